@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""An append-only file of entries, which survives the end of its process."""
+"""An append-only file of entries, which survives a kill of its process."""
 
 import errno
 import fcntl
@@ -17,21 +17,21 @@ from typing import Any
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import open_file, parse_json
 
-# During a drag, a hundred entries a second need not each wait for the disk.
+# While the user drags a landmark, a hundred entries a second must not each wait for the disk.
 _SYNC_INTERVAL_S = 0.5
 
 
 class Log:
-    """Entries of JSON, one a line, in a file that one process at a time has open.
+    """A file of JSON entries, one per line, which one process at a time can open.
 
     Parameters
     ----------
     error : type of CliplocError
-        What is raised, here and when an entry is added.
+        Exception to raise, here and in other methods.
     advice : str
-        What to do about a file that cannot be written.
+        Advice to the user if the file cannot be written.
     parse : callable
-        Returns the entry of a line, or raises any Exception for a damaged one.
+        Converts a line to an entry, or raises any Exception if it is damaged.
     """
 
     def __init__(self, path: Path, error: type[CliplocError], advice: str,
@@ -41,7 +41,7 @@ class Log:
         self._synced_s = 0.0
         try:
             if path.exists():
-                open_file(path).close()  # to say what else it is
+                open_file(path).close()  # for a message if it is not a regular file
             self._file = path.open('a+b', buffering=0)
         except OSError as problem:
             raise self._unwritable(problem) from problem
@@ -49,15 +49,16 @@ class Log:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as problem:
             self.close()
-            raise error(f'{path}: another studio or run has it open; close it first') from problem
+            raise error(f'{path}: open in another studio or run; close that first') from problem
         except OSError:
-            pass  # some file systems have no locks
+            pass  # some file systems do not support locks
         self._end = self._file.seek(0, os.SEEK_END)
 
     def read(self) -> tuple[list[Any], bool]:
-        """Return the entries before the first damaged line, and whether that is a whole line.
+        """Return the entries before the first damaged line, and whether there is a damaged line.
 
-        A kill leaves a part of a line, which is not damage. The next entry replaces the rest.
+        A partial last line, as left by a kill, is not damage. The next entry overwrites everything
+        after the returned entries.
         """
         entries: list[Any] = []
         self._end = 0
@@ -67,15 +68,15 @@ class Log:
                     break
                 try:
                     entries.append(self._parse(line))
-                except Exception:  # whatever the content causes
+                except Exception:  # damaged content may cause any exception
                     return entries, True
                 self._end += len(line)
         return entries, False
 
     def append(self, entry: Any) -> None:
-        """Add an entry; it is on the disk after at most half a second of further entries.
+        """Add an entry; the file is flushed to disk at most every half second.
 
-        CliplocError: the disk is full or gone, and the entry is not there.
+        Raises CliplocError if the disk is full or gone; the entry is then not in the file.
         """
         line = json.dumps(entry).encode() + b'\n'
         try:
@@ -100,7 +101,7 @@ class Log:
             self.append(entry)
 
     def set_aside(self) -> Path:
-        """Copy the file to another one, which is never overwritten; return its path."""
+        """Copy the file to a new file, without overwriting any file; return its path."""
         for number in itertools.count(1):
             path = self.path.with_name(f'{self.path.name}.{number}')
             try:
@@ -114,7 +115,7 @@ class Log:
         return path
 
     def close(self) -> None:
-        """Close the file; it stays."""
+        """Close the file, without deleting it."""
         self._file.close()
 
     def remove(self) -> None:

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Independent tasks on this process, on local processes, or on a Dask cluster.
+"""Run independent tasks in this process, in local processes, or on a Dask cluster.
 
-A worker that dies costs the time of its tasks: they run again after all others, each alone. A task
-that kills its worker a second time is given up and reported.
+If a worker dies, its tasks run again after all other tasks, one at a time. A task whose worker
+dies a second time is given up and reported.
 """
 
 import ctypes
@@ -29,61 +29,61 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Tasks at each worker: the next one waits there, and few are held in memory.
+# Tasks queued at each worker: the next task is ready there, and few tasks are in memory.
 _TASKS_A_WORKER = 2
-# Tasks at all workers lost this many times in a row, without a result, are not an accident.
+# If all workers lose their tasks this many times in a row, without any result, the run is aborted.
 _MOST_LOSSES = 3
-# A cluster that lost all its workers starts new workers in this time, or never.
+# Polling interval, and maximum wait for new workers after a cluster has lost all its workers [s].
 _CHECK_S, _RESTART_S = 5.0, 60.0
 _CONNECT_S = 10
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class WorkersError(CliplocError):
-    """Workers cannot be started, or die again and again."""
+    """Workers cannot be started, or die repeatedly."""
 
 
-#: Makes the function that does a task; holds or loads what it needs. Each worker gets it once, and
-#: each thread that does tasks makes a function of its own.
+#: Makes the function that runs a task, and loads the data that it needs. It is sent to each worker
+#: once, and called once in each thread that runs tasks.
 MakeWork = Callable[[], Callable[[Any], Any]]
 
 
 class _Pool(NamedTuple):
-    """Processes that do tasks, here or on a cluster."""
+    """Processes that run tasks, locally or on a cluster."""
 
-    most: int  #: Tasks that may be there at once
+    most: int  #: Maximum number of tasks in flight
     deaths: tuple[type[Exception], ...]  #: Exceptions of a task whose worker died
-    submit: Callable[[Any], Any]  #: Hands over a task; returns its future
-    #: Returns those of some futures that are done, as soon as there are any
+    submit: Callable[[Any], Any]  #: Submits a task; returns its future
+    #: Waits until at least one of the futures is done; returns the finished futures
     wait: Callable[[list[Any]], Collection[Any]]
 
 
 def run_tasks(make_work: MakeWork, tasks: Iterable[Any], *, workers: int = 1, scheduler: str = ''
               ) -> Generator[tuple[Any, Any]]:
-    """Do tasks, and yield each with its result as soon as it is there.
+    """Run tasks; yield each task with its result as soon as it is finished.
 
-    Tasks are taken from the iterable as workers become free, so that it may stream. Local workers
-    end with this process, and as soon as this generator is closed.
+    Tasks are taken from the iterable as workers become free, so the iterable may be a stream.
+    Local workers end with this process, or as soon as this generator is closed.
 
     Parameters
     ----------
     tasks : iterable
-        What can be sent to another process.
+        Picklable tasks.
     workers : int
-        Local processes; 1 does the tasks in this process.
+        Number of local processes; 1 runs the tasks in this process.
     scheduler : str
-        Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers do the tasks
+        Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers run the tasks
         instead; '' for none.
 
     Yields
     ------
     task, result : object
-        In no particular order. A task at which workers died twice has the result None.
+        In no particular order. A task whose workers died twice has the result None.
 
     Raises
     ------
     WorkersError
-        Workers cannot be started, die again and again, or have another version of this package.
+        Workers cannot be started, die repeatedly, or have another version of this package.
     """
     if workers == 1 and not scheduler:
         work = make_work()
@@ -96,16 +96,17 @@ def run_tasks(make_work: MakeWork, tasks: Iterable[Any], *, workers: int = 1, sc
         yield from _stream(pool, iter(tasks), pool.most, again)
         if again:
             logger.warning('workers died; %d tasks run again', len(again))
-        # a cluster blames every task of a dead worker, whichever of them killed it
+        # one at a time: a cluster reports all tasks of a dead worker, not only the task that
+        # killed it
         yield from _stream(pool, iter(again), 1, given_up)
     for task in given_up:
-        logger.warning('left out: workers died again and again at %.200s', task)
+        logger.warning('skipped: its workers died twice: %.200s', task)
         yield task, None
 
 
 def _stream(pool: _Pool, tasks: Iterator[Any], most: int, lost: list[Any]
             ) -> Iterator[tuple[Any, Any]]:
-    """Yield tasks with their results; add those whose worker died to `lost`."""
+    """Yield tasks with their results; add tasks whose worker died to `lost`."""
     in_flight: dict[Any, Any] = {}
     losses = 0
     while True:
@@ -121,40 +122,40 @@ def _stream(pool: _Pool, tasks: Iterator[Any], most: int, lost: list[Any]
                 lost.append(task)
                 losses += 1
                 if losses > _MOST_LOSSES * most:
-                    raise WorkersError('workers die again and again, perhaps out of memory; run '
-                                       'again with fewer') from error
+                    raise WorkersError('workers die repeatedly, perhaps out of memory; run again '
+                                       'with fewer workers') from error
             else:
                 losses = 0
                 yield task, result
 
 
 class _Work:
-    """Does tasks; made once for each thread. It travels as what makes it."""
+    """Runs tasks with a function made once for each thread. It is pickled as its MakeWork."""
 
     def __init__(self, make_work: MakeWork) -> None:
         self._make_work = make_work
         self._of_thread = threading.local()
 
     def __reduce__(self) -> tuple[type['_Work'], tuple[MakeWork]]:
-        """Return how another process makes an equal one."""
+        """Return the constructor and its argument, for pickling."""
         return _Work, (self._make_work,)
 
     def __call__(self, task: Any) -> Any:
-        """Do a task."""
+        """Run a task."""
         if not hasattr(self._of_thread, 'work'):
             self._of_thread.work = self._make_work()
         return self._of_thread.work(task)
 
 
-_work: _Work  # of a local worker, which has no other memory
+_work: _Work  # of a local worker: global, because tasks are submitted to a function without state
 
 
 def _begin_worker(make_work: MakeWork) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    # a killed parent cannot end its workers, so the kernel does
+    # a killed parent cannot end its workers: the kernel ends them
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     global _work
-    _work = _Work(make_work)  # makes it later: an error here would only break the pool
+    _work = _Work(make_work)  # calls make_work at the first task: an error here breaks the pool
 
 
 def _do(task: Any) -> Any:
@@ -163,8 +164,8 @@ def _do(task: Any) -> Any:
 
 @contextmanager
 def _processes(make_work: MakeWork, workers: int) -> Iterator[_Pool]:
-    """Yield local processes, each a pool of its own: the death of one breaks no other."""
-    # spawned, since forking a process that has run PyTorch's threads may hang
+    """Start local processes, each in a separate pool: the death of a process breaks no other."""
+    # spawned, because a fork of a process with PyTorch threads may hang
     start = partial(ProcessPoolExecutor, 1, mp_context=multiprocessing.get_context('spawn'),
                     initializer=_begin_worker, initargs=(make_work,))
     pools = [start() for _ in range(workers)]
@@ -200,12 +201,12 @@ def _processes(make_work: MakeWork, workers: int) -> Iterator[_Pool]:
 
 @contextmanager
 def _cluster(make_work: MakeWork, address: str) -> Iterator[_Pool]:
-    """Yield a Dask cluster. Client.get_executor would lose results of workers that die soon."""
+    """Connect to a Dask cluster. Client.get_executor would lose results of workers that die."""
     try:
         from distributed import Client, KilledWorker
         from distributed import wait as wait_on_dask
     except ImportError as error:
-        raise OptionsError('a `scheduler` needs Dask: pip install distributed') from error
+        raise OptionsError('`scheduler` requires Dask: pip install distributed') from error
     try:
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
@@ -224,15 +225,15 @@ def _cluster(make_work: MakeWork, address: str) -> Iterator[_Pool]:
     with client:
         _wait_for_workers(client, address, _CONNECT_S)
         _check_sources(client, address)
-        # a task of its own: what makes the work reaches each worker once, and Dask makes it again
-        # if the workers that hold it die
+        # a separate task: make_work is sent to each worker once, and Dask recreates it if the
+        # workers that have it die
         work = client.submit(_Work, make_work, pure=False)
         try:
             yield _Pool(_TASKS_A_WORKER * sum(client.nthreads().values()), (KilledWorker,),
                         partial(client.submit, _Work.__call__, work, pure=False), wait_for_some)
         except CancelledError as error:
             raise WorkersError(f'the Dask scheduler at {address} is gone; start it and run again '
-                               'to go on') from error
+                               'to continue') from error
 
 
 def _wait_for_workers(client: 'Client', address: str, time_s: float) -> None:
@@ -244,13 +245,13 @@ def _wait_for_workers(client: 'Client', address: str, time_s: float) -> None:
 
 
 def _check_sources(client: 'Client', address: str) -> None:
-    """Refuse workers whose results may differ: with other sources of this package, or none."""
+    """Raise WorkersError if the sources of this package on a worker are missing or different."""
     ours = digest_of_sources()
     for worker, theirs in client.run(digest_of_sources, on_error='return').items():
         if theirs != ours:
             raise WorkersError(
-                f'the Dask worker {worker} has sources {theirs} of cliploc_ros, here are {ours}; '
-                f'install the same on all workers of {address} and restart them')
+                f'the Dask worker {worker} has sources {theirs} of cliploc_ros, expected {ours}; '
+                f'install the same version on all workers of {address} and restart them')
 
 
 def digest_of_sources() -> str:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read files of any origin, find folders for files, and replace files safely."""
+"""Read untrusted files, choose and create folders, and replace files atomically."""
 
 import atexit
 import errno
@@ -24,46 +24,47 @@ from cliploc_ros.errors import OptionsError
 
 logger = logging.getLogger(__name__)
 
-#: The largest file that is read into memory as a whole [bytes].
+#: Maximum size of a file that is read into memory completely [bytes].
 MOST_BYTES = 256 * 2**20
-# Values of a JSON text, each of which takes up to 64 bytes of memory, and digits of its integers:
-# 64 bits have 19 or 20.
+# Maximum number of values in a JSON text, each of which takes up to 64 bytes of memory, and of
+# digits in an integer: 64 bits have 19 or 20.
 _MOST_VALUES = 8_000_000
 _MOST_DIGITS = 20
-# Writers of one folder wait this long for their turn, and look this often [s]: a set takes less.
+# Maximum wait for other writers of a folder, and polling interval [s]: writing a set takes less.
 _TURN_S, _TURN_POLL_S = 30.0, 0.02
-# A full disk may still take an empty file.
+# Not 0: an empty file can be created even on a full disk.
 _PROBE_BYTES = 4096
-#: Advice about a file that cannot be written
+#: Advice for a file that cannot be written.
 MAKE_ROOM = 'make room, or choose another folder'
-#: Files that this process could not keep in a cache, see warn_not_kept
+#: Messages about files that this process could not cache, see warn_not_kept.
 NOT_KEPT: list[str] = []
 
 
 def open_file(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a regular file to read it, whatever else a path of any origin names.
+    """Open a regular file for reading.
 
-    OSError: there is none. A pipe would wait for a writer, a device would never end.
+    Raises OSError if an untrusted path is not a regular file: a pipe would wait for a writer, and
+    a device would never end.
     """
     try:
-        mode = Path(path).stat().st_mode  # first: a device may act as soon as it is opened
+        mode = Path(path).stat().st_mode  # before opening, which may have effects on a device
         if stat.S_ISREG(mode):
             file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb')
             mode = os.fstat(file.fileno()).st_mode
             if stat.S_ISREG(mode):
                 return file
             file.close()
-    except ValueError as error:  # a zero byte, or no UTF-8
-        raise OSError(errno.EINVAL, f'names no file: {error}') from error
+    except ValueError as error:  # a null byte, or invalid UTF-8
+        raise OSError(errno.EINVAL, f'is not a valid path: {error}') from error
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, 'a folder, not a regular file')
     raise OSError(errno.EINVAL, 'not a regular file')
 
 
 def read_file(path: str | os.PathLike[str], most_bytes: int = MOST_BYTES) -> bytes:
-    """Return the content of a regular file; OSError: there is none, or it is too large."""
+    """Read a regular file; OSError: there is none, or it is larger than most_bytes."""
     with open_file(path) as file:
-        # a sparse file has any size
+        # check the size first: that of a sparse file is not limited by the disk
         size = os.fstat(file.fileno()).st_size
         content = file.read(most_bytes + 1) if size <= most_bytes else b''
     if max(size, len(content)) > most_bytes:
@@ -72,14 +73,14 @@ def read_file(path: str | os.PathLike[str], most_bytes: int = MOST_BYTES) -> byt
 
 
 def parse_json(text: str | bytes, **options: Any) -> Any:
-    """Return the value of a JSON text, see json.loads.
+    """Parse a JSON text, see json.loads.
 
-    ValueError: it is not JSON, or nested so deeply, so long, or with such numbers that no file of
-    this package or of the programs that it reads is.
+    Raises ValueError if it is not JSON, or if its nesting, its number of values or its integers
+    exceed what any supported program writes.
     """
     marks = (b',', b'[', b'{') if isinstance(text, bytes) else (',', '[', '{')
     if sum(map(text.count, marks)) > _MOST_VALUES:  # type: ignore[arg-type]
-        raise ValueError(f'holds more than {_MOST_VALUES} values')
+        raise ValueError(f'contains more than {_MOST_VALUES} values')
     try:
         return json.loads(text, parse_int=_integer, **options)
     except RecursionError as error:
@@ -88,7 +89,7 @@ def parse_json(text: str | bytes, **options: Any) -> Any:
 
 def _integer(digits: str) -> int:
     if len(digits) > _MOST_DIGITS:
-        raise ValueError(f'holds an integer of {len(digits)} digits')
+        raise ValueError(f'contains an integer of {len(digits)} digits')
     return int(digits)
 
 
@@ -96,15 +97,15 @@ def _integer(digits: str) -> int:
 def replace_file(path: Path) -> Iterator[Path]:
     """Yield the path of a temporary file that becomes ``path`` when the block ends.
 
-    The temporary file lies in the same folder and has the same suffix. It is flushed to disk
-    before it replaces the old file, so that not even a power cut leaves half a file. An exception
-    removes it, and the old file stays. A symbolic link is followed and stays, and an existing
-    file keeps its mode.
+    The temporary file is in the same folder and has the same suffix. It is flushed to disk before
+    it replaces the old file, so that even a power failure does not leave a partial file. After an
+    exception, it is removed and the old file is kept. A symbolic link is followed and kept, and an
+    existing file keeps its mode.
 
-    OSError: the folder is missing, read-only or full.
+    Raises OSError if the folder is missing, read-only or full.
     """
     path = Path(os.path.realpath(path))
-    # two containers that share the folder may have processes of the same number
+    # random, because containers that share the folder may have processes of equal number
     partial = path.with_name(f'.{secrets.token_hex(6)}.{path.name}')
     try:
         yield partial
@@ -117,64 +118,68 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 
 def _take_place(partial: Path, path: Path) -> None:
-    """Let a file replace another one, whose mode it takes; a symbolic link is followed."""
+    """Replace a file by another file, keeping its mode; a symbolic link is followed."""
     path = Path(os.path.realpath(path))
     with suppress(OSError):  # there is no file yet, or the file system has no modes
         partial.chmod(stat.S_IMODE(path.stat().st_mode))
     partial.replace(path)
 
 
-#: Writes a file to a path, with the digest of its set in it.
+#: Writes a file to a path, with the digest of its set in the content.
 WriteOfSet = Callable[[Path, str], object]
 
 
 def replace_set(path: Path, digest: str, write: WriteOfSet,
                 besides: Mapping[Path, WriteOfSet | None]) -> None:
-    """Write a file and those beside it as one: whenever the process ends, a whole set is there.
+    """Write a file and the files beside it atomically: a kill at any time leaves a complete set.
 
-    Those beside are written under other names first. The file itself takes its place in one step,
-    and from then on its set is the new one: finish_set does what a kill leaves. Files that are not
-    of its set have another digest. Two writers of one folder do this one after the other.
+    The files beside it are first written under temporary names. The file itself is then replaced
+    atomically, which makes the new set valid; after a kill, finish_set renames the remaining
+    files. Files of other sets are recognized by their digest. Writers of one folder take turns.
 
     Parameters
     ----------
     besides : mapping
-        The other files in the same folder; None removes one.
+        The other files in the same folder; None removes a file.
 
-    OSError, and what the callables raise: nothing was changed. OptionsError: the set was written,
-    and a file that is not of it cannot be removed.
+    Raises
+    ------
+    OSError
+        Nothing was changed. The callables may raise other exceptions, with the same effect.
+    OptionsError
+        The set was written, but a file of an older set cannot be removed.
     """
     staged = {other: _staged(Path(os.path.realpath(other)), digest) for other in besides}
     with _alone_in(path.parent):
         try:
             for other, make in besides.items():
                 if make is None:
-                    staged[other].unlink(missing_ok=True)  # of a writer that was killed
+                    staged[other].unlink(missing_ok=True)  # left by a killed writer
                 else:
                     make(staged[other], digest)
             write(path, digest)
         except BaseException:
-            for one in staged.values():
+            for unfinished in staged.values():
                 with suppress(OSError):
-                    one.unlink(missing_ok=True)
+                    unfinished.unlink(missing_ok=True)
             raise
         for other, make in besides.items():
             try:
                 if make is None:
                     other.unlink(missing_ok=True)
                 else:
-                    with suppress(FileNotFoundError):  # a reader has done it
+                    with suppress(FileNotFoundError):  # a reader has already renamed it
                         _take_place(staged[other], other)
             except OSError as error:
-                raise OptionsError(f'{other}: belongs to an older {path.name}; it cannot '
-                                   f'be removed: {error.strerror}; remove it') from error
+                raise OptionsError(f'{other}: belongs to an older {path.name} and cannot be '
+                                   f'removed ({error.strerror}); remove it') from error
 
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Keep other writers of sets out of a folder meanwhile, where its file system can.
+    """Hold a lock on a folder against other writers of sets, if its file system supports locks.
 
-    OSError: another program keeps this one out for long, such as a process that was stopped.
+    Raises OSError if another program holds the lock for long, for example a suspended process.
     """
     descriptor, deadline = os.open(folder, os.O_RDONLY | os.O_CLOEXEC), time.monotonic() + _TURN_S
     try:
@@ -186,7 +191,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
                     raise OSError(errno.EBUSY, 'another program has been writing there for '
                                                f'{_TURN_S:g} s') from None
                 time.sleep(_TURN_POLL_S)
-            except OSError:  # some network file systems lock no folder
+            except OSError:  # some network file systems cannot lock folders
                 break
             else:
                 break
@@ -196,10 +201,10 @@ def _alone_in(folder: Path) -> Iterator[None]:
 
 
 def finish_set(path: Path, digest: str) -> None:
-    """Put in place what a killed writer left of the set of a file, where that is allowed."""
+    """Complete the set of a file after a kill of its writer, if the folder is writable."""
     pattern = f'{glob.escape(_staged(path.with_suffix(""), digest).name)}.*'
     for staged in path.parent.glob(pattern) if digest else ():
-        with suppress(OSError):  # the writer has done it meanwhile, or the folder is read-only
+        with suppress(OSError):  # another process has already done it, or the folder is read-only
             _take_place(staged, staged.with_name(staged.name.removeprefix(f'.{digest}.')))
 
 
@@ -208,9 +213,9 @@ def _staged(path: Path, digest: str) -> Path:
 
 
 def make_folder(folder: Path) -> None:
-    """Create the output folder and its parents.
+    """Create an output folder and its parents.
 
-    OptionsError: the folder cannot be created or written to, or its disk is full.
+    Raises OptionsError if the folder cannot be created or written to, or its disk is full.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -225,15 +230,15 @@ def make_folder(folder: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file in one step; OptionsError: it cannot be written, and nothing is left."""
+    """Write a text file atomically; OptionsError: it cannot be written, and no file is left."""
     write_file(path, lambda partial: partial.write_text(text, encoding='utf-8'))
 
 
 def write_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Let a function write a file, which gets its name only when it is complete.
+    """Write a file atomically with a function.
 
-    The function takes the path to write to, which has the suffix of the file. OptionsError: the
-    file cannot be written, and nothing is left.
+    The function takes the path of a temporary file, which has the suffix of the file. Raises
+    OptionsError if the file cannot be written; no temporary file is left.
     """
     try:
         with replace_file(path) as partial:
@@ -243,22 +248,22 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def warn_not_kept(text: str) -> None:
-    """Warn that something could not be kept in a cache, and remember that for `prepare`."""
+    """Warn that a file could not be cached, and record the warning for `prepare`."""
     NOT_KEPT.append(text)
     logger.warning('%s', text)
 
 
 def resolve_cache_dir(cache_dir: str) -> Path:
-    """Return the folder for downloads, label embeddings and kernels; '' means the user's cache.
+    """Return the folder for downloads, label embeddings and kernels; '' gives the user's cache.
 
-    That is ``$XDG_CACHE_HOME/cliploc_ros``, else ``~/.cache/cliploc_ros``. A forged label
-    embedding leads to wrong poses, a forged kernel runs code. So if the user has no home folder,
-    or other users own the cache or can write to it, a private folder replaces it until the process
-    ends.
+    The user's cache is ``$XDG_CACHE_HOME/cliploc_ros`` or else ``~/.cache/cliploc_ros``. A forged
+    label embedding leads to wrong poses, and a forged kernel runs arbitrary code. So if the user
+    has no home folder, or if other users own the cache or can write to it, a private temporary
+    folder is used until the process ends.
     """
     if cache_dir:
         return Path(cache_dir).expanduser().absolute()
-    # platformdirs would be one more dependency for these two lines
+    # platformdirs would be a further dependency for these two lines
     xdg = os.environ.get('XDG_CACHE_HOME', '')
     try:
         folder = (Path(xdg) if Path(xdg).is_absolute() else Path.home() / '.cache') / 'cliploc_ros'
@@ -267,7 +272,7 @@ def resolve_cache_dir(cache_dir: str) -> Path:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.stat()
-    except OSError:  # the first write reports it
+    except OSError:  # reported by the first write
         return folder
     if is_foreign(status, {os.getuid()}):
         return _process_cache(f'other users own {folder} or can write to it')
@@ -275,9 +280,10 @@ def resolve_cache_dir(cache_dir: str) -> Path:
 
 
 def is_foreign(status: os.stat_result, owners: Collection[int]) -> bool:
-    """Return whether others than some owners can write to a file or folder, or own it.
+    """Check whether users other than the given owners own a file or folder or can write to it.
 
-    The group of this process is its user's own, in any other one may be anyone.
+    The group of this process is trusted as the user's own group; any other group may have unknown
+    members.
     """
     return (status.st_uid not in owners or bool(status.st_mode & stat.S_IWOTH)
             or (bool(status.st_mode & stat.S_IWGRP) and status.st_gid not in (os.getgid(), 0)))

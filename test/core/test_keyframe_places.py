@@ -193,9 +193,9 @@ def test_a_selected_keyframe_is_as_it_was(corridor):
 
 
 @pytest.mark.parametrize(('other', 'message'), [
-    (replace(ROOM, frame_id='odom'), "'map', not 'odom'"),
+    (replace(ROOM, frame_id='odom'), "'map', expected 'odom'"),
     (replace(ROOM, landmark_ids=tuple(f'x{row}' for row in range(len(ROOM)))), 'no landmark'),
-    (replace(ROOM, centers=ROOM.centers + 5.0), '8.66 m from')])
+    (replace(ROOM, centers=ROOM.centers + 5.0), '8.66 m away from')])
 def test_the_layer_of_another_map_is_named(file, other, message):
     with pytest.raises(MapError, match=message) as caught:
         load_layer_of_map(file, other)

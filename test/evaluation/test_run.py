@@ -215,7 +215,7 @@ def test_keyframes_are_for_auto_and_what_is_based_on_it(tmp_path):
     ('wide: 3', 'mine.yaml: wide: is not a mapping'),
     ('wide: {base: best}', "'best' is none of"),
     ('auto: {k: 2}', "two different methods are called 'auto'"),
-    ('[1, 2]', 'holds no YAML mapping'), ('{', 'not valid YAML')])
+    ('[1, 2]', 'not a YAML mapping'), ('{', 'not valid YAML')])
 def test_bad_files_are_named(tmp_path, text, named):
     path = tmp_path / 'mine.yaml'
     path.write_text(text)

@@ -81,7 +81,7 @@ def test_restart_and_remove(path):
 
 
 def test_one_process_at_a_time(path):
-    with open_log(path), pytest.raises(DatasetError, match='has it open'):
+    with open_log(path), pytest.raises(DatasetError, match='open in another studio'):
         open_log(path)
     assert read(path) == ([], False)
 
@@ -230,7 +230,7 @@ def test_workers_that_all_die_end_the_run():
 def test_a_deadly_task_is_given_up_alone(caplog):
     with caplog.at_level(logging.WARNING):
         assert results(Square(5), workers=2) == SQUARES | {5: None}
-    assert 'left out' in caplog.text
+    assert 'skipped: its workers died twice' in caplog.text
 
 
 def test_without_dask(monkeypatch):

@@ -255,7 +255,7 @@ def test_a_set_without_end_is_not_printed(path):
     landmark_map, place = LandmarkMap.from_file(path), embeddings_path(path)
     save_landmark_embeddings(place, replace(load_landmark_embeddings(place),
                                             set_digest='a' * 1_000_000))
-    with pytest.raises(MapError, match=r'is of the set a{12}, its') as error:
+    with pytest.raises(MapError, match=r'is of the set a{12}, but its') as error:
         load_embeddings_of_map(path, landmark_map.landmark_ids, landmark_map.map_set)
     assert len(str(error.value)) < 500
 

@@ -143,7 +143,7 @@ def bomb(path, shape, compression=zipfile.ZIP_DEFLATED, declared=None):
 
 @pytest.mark.parametrize(('change', 'named'), [
     (partial(bomb, shape=(20_000_000, 4)), 'unpacks to 610 MiB'),
-    (partial(bomb, shape=(3, 4), declared=(10**12, 4)), 'its values take 32000000000000 bytes')])
+    (partial(bomb, shape=(3, 4), declared=(10**12, 4)), 'expected 32000000000000')])
 def test_an_npz_of_gigabytes_is_not_unpacked(sound, tmp_path, change, named):
     path = tmp_path / 'seen.npz'
     path.write_bytes((sound / 'seen.npz').read_bytes())

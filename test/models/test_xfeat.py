@@ -152,7 +152,7 @@ def test_features_of_different_kinds_are_not_compared(layer_file, room, image_rg
         load_layer_of_map(layer_file, room)
     mixed = tmp_path / 'mixed.npz'
     save_layer(mixed, replace(layer, kind=SIFT))
-    with pytest.raises(MapError, match=r'of 64 numbers, but those of the kind .* have 128'):
+    with pytest.raises(MapError, match=r'of 64 dimensions, expected 128 for kind'):
         load_layer_of_map(mixed, room, kinds)
 
 

@@ -41,7 +41,7 @@ def test_a_file_of_map_server_is_read(tmp_path, suffix, negate):
     ('image: walls.{suffix}', 'image: /dev/zero', 'not an image'), ('trinary', 'raw', 'mode raw'),
     ('resolution: 0.5\n', '', "'resolution' is miss"), ('0.5', '0.0', 'resolution 0.0'),
     ('[1.0, -2.0, {yaw}]', '[1.0, .inf, 0.0]', 'origin'), ('0.196', '0.9', 'must rise'),
-    (YAML, 'walls', 'no YAML mapping'), ('negate: {negate}', 'negate: maybe', 'maybe')])
+    (YAML, 'walls', 'not a YAML mapping'), ('negate: {negate}', 'negate: maybe', 'maybe')])
 def test_a_damaged_file_is_refused_by_name(tmp_path, before, after, text):
     file = write(tmp_path, text=YAML.replace(before, after))
     with pytest.raises(MapError, match=str(file)) as caught:

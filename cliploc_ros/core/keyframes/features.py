@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Local features of an image, and which of two images show the same point.
+"""Extract local features of an image, and match the features of two images.
 
-A FeatureKind finds features and compares them. SIFT is built in (Lowe, "Distinctive Image
-Features from Scale-Invariant Keypoints", 2004), with the square root of Arandjelovic and Zisserman
-("Three things everyone should know to improve object retrieval", 2012). OpenCV finds the features;
-a descriptor takes 128 bytes.
+A FeatureKind extracts and matches features. SIFT is built in (Lowe, "Distinctive Image Features
+from Scale-Invariant Keypoints", 2004), as RootSIFT (Arandjelovic and Zisserman, "Three things
+everyone should know to improve object retrieval", 2012). OpenCV extracts the features. A
+descriptor takes 128 bytes.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,17 +15,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-DIMENSIONS = 128  #: Of a descriptor of SIFT
-# A unit vector of square roots times this fits into a byte; no entry of a real one exceeds .5.
+DIMENSIONS = 128  #: Dimensions of a SIFT descriptor
+# Scale from entries of a unit vector of square roots to bytes: in practice, no entry exceeds .5.
 _SCALE = 512.0
-# A dark image is made brighter first, until one pixel in a hundred is at least so bright: SIFT
-# leaves out features of little contrast.
+# A dark image is first brightened until its 99th percentile has this value: SIFT drops features
+# of low contrast.
 _DARK = 160.0
-# Less than SIFT's own .04: floors, walls and boxes have little contrast.
+# Below SIFT's default of .04: floors, walls and boxes have low contrast.
 _CONTRAST = 0.02
 # A match is refused if another feature of the other image is nearly as similar (Lowe, 2004).
 _RATIO = 0.85
-# Cosines are as near to equal as this by rounding: of two equal descriptors neither is clearer.
+# Rounding error of a cosine. It is added to distances, so that equal descriptors have ratio 1.
 _SAME = 1e-6
 
 
@@ -33,9 +33,9 @@ _SAME = 1e-6
 class Features:
     """The n features of an image."""
 
-    pixels: NDArray[np.float64]  #: (n, 2) [px] in the image as it is, distorted
+    pixels: NDArray[np.float64]  #: (n, 2) [px] in the original, distorted image
     descriptors: NDArray[np.uint8]  #: (n, d)
-    strengths: NDArray[np.float32]  #: (n,): response of the detector; the strongest is first
+    strengths: NDArray[np.float32]  #: (n,): response of the detector, in decreasing order
 
     def __len__(self) -> int:
         """Return the number of features."""
@@ -46,45 +46,46 @@ class Features:
 class FeatureKind:
     """Extraction, storage and comparison of one kind of features."""
 
-    #: Identifies the descriptors: those of another kind must not be compared with these
+    #: Identifies the descriptors: descriptors of different kinds must not be compared
     name: str
     dimensions: int  #: Dimensions of a descriptor: d
-    #: Takes an image (h, w, 3), the most features, and the longest side that it is made smaller to
+    #: Extracts features from an image (h, w, 3): (image, maximum number, longest side [px] to
+    #: which a larger image is reduced)
     extract: Callable[[NDArray[np.uint8], int, int], Features]
-    #: An entry of a unit vector is stored as a byte: this plus `scale` times the entry
+    #: An entry of a unit vector is stored as the byte `zero` + `scale` * entry
     zero: int = 0
     scale: float = _SCALE
-    #: The most similar feature of another image is at most this share as far as the second one
+    #: Maximum ratio of the distances to the most similar and to the second feature of an image
     ratio: float = _RATIO
-    least_inliers: int = 0  #: With fewer features that agree, a pose may be one of chance
-    #: The fast pass: longest side of the image, and the most features. At the size of keyframes,
-    #: features take twice the time at equal success.
+    least_inliers: int = 0  #: A pose with fewer agreeing features may be a chance result
+    #: Fast pass: longest side of the image, and maximum number of features. At the image size of
+    #: keyframes, features would take twice the time without a higher success rate.
     query_px: int = 400
     query_most: int = 600
 
     def compact(self, units: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Return unit vectors (n, d) as descriptors."""
+        """Convert unit vectors (n, d) to descriptors (n, d)."""
         return compact(units, self.zero, self.scale)
 
     def units(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return descriptors (n, d) as unit vectors."""
+        """Convert descriptors (n, d) to unit vectors (n, d)."""
         return unit_rows(descriptors, self.zero)
 
     def match(self, ours: NDArray[np.float32], theirs: NDArray[np.float32]
               ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Return the pairs of rows of two images' unit descriptors, see the function match."""
+        """Match the unit descriptors of two images, see the function match."""
         return match(ours, theirs, self.ratio)
 
 
-#: Kinds by their names; a call makes one, which may load or download something.
+#: Factories of feature kinds by name; calling one may load or download a model.
 FeatureKinds = Mapping[str, Callable[[], FeatureKind]]
 
 
 def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800) -> Features:
-    """Return the strongest features of an image (h, w, 3), up to a number.
+    """Return up to `most` features of an image (h, w, 3), the strongest first.
 
-    A larger image is made smaller first: it bounds the time. Features of different sizes of an
-    image match: those that the smaller one lacks are its finest.
+    A larger image is reduced first, which limits the time. Features of an image at different sizes
+    match; a reduced image lacks only the finest features.
     """
     gray = cv2.cvtColor(image_rgb, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, longest_side_px / max(image_rgb.shape[:2]))
@@ -107,19 +108,19 @@ def extract(image_rgb: NDArray[np.uint8], most: int, longest_side_px: int = 800)
     return Features(pixels, compact(np.sqrt(shares)), strengths[rows])
 
 
-#: The built-in kind.
+#: The built-in feature kind.
 SIFT = FeatureKind('rootsift-128-uint8', DIMENSIONS, extract)
 ONLY_SIFT: FeatureKinds = {SIFT.name: lambda: SIFT}
 
 
 def compact(units: NDArray[np.float32], zero: int = 0, scale: float = _SCALE
             ) -> NDArray[np.uint8]:
-    """Return unit vectors (n, d) as descriptors, see FeatureKind."""
+    """Convert unit vectors (n, d) to descriptors (n, d), see FeatureKind."""
     return np.clip(np.round(scale * units) + zero, 0, 255).astype(np.uint8)
 
 
 def unit_rows(descriptors: NDArray[np.uint8], zero: int = 0) -> NDArray[np.float32]:
-    """Return descriptors (n, d) as unit vectors; a byte of `zero` stands for 0."""
+    """Convert descriptors (n, d) to unit vectors (n, d); the byte `zero` stands for 0."""
     rows = descriptors.astype(np.float32) - zero
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
     return rows
@@ -127,16 +128,14 @@ def unit_rows(descriptors: NDArray[np.uint8], zero: int = 0) -> NDArray[np.float
 
 def match(ours: NDArray[np.float32], theirs: NDArray[np.float32], ratio: float = _RATIO
           ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return which rows of two images' unit descriptors show the same point, and how clearly.
-
-    Each is the other's most similar one, and clearly more similar than the second of theirs.
+    """Match the unit descriptors of two images: mutual nearest neighbours with a ratio test.
 
     Returns
     -------
     pairs : ndarray (k, 2) of int
         Rows of ours and theirs.
     shares : ndarray (k,)
-        Squared distance of each as a share of that to the second of theirs.
+        Squared distance of each pair, divided by that to the second-nearest row of theirs.
     """
     if len(ours) == 0 or len(theirs) < 2:
         return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.float32)

@@ -26,62 +26,62 @@ from cliploc_ros.core.keyframes.point_pose import (
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
 
-# Keyframes that are matched: the most similar ones, then the most similar ones elsewhere, so that
-# a place that looks alike is found, and those where objects propose.
+# Number of keyframes to match: the most similar, the most similar at other places (so that places
+# that look alike are found), and keyframes near each pose that objects propose.
 _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
-# With fewer points that agree, more keyframes are matched: those near the pose, and as many of the
-# next similar ones.
+# With fewer agreeing points, more keyframes are matched: this many near the pose, and as many of
+# the next similar keyframes.
 _ENOUGH_INLIERS, _MORE = 100, 5
-# An image's words may resemble those of the wrong keyframes. Where none of the above shows the
-# place, the next 25 are matched by the strongest 600 features. A chance pose has up to 8 inliers
-# there, so 20 are required.
+# An image's words may resemble those of the wrong keyframes. If none of the above shows the place,
+# the strongest 600 features are matched with the next 25 keyframes. A chance pose has up to 8
+# inliers among these matches, so 20 are required.
 _FURTHER, _STRONGEST, _CLEAR = 25, 600, 20
-# The thorough pass: features at full size. Of the keyframes with the most similar words, those are
-# matched that share the most of the image's strongest features.
+# The thorough pass extracts features at full size: maximum number, and longest side.
 _THOROUGH_FEATURES, _THOROUGH_PX = 3000, 1600
+# Of the keyframes with the most similar words (candidates), it matches the keyframes that share
+# the most of the image's strongest features (voters).
 _CANDIDATES, _VOTERS, _VOTED = 100, 300, 20
-# Then the points of keyframes near the pose are looked for where it puts them: within this angle
-# (8 px at f = 525 px), among this many nearest features: a camera with a long lens has all of them
-# there. Their descriptors are at least so similar.
+# It then searches for points of keyframes near the pose where the pose projects them: within this
+# angle (8 px at f = 525 px), among this many nearest features (a long lens has all features within
+# the angle), and with at least this cosine of the descriptors.
 _GUIDED_RADIUS, _GUIDED_NEAREST = 8.0 / 525.0, 10
 _GUIDED_COSINE, _GUIDED_KEYFRAMES = 0.8, 12
-# Points nearer to the camera than this are not looked for [m], nor those so far off its axis.
+# Points closer to the camera [m], or farther from its axis on the plane z = 1, are skipped.
 _GUIDED_LEAST_M, _GUIDED_MOST_BEARING = 0.1, 5.0
-#: With less time left, no pass begins [s]: finding features cannot be stopped.
+#: No pass begins with less time left [s]: the extraction of features cannot be interrupted.
 LEAST_S = 0.5
-#: Places of an image that do not agree with each other.
+#: Maximum number of mutually different places of an image.
 MOST_PLACES = 3
-# Similar keyframes; the search chooses among those elsewhere.
+# Number of similar keyframes among which keyframes at other places are chosen.
 _MOST_RANKED = 500
-#: A keyframe sees the same as a pose if it looks the same way from near enough: the shares of the
-#: two that it is away are less than 1 together.
+#: A keyframe has the view of a pose if distance / NEAR_M + angle / NEAR_DEG is less than 1.
 NEAR_M, NEAR_DEG = SAME_SIGHT
-# Samples of three points that are tried: for the first place, and for each one elsewhere.
+# Number of three-point samples: for the first place, and for each rival.
 _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
-# Points of the inliers and everything near them are removed before a rival is looked for.
+# Before the search for a rival, all points within this multiple of the tolerance are removed.
 _RIVAL_TOLERANCE = 3.0
-#: Nothing is known of the camera.
+#: No constraint on the camera.
 NOTHING_KNOWN = Constraint()
-# Cells of the image (columns, rows). A cell is comparable from this many points of keyframes and
-# features of the image on; an image has half as many features as a keyframe.
+# Cells of the image (columns, rows). A cell is comparable with at least this many points of a
+# keyframe and features of the image; an image has half as many features as a keyframe.
 _CELLS = (8, 6)
 _LEAST_EXPECTED, _LEAST_SEEN = 4, 2
-# Points near each other share errors, and several keyframes have the same point: the errors of
-# poses and focal lengths are this many times those of as many independent points. Of 570 right
-# poses of the kitchen and fr1, 92 % have a focal length within two such deviations.
+# Nearby points share errors, and several keyframes contain the same point: errors of poses and
+# focal lengths are larger by this factor than with independent points. Of 570 right poses of the
+# kitchen and fr1, 92 % have a focal length within two such deviations.
 _MUCH_ALIKE = 4.5
-# A rolling shutter stretches the image of a camera that turns: deviations of the logarithms of the
-# focal length and its aspect.
+# A rolling shutter stretches the image of a rotating camera: standard deviations of the logarithms
+# of focal length and aspect.
 _STRETCHED = (0.005, 0.01)
-# Errors that all points of a keyframe share: of its pose, and of its points, which matter the
-# more the further the image is from the keyframe. Chosen on the kitchen, see the study.
+# Errors that all points of a keyframe share: the error of its pose, and the error of its points,
+# which grows with distance and angle from the keyframe. Chosen on the kitchen, see the study.
 _KEYFRAME_M, _KEYFRAME_RAD, PER_RADIAN = 0.012, np.radians(0.45), 0.04
 
 
 class _Matched(NamedTuple):
-    """Matches of an image: feature, point in the map, its keyframe and row, k of each.
+    """The k matches of an image: features, points in the map, their keyframes and rows.
 
-    Their shares say how clear they are, see core.keyframes.features.match.
+    The shares measure how distinctive the matches are, see core.keyframes.features.match.
     """
 
     features: NDArray[np.int64]
@@ -101,16 +101,16 @@ class _Matched(NamedTuple):
 
 def query_features(image_rgb: NDArray[np.uint8], kind: FeatureKind = SIFT,
                    is_thorough: bool = False) -> Features:
-    """Return the features of an image (h, w, 3) that is to be localized, for one of two passes.
+    """Extract the features of an image (h, w, 3) to be localized, for the fast or thorough pass.
 
-    The kind is that of the layer in which it is localized.
+    The kind must be that of the layer.
     """
     return kind.extract(image_rgb, *((_THOROUGH_FEATURES, _THOROUGH_PX) if is_thorough
                                      else (kind.query_most, kind.query_px)))
 
 
 class ImageFeatures:
-    """The features of an image for both passes, each found when it is needed first.
+    """The features of an image for both passes, each extracted when it is first needed.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class ImageFeatures:
         self._found: dict[bool, tuple[Features, float]] = {}
 
     def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
-        """Return the features of a pass, and how long finding them took [ms]."""
+        """Return the features of a pass, and the time of their extraction [ms]."""
         if is_thorough not in self._found:
             image_rgb, begin = self._read_rgb(), time.perf_counter()
             features = query_features(image_rgb, self._kind, is_thorough)
@@ -137,7 +137,7 @@ class ImageFeatures:
 
 
 class _Look(NamedTuple):
-    """An image: its features, their bearings (n, 2), the camera and its constraints."""
+    """A query image: its features, their bearings (n, 2), the camera and its constraint."""
 
     features: Features
     bearings: NDArray[np.float64]
@@ -147,7 +147,7 @@ class _Look(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """A pose, the matches it was found among and those that agree, their features and cells."""
+    """A pose, all matches, its inliers, and the number of agreeing features, also per cell."""
 
     map_from_camera: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -168,7 +168,7 @@ class KeyframeLocalizer:
                           guesses: Sequence[NDArray[np.float64]] = (), deadline: float = np.inf,
                           constraint: Constraint = NOTHING_KNOWN, fast: Recognition | None = None
                           ) -> Recognition:
-        """Find where an image with these features was taken.
+        """Find the places where an image with these features may have been taken.
 
         Parameters
         ----------
@@ -177,22 +177,22 @@ class KeyframeLocalizer:
         guesses : sequence of ndarray (4, 4)
             Poses that objects propose; keyframes near them are matched, too.
         deadline : float
-            No further keyframe is matched then (monotonic clock) [s].
+            Time after which no further keyframe is matched (monotonic clock) [s].
         constraint : Constraint, optional
-            Poses that its height range or max_tilt excludes are not places.
+            Poses outside its height range or max_tilt are dropped.
         fast : Recognition, optional
-            What the fast pass found. With it, this is the thorough pass: many keyframes are
-            matched instead of a few, and the pose is refined by all of their points. It takes
-            several times as long.
+            Result of the fast pass. If given, this is the thorough pass: it matches many keyframes
+            instead of a few and refines the pose with all of their points, which takes several
+            times as long.
 
         Raises
         ------
         MapError
-            The features are of another kind than those of the layer.
+            The features are not of the kind of the layer.
         """
         kind, is_thorough = self.layer.kind, fast is not None
         if features.descriptors.shape[1] != kind.dimensions:
-            raise MapError(f'features of {features.descriptors.shape[1]} numbers, but the '
+            raise MapError(f'features have {features.descriptors.shape[1]} dimensions, but the '
                            f'keyframes have {kind.name}: extract them with the kind of the layer')
         bearings = camera.normalize_points(features.pixels)
         known = np.isfinite(bearings).all(axis=1)
@@ -206,8 +206,8 @@ class KeyframeLocalizer:
             places = _places(*self._search_fast(descriptors, look, guesses, deadline), look)
         else:
             places = _places(*self._search_thoroughly(
-                descriptors, look, guesses, [one.map_from_camera for one in fast.places], deadline
-            ), look)
+                descriptors, look, guesses, [place.map_from_camera for place in fast.places],
+                deadline), look)
             places[:1] = [self._guided(place, look, descriptors) for place in places[:1]]
         if time.monotonic() > deadline:
             return Recognition(is_complete=False, is_thorough=is_thorough)
@@ -217,13 +217,13 @@ class KeyframeLocalizer:
     def _search_fast(self, descriptors: NDArray[np.float32], look: _Look,
                      guesses: Sequence[NDArray[np.float64]], deadline: float
                      ) -> tuple['_Place | None', _Matched]:
-        """Return the best pose among a few similar keyframes, and all matches with them."""
+        """Find the best pose from a few similar keyframes; return it and all matches with them."""
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
         chosen = self._choose(ranks, guesses)
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
         if first is None or first.agreed < _ENOUGH_INLIERS:
-            # More keyframes: those near the pose so far, and the next in similarity.
+            # also match keyframes near the pose, and the next similar keyframes
             near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
                                    )[:_MORE].tolist() if first else []
             more = [rank for rank in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
@@ -240,9 +240,9 @@ class KeyframeLocalizer:
                            guesses: Sequence[NDArray[np.float64]],
                            found: Sequence[NDArray[np.float64]], deadline: float
                            ) -> tuple['_Place | None', _Matched]:
-        """Return the best pose among many voted keyframes, and all matches with them.
+        """Find the best pose from many voted keyframes; return it and all matches with them.
 
-        The poses (4, 4) that were found before compete, too.
+        The poses found by the fast pass (4, 4) compete, too.
         """
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable')[:_CANDIDATES]
         votes = [len(self._match(descriptors[:_VOTERS], [rank], deadline).features)
@@ -255,16 +255,16 @@ class KeyframeLocalizer:
         first = _place(matched, look, found=found)
         if first is not None:
             near = keyframes_near(self.layer.map_from_camera, first.map_from_camera)
-            more = [one for one in near[:_MORE].tolist() if one not in chosen]
+            more = [keyframe for keyframe in near[:_MORE].tolist() if keyframe not in chosen]
             matched = matched.join(self._match(descriptors, more, deadline))
             first = _place(matched, look, found=[first.map_from_camera])
         return first, matched
 
     def _guided(self, place: '_Place', look: _Look, descriptors: NDArray[np.float32]) -> '_Place':
-        """Return a place refined by all points that the image shows where the pose puts them.
+        """Refine a place with all points that the image shows at their projections.
 
-        They tell how far the place reaches in the image. They are no further evidence that it is
-        the right one: some are found near any place by chance.
+        These points show how much of the image the place covers. They are no further evidence that
+        the place is right: at any pose, some points match by chance.
         """
         camera_from_map = invert_transform(place.map_from_camera)
         near = keyframes_near(self.layer.map_from_camera, place.map_from_camera)
@@ -283,7 +283,7 @@ class KeyframeLocalizer:
             of_points, of_features = rows[of_points], nearest[of_points, ranks]
             cosines = np.einsum('kd,kd->k', self.layer.unit_descriptors(keyframe)[of_points],
                                 descriptors[of_features])
-            # pairs of which each is the other's most similar one there
+            # mutually most similar pairs
             order = np.argsort(-cosines, kind='stable')
             order = order[cosines[order] > _GUIDED_COSINE]
             mutual = np.intersect1d(np.unique(of_points[order], return_index=True)[1],
@@ -292,7 +292,7 @@ class KeyframeLocalizer:
             matched = matched.join(_Matched(
                 kept, theirs[of_points], np.full(len(kept), keyframe),
                 of_points + self.layer.rows(keyframe).start, np.ones(len(kept), np.float32)))
-        # a match counts once, however it was found
+        # drop duplicate matches
         _, kept = np.unique([matched.features, matched.rows], axis=1, return_index=True)
         matched = matched.select(np.sort(kept))
         refined = refine(matched.points, look.bearings[matched.features], camera_from_map)
@@ -301,13 +301,13 @@ class KeyframeLocalizer:
             inliers=matched.select(refined.inliers))
 
     def _used(self, place: '_Place') -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keyframes whose points agree with a place, the most first, and how many."""
+        """Return the keyframes with inliers, in decreasing order, and the inliers (K,) of each."""
         counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
         return np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)], counts
 
     def _search_further(self, descriptors: NDArray[np.float32], look: _Look, ranks: Sequence[int],
                         deadline: float) -> list[int]:
-        """Return the keyframes near a pose that many points of less similar keyframes support."""
+        """Search less similar keyframes for a pose; return the keyframes near it, or none."""
         matched = self._match(descriptors[:_STRONGEST], ranks[:_FURTHER], deadline)
         place = _place(matched, look, _RIVAL_ITERATIONS)
         if place is None or place.agreed < _CLEAR:
@@ -315,16 +315,16 @@ class KeyframeLocalizer:
         return keyframes_near(self.layer.map_from_camera, place.map_from_camera)[:_MORE].tolist()
 
     def coverage(self, map_from_camera: NDArray[np.float64], camera: Camera) -> float:
-        """Return the share of an image that the layer knows at a pose (4, 4).
+        """Return the share of an image that the layer covers at a pose (4, 4).
 
-        It counts the cells of the image in which keyframes near the pose expect points. Where it
-        is 0, no keyframe is near: that an image is not recognized says nothing about this place.
+        It is the share of cells of the image in which keyframes near the pose predict points. If
+        it is 0, no keyframe is near: failed recognition is then no evidence against this place.
         """
         near = keyframes_near(self.layer.map_from_camera, map_from_camera)
         return float(self._expects(near, map_from_camera, camera).mean())
 
     def _recognized(self, place: '_Place', look: '_Look', is_thorough: bool) -> RecognizedPlace:
-        """Return a place with the evidence for and against it."""
+        """Evaluate the evidence for and against a place."""
         used, counts = self._used(place)
         pose, shared = place.map_from_camera, self._shared(place.map_from_camera, counts)
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
@@ -337,7 +337,7 @@ class KeyframeLocalizer:
             is_thorough)
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
-        """Return the keyframes to match: similar keyframes, and keyframes near the guesses."""
+        """Choose the keyframes to match: similar keyframes, and keyframes near the guesses."""
         poses = self.layer.map_from_camera
         chosen = list(ranks[:_SIMILAR])
         others = np.array(ranks[_SIMILAR:_MOST_RANKED], dtype=np.int64)
@@ -346,7 +346,8 @@ class KeyframeLocalizer:
             chosen += others[:1].tolist()
         for guess in guesses:
             near = keyframes_near(poses, guess)
-            chosen += [one for one in near[:PROPOSED].tolist() if one not in chosen]
+            chosen += [keyframe for keyframe in near[:PROPOSED].tolist()
+                       if keyframe not in chosen]
         return chosen
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
@@ -370,11 +371,12 @@ class KeyframeLocalizer:
 
     def _confirmed(self, place: '_Place', look: '_Look', used: NDArray[np.int64]
                    ) -> tuple[float, float, tuple[int, int]]:
-        """Return which cells have inliers, of those where keyframes expect some.
+        """Count the cells with inliers among the comparable cells.
 
-        A cell without features, such as one that something covers, says nothing. The values are
-        the share of cells, the share expected of this number of inliers, whose density varies from
-        cell to cell (a geometric distribution), and the numbers of cells.
+        Return the share of confirmed cells, the share expected for this number of inliers, and the
+        numbers of confirmed and of comparable cells. A cell without features, such as an occluded
+        cell, is not comparable. The expected share assumes a geometric distribution of the inliers
+        in a cell, because their density varies from cell to cell.
         """
         seen = _count(look.features.pixels, look.camera)
         comparable = (seen >= _LEAST_SEEN) & self._expects(used, place.map_from_camera,
@@ -387,13 +389,13 @@ class KeyframeLocalizer:
 
     def _expects(self, keyframes: NDArray[np.int64], pose: NDArray[np.float64], camera: Camera
                  ) -> NDArray[np.bool_]:
-        """Return in which cells of an image the first of some keyframes expect points."""
+        """Return a mask of the cells of an image in which the first keyframes predict points."""
         counts = [_count(_project(self.layer.points_in_map(keyframe), pose, camera), camera)
                   for keyframe in keyframes[:_SIMILAR].tolist()]
         return np.max(counts, axis=0, initial=0) >= _LEAST_EXPECTED
 
     def _shared(self, pose: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the covariance (6, 6) of the errors that points of a keyframe share."""
+        """Return the covariance (6, 6) of the errors that the points of a keyframe share."""
         used = np.nonzero(counts)[0]
         shares = counts[used] / counts.sum()
         poses = self.layer.map_from_camera[used]
@@ -406,17 +408,17 @@ class KeyframeLocalizer:
 
 
 def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place]:
-    """Return the pose that most matches agree with, and the best poses elsewhere.
+    """Return the first place and its rivals, the best places elsewhere.
 
-    The one whose points lie in the most parts of the image comes first: a poster has many points,
-    but shows only a part of its place.
+    The place whose points lie in the most cells of the image comes first: a poster has many
+    points, but shows only a part of its place.
     """
     place, found, places = first, 0, list[_Place]()
     while place is not None and (not places or place.agreed >= LEAST_INLIERS):
         if look.constraint.allows(place.map_from_camera):
             found += 1
-            if not any(SAME_ANSWER.agree(place.map_from_camera, one.map_from_camera)
-                       for one in places):
+            if not any(SAME_ANSWER.agree(place.map_from_camera, other.map_from_camera)
+                       for other in places):
                 places.append(place)
         if found == MOST_PLACES:
             break
@@ -424,16 +426,17 @@ def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place
                          invert_transform(place.map_from_camera), _RIVAL_TOLERANCE)
         matched = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
         place = _place(matched, look, _RIVAL_ITERATIONS)
-    return sorted(places, key=lambda one: -np.count_nonzero(one.cells))
+    return sorted(places, key=lambda place: -np.count_nonzero(place.cells))
 
 
 def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
            found: Sequence[NDArray[np.float64]] = ()) -> _Place | None:
-    """Return the pose that most features agree with, a new one or one of those found before."""
+    """Return the place that most features agree with: a new pose, or a pose found earlier."""
     matched = matched.select(np.argsort(matched.shares, kind='stable'))
     bearings, places = look.bearings[matched.features], list[_Place]()
     for pose in (find_pose(matched.points, bearings, iterations, are_best_first=True),
-                 *(refine(matched.points, bearings, invert_transform(one)) for one in found)):
+                 *(refine(matched.points, bearings, invert_transform(earlier))
+                   for earlier in found)):
         if pose is None:
             continue
         inliers = matched.select(pose.inliers)
@@ -442,12 +445,12 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
             places.append(_Place(pose.map_from_camera, pose.covariance, matched, inliers,
                                  len(features), _count(look.features.pixels[features],
                                                        look.camera)))
-    return max(places, key=lambda one: one.agreed, default=None)
+    return max(places, key=lambda place: place.agreed, default=None)
 
 
 def _focal(place: _Place, look: _Look, used: NDArray[np.int64]
            ) -> tuple[float, float, float, float]:
-    """Return focal length and aspect, with deviations."""
+    """Return focal ratio and aspect ratio, each followed by its deviation."""
     among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
     found = free_focal(among.points, look.bearings[among.features],
                        invert_transform(place.map_from_camera))
@@ -459,7 +462,7 @@ def _focal(place: _Place, look: _Look, used: NDArray[np.int64]
 
 
 def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the keyframes whose views overlap that of a pose, the most similar first."""
+    """Return the keyframes whose views overlap the view of a pose, the closest first."""
     distances = np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1)
     cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], guess[:3, :3]) - 1.0)
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
@@ -478,7 +481,7 @@ def _project(points: NDArray[np.float64], pose: NDArray[np.float64], camera: Cam
 
 
 def _count(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
-    """Return how many pixels (m, 2) lie in each cell of the image."""
+    """Return the number of pixels (m, 2) in each cell of the image."""
     with np.errstate(invalid='ignore'):
         inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
     columns, rows = _CELLS
@@ -488,14 +491,14 @@ def _count(pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.int64]:
 
 
 class ImageRecognizer:
-    """The keyframe search of one image, which several searches of its objects ask.
+    """Keyframe search of one image; several searches of its objects share the result.
 
     Parameters
     ----------
     deadline : float
         See localize_features.
     begin_stage : callable
-        Takes the name of a stage that begins: 'keyframes', and 'search' after them.
+        Called with the name of each stage that begins: 'keyframes', followed by 'search'.
     may_be_thorough : bool
         Whether the image may be searched thoroughly.
     """
@@ -510,11 +513,11 @@ class ImageRecognizer:
         self._may_be_thorough = may_be_thorough
         self._known: tuple[set[int], Recognition] | None = None
         self._fast: Recognition | None = None
-        #: Time that it took so far [ms], features included.
+        #: Total time of recognition [ms], including features.
         self.spent_ms = 0.0
 
     def begin_thorough(self) -> bool:
-        """Search thoroughly from now on; False: it does already, may not, or has no time left."""
+        """Switch to the thorough pass; False if already in it, not allowed, or out of time."""
         if self._fast is not None or self._known is None or not self._may_be_thorough or (
                 self._deadline - time.monotonic() < LEAST_S):
             return False
@@ -523,7 +526,7 @@ class ImageRecognizer:
 
     def recognize(self, guesses: Sequence[NDArray[np.float64]],
                   constraint: Constraint = NOTHING_KNOWN) -> Recognition:
-        """Find where the image was taken; again only where guesses propose other keyframes."""
+        """Return the places of the image; search again only if guesses propose other keyframes."""
         near = {row for guess in guesses for row in keyframes_near(
             self._keyframes.layer.map_from_camera, guess)[:PROPOSED].tolist()}
         if self._known is None or not near <= self._known[0]:
@@ -540,7 +543,7 @@ class ImageRecognizer:
 
     @property
     def deviation_per_metre(self) -> float:
-        """Return the layer's, see KeyframeLayer."""
+        """Return deviation_per_metre of the KeyframeLayer."""
         return self._keyframes.layer.deviation_per_metre
 
     def coverage(self, map_from_camera: NDArray[np.float64]) -> float:

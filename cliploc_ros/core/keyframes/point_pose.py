@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose and covariance from points of the map and where an image shows them."""
+"""Pose and covariance of a camera from points of the map and their positions in the image."""
 
 from typing import NamedTuple
 
@@ -11,44 +11,54 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.kernels.compiled import compiled
 
-#: Fewer inliers determine no pose: three fix it, the others agree with it.
+#: Minimum number of inliers of a pose: three determine it, five confirm it.
 LEAST_INLIERS = 8
-# An inlier's reprojection is no further off, as an angle: 3 px at f = 525 px.
+# Maximum reprojection error of an inlier, as an angle: 3 px at f = 525 px.
 _MOST_ERROR = 3.0 / 525.0
+# Confidence at which MSAC stops sampling.
 _SURE = 0.9999
-# Least squares end after some steps, or one that is small [m, rad]; none changes the logarithm of
-# the focal length by more.
+# Least squares: maximum number of steps, length of a step that ends it [m, rad], and maximum
+# change of the logarithm of the focal length in a step.
 _STEPS, _SMALL_STEP, _MOST_STEP = 6, 1e-4, 0.3
-# Tolerances of the inliers, as multiples: for a pose of three points, and for one with a focal
-# length that may be half the true one. None is wrong by more than the logarithm.
+# Tolerances of the inliers, as multiples of _MOST_ERROR, used one after another: for a pose from
+# three points, and for a focal length that may be half the true value; maximum error of the
+# logarithm of the focal length.
 _ROUGH, _WRONG_FOCAL, _MOST_LOGARITHM = (2.0, 1.0), (12.0, 6.0, 3.0, 1.0), np.log(10.0)
-# Logarithms of the focal lengths of x and y, from those of both and of the aspect.
+# Maps the logarithms of focal length and aspect to those of the focal lengths of x and y.
 _OF_X_AND_Y = np.array([[1.0, 1.0], [1.0, -1.0]])
-# The least deviation of a feature, as an angle: half a pixel at f = 525 px.
+# Minimum standard deviation of a feature, as an angle: half a pixel at f = 525 px.
 _LEAST_DEVIATION = 0.5 / 525.0
-# Points behind the camera count as points before it at this depth [m].
+# Points behind the camera are treated as points in front of it at this depth [m].
 _LEAST_DEPTH = 1e-3
-# Standard deviation of a normal distribution over its median of absolute values.
+# Ratio of a normal distribution's standard deviation to its median absolute deviation.
 _FROM_MEDIAN = 1.4826
 
 
 class PointPose(NamedTuple):
-    """A pose that many points agree with."""
+    """A pose that many points support."""
 
     map_from_camera: NDArray[np.float64]  #: (4, 4)
-    inliers: NDArray[np.int64]  #: (k,): rows of the points that agree
-    #: (6, 6): from the features' deviations alone; in the order of core.fit.covariance
+    inliers: NDArray[np.int64]  #: (k,): rows of the agreeing points
+    #: (6, 6): due to the noise of the features alone; in the order of core.fit.covariance
     covariance: NDArray[np.float64]
 
 
 def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterations: int = 3000,
               are_best_first: bool = False) -> PointPose | None:
-    """Return the pose that most points agree with; None if there is none.
+    """Estimate the pose that most points agree with; return None if it has too few inliers.
 
-    MSAC of OpenCV finds it, and robust least squares refines it on the inliers. Its own local
-    optimization, MAGSAC++ and PoseLib took longer at equal success. Points (n, 3) are in the map
-    [m], bearings (n, 2) where the image shows them, on the plane z = 1. Where the best matches are
-    first, samples are drawn of them first (PROSAC; Chum and Matas 2005).
+    OpenCV's MSAC finds the pose, and robust least squares refines it on the inliers. MSAC's local
+    optimization, MAGSAC++ and PoseLib took longer without a higher success rate.
+
+    Parameters
+    ----------
+    points : ndarray (n, 3)
+        Points in the map [m].
+    bearings : ndarray (n, 2)
+        Their positions in the image, on the plane z = 1.
+    are_best_first : bool
+        The points are in order of preference: samples are drawn from the first points first
+        (PROSAC; Chum and Matas 2005).
     """
     if len(points) < LEAST_INLIERS:
         return None
@@ -57,7 +67,7 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterat
     if are_best_first:
         options.sampler = cv2.SAMPLING_PROSAC
     options.maxIterations, options.confidence, options.threshold = iterations, _SURE, _MOST_ERROR
-    middle = points.mean(axis=0)  # OpenCV computes with floats: keep numbers small
+    middle = points.mean(axis=0)  # OpenCV uses single precision: keep coordinates small
     try:
         found, _, vector, translation, _ = cv2.solvePnPRansac(
             points - middle, bearings, np.eye(3), None, params=options)
@@ -72,13 +82,13 @@ def find_pose(points: NDArray[np.float64], bearings: NDArray[np.float64], iterat
 
 def refine(points: NDArray[np.float64], bearings: NDArray[np.float64],
            camera_from_map: NDArray[np.float64]) -> PointPose | None:
-    """Return a pose after least squares with Cauchy's weights; None with too few inliers."""
+    """Refine a pose (4, 4) by least squares with Cauchy weights; None with too few inliers."""
     found = _fit(points, bearings, _Fit(camera_from_map, np.zeros(2), np.eye(6)), _ROUGH)
     if found is None:
         return None
     fit, inliers = found
-    # A step (v, w) from the left of camera_from_map moves the camera's place by -R^T v, and turns
-    # it by -R^T w about the map's axes; R is the rotation of camera_from_map.
+    # A step (v, w), applied to camera_from_map from the left, moves the camera by -R^T v and
+    # rotates it by -R^T w about the axes of the map; R is the rotation of camera_from_map.
     turn = np.kron(np.eye(2), -fit.camera_from_map[:3, :3].T)
     covariance = turn @ np.linalg.inv(fit.information) @ turn.T
     return PointPose(invert_transform(fit.camera_from_map), inliers,
@@ -88,27 +98,28 @@ def refine(points: NDArray[np.float64], bearings: NDArray[np.float64],
 def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
                camera_from_map: NDArray[np.float64]
                ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]] | None:
-    """Return the focal lengths that fit points best; None with too few of them.
+    """Estimate the focal lengths that fit the points best; return None with too few inliers.
 
-    Points that the given focal length keeps from agreeing count, too: the tolerance falls step by
-    step. Under a focal length that is half or twice the true one, a pose has but a few of them.
+    The tolerance decreases step by step, because points may disagree only due to a wrong focal
+    length. If the given focal length is half or twice the true value, a pose has few inliers.
 
     Parameters
     ----------
     points : ndarray (n, 3)
-        All that may agree, in the map [m].
+        All points that may agree, in the map [m].
     bearings : ndarray (n, 2)
-        As of find_pose, by the given focal length.
+        As in find_pose, computed with the given focal length.
     camera_from_map : ndarray (4, 4)
-        By the given focal length.
+        Pose estimated with the given focal length.
 
     Returns
     -------
     logarithms, deviations : ndarray (2,)
-        Logarithms of the focal length, as a multiple of the given one, and of its aspect, x to y:
-        the root of the quotient. Their standard deviations, from those of the features alone.
+        Logarithms of the focal length, as a multiple of the given value, and of its aspect: the
+        root of the ratio x to y. Their standard deviations, due to the noise of the features
+        alone.
     inliers : ndarray (k,) of int
-        Rows of the points that agree.
+        Rows of the agreeing points.
     """
     fit = _fit(points, bearings, _Fit(camera_from_map, np.zeros(2), np.eye(8)), _WRONG_FOCAL)
     return fit and (fit[0].logarithms,
@@ -116,10 +127,10 @@ def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
 
 
 class _Fit(NamedTuple):
-    """A pose, logarithms of the focal length and its aspect (2,), and the information.
+    """A pose, the logarithms of focal length and aspect (2,), and the information matrix.
 
-    It is of translation and rotation of the camera, and of the logarithms if it is (8, 8); with
-    (6, 6) they stay.
+    An information matrix (6, 6) is that of the camera's translation and rotation; the logarithms
+    stay constant. With (8, 8), they are estimated, too.
     """
 
     camera_from_map: NDArray[np.float64]
@@ -134,7 +145,7 @@ class _Fit(NamedTuple):
 
 def _fit(points: NDArray[np.float64], bearings: NDArray[np.float64], fit: _Fit,
          tolerances: tuple[float, ...]) -> tuple[_Fit, NDArray[np.int64]] | None:
-    """Fit again and again, to the points within one tolerance after another; None with too few."""
+    """Fit to the points within each tolerance, one after another; None with too few inliers."""
     for tolerance in tolerances:
         inliers = agreeing(points, bearings / fit.ratios, fit.camera_from_map, tolerance)
         if len(inliers) < LEAST_INLIERS:
@@ -149,7 +160,7 @@ def _fit(points: NDArray[np.float64], bearings: NDArray[np.float64], fit: _Fit,
 
 def agreeing(points: NDArray[np.float64], bearings: NDArray[np.float64],
              camera_from_map: NDArray[np.float64], tolerance: float = 1.0) -> NDArray[np.int64]:
-    """Return the rows (k,) of the points that a pose puts where the image shows them."""
+    """Return the rows (k,) of the points that a pose projects to their positions in the image."""
     inside = points @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
     with np.errstate(divide='ignore', invalid='ignore'):
         errors = np.linalg.norm(inside[:, :2] / inside[:, 2:] - bearings, axis=1)
@@ -157,7 +168,7 @@ def agreeing(points: NDArray[np.float64], bearings: NDArray[np.float64],
 
 
 def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64], fit: _Fit) -> _Fit:
-    """Return a fit after some steps of Gauss and Newton."""
+    """Return a fit after Gauss-Newton steps."""
     points, bearings = np.ascontiguousarray(points), np.ascontiguousarray(bearings)
     for _ in range(_STEPS):
         information, gradient = _normal_equations(
@@ -165,7 +176,7 @@ def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64], f
             len(fit.information))
         try:
             step = -np.linalg.solve(information, gradient)
-        except np.linalg.LinAlgError:  # the points fix no pose
+        except np.linalg.LinAlgError:  # the points do not determine a pose
             return fit._replace(information=information)
         step /= max(1.0, np.abs(step[6:]).max(initial=0.0) / _MOST_STEP)
         moved = make_transform(cv2.Rodrigues(step[3:6])[0], step[:3])
@@ -178,10 +189,10 @@ def _least_squares(points: NDArray[np.float64], bearings: NDArray[np.float64], f
 
 @compiled
 def _normal_equations(points, bearings, camera_from_map, ratios, size):
-    """Return the information (size, size) and the gradient of a fit with Cauchy's weights.
+    """Return the information (size, size) and the gradient (size,) of a fit with Cauchy weights.
 
-    The unknowns are a step (v, w) from the left of camera_from_map, and with a size of 8 the
-    logarithms of the focal length and its aspect. Residuals are divided by their deviation.
+    The unknowns are a step (v, w), applied to camera_from_map from the left, and, with size 8, the
+    logarithms of focal length and aspect. Residuals are divided by their standard deviation.
     """
     count = len(points)
     seen, residuals = np.empty((count, 3)), np.empty(2 * count)
@@ -199,7 +210,8 @@ def _normal_equations(points, bearings, camera_from_map, ratios, size):
     jacobian = np.empty((2, 8))
     for row in range(count):
         u, v, one = seen[row]
-        # of the residuals times the focal length: else an endless one would fit best
+        # Jacobian of the residuals times the focal length: otherwise, an infinite focal length
+        # would fit best
         jacobian[0] = one, 0.0, -u * one, -u * v, 1.0 + u * u, -v, u, u
         jacobian[1] = 0.0, one, -v * one, -1.0 - v * v, u * v, u, v, -v
         square = (residuals[2 * row] ** 2 + residuals[2 * row + 1] ** 2) / deviation ** 2

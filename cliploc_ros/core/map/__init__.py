@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The map: landmarks, one map or several, their files, and their indices.
+"""The map: landmarks, joined maps, map files, and indices.
 
 landmark_map
-    The map, its landmarks by class, and how its file is read; landmark_details has its optional
+    The map, its landmarks by class, and the reader of its file; landmark_details has the optional
     fields.
 landmark_embeddings
     Image embeddings of each landmark, and their comparison with crops.
@@ -12,7 +12,7 @@ joined_map
 map_file, parameter_file
     Write a map, read it fast, and read any parameter file without ROS.
 similarities, pairs, culling
-    The landmarks by similarity of their labels, by pairs, and by place.
+    Find landmarks by similarity of their labels, by pairs, and by position.
 visibility
-    The landmarks that an image should show, and those that are gone.
+    Find the landmarks that an image should show, and landmarks that are gone.
 """

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frustum culling with a tree of bounding spheres: only landmarks in view are compared.
 
-A landmark can overlap a box by more than the threshold only if it reaches into the frustum
+A landmark can overlap a box by more than the threshold only if it extends into the frustum
 through the boxes of its class, and if it is near enough to appear large enough. Culling drops
-only the others, so it changes no result. The map is sorted along a Morton curve once. Each frame
-builds a tree over the landmarks of the classes that it shows; the tree also bounds their depth.
+all other landmarks, so it changes no result. The map is sorted along a Morton curve once. For each
+frame, a tree is built over the landmarks of the detected classes; it also bounds their depth.
 """
 
 from math import inf
@@ -17,60 +17,60 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.ellipsoid import project
 from cliploc_ros.core.kernels.compiled import compiled
 
-#: Up to this number of landmarks, comparing with all is faster than culling.
+#: Up to this number of landmarks, a comparison with all landmarks is faster than culling.
 FEW = 64
 # Children of each sphere of the tree.
 _BRANCHES = 8
-# All that 64 bits hold: joined maps are far apart.
+# Bits for each axis: the maximum for three axes in 64 bits, because joined maps are far apart.
 _MORTON_BITS = 21
 # Landmarks that appear larger than this half angle are never culled by depth.
 _NEAR_ANGLE = np.radians(10.0)
 
 
 class SortedLandmarks(NamedTuple):
-    """All landmarks of a map along a Morton curve, so that neighbours have near rows: m rows.
+    """All landmarks of a map in m rows along a Morton curve: neighbours have nearby rows.
 
     A landmark has a row for each of its classes.
     """
 
-    landmarks: NDArray[np.float64]  #: (m, 9): centre and shape of each
-    radii: NDArray[np.float64]  #: (m,): greatest semi-axis of each [m]
-    numbers: NDArray[np.int64]  #: (m,): row of each in the map
-    classes: NDArray[np.int32]  #: (m,): class number of each
+    landmarks: NDArray[np.float64]  #: (m, 9): centre and shape
+    radii: NDArray[np.float64]  #: (m,): greatest semi-axis [m]
+    numbers: NDArray[np.int64]  #: (m,): row in the map
+    classes: NDArray[np.int32]  #: (m,): class number
 
 
 class Groups(NamedTuple):
-    """The landmarks of the classes that a frame shows: g classes, w landmarks, m spheres.
+    """The landmarks of the detected classes: g classes, w landmarks, m spheres.
 
     A group is a class: its detections may show any of its landmarks, the members.
     """
 
-    starts: NDArray[np.int64]  #: (g + 1,): where the detections of each group begin in detections
+    starts: NDArray[np.int64]  #: (g + 1,): index in `detections` of the first of each group
     detections: NDArray[np.int64]  #: (v,)
-    #: (g + 1, 4, 2): unit normals, inwards, of the sides of the frustum through the boxes of each
+    #: (g + 1, 4, 2): inward unit normals of the sides of the frustum through the boxes of each
     #: group: x and z of left and right, y and z of top and bottom. The last row is the frustum
-    #: through all.
+    #: through all boxes.
     frusta: NDArray[np.float64]
-    #: (w, 2): row among the sorted landmarks, in their order, and group
+    #: (w, 2): row among the sorted landmarks, ascending, and group
     members: NDArray[np.int32]
-    #: (d + 1,): where each level of the tree begins in spheres. The first level has a sphere for
-    #: each member, the next one for each eight of them, up to the root.
+    #: (d + 1,): index in `spheres` of the first sphere of each level of the tree. The first level
+    #: has a sphere for each member, the next level one for each eight spheres, up to the root.
     levels: NDArray[np.int64]
-    #: (m, 5): centre and radius of a sphere around all members below, and the depth of the centre
+    #: (m, 5): centre and radius of a sphere around all its members, and the depth of the centre
     #: beyond which all of them appear too small [m]
     spheres: NDArray[np.float64]
 
 
 def sort_landmarks(centers: NDArray[np.float64], shapes: NDArray[np.float64],
                    members: NDArray[np.int64]) -> SortedLandmarks:
-    """Return the landmarks of a map along a Morton curve.
+    """Sort the landmarks of a map along a Morton curve.
 
     Parameters
     ----------
     centers, shapes : ndarray (L, 3), (L, 6)
         See cliploc_ros.core.geometry.ellipsoid.
     members : ndarray (m, 2) of int
-        Landmark and class number, see ClassIndex.members.
+        Landmarks and class numbers, see ClassIndex.members.
     """
     members = members[np.argsort(morton_codes(centers[members[:, 0]]), kind='stable')]
     numbers, classes = members.T
@@ -90,24 +90,24 @@ def no_landmarks() -> SortedLandmarks:
 
 def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
                 boxes: NDArray[np.float64], iou_threshold: float) -> Groups:
-    """Return the groups of a frame.
+    """Group the landmarks of a frame by detected class.
 
     Parameters
     ----------
     classes : ndarray (n,) of int
-        Class of each detection, as the sorted landmarks have them; below 0 for none.
+        Class of each detection, as numbered in sorted_landmarks; negative: no class of the map.
     boxes : ndarray (n, 4)
         Box ellipses, see Scene.
     iou_threshold : float
         Landmarks that cannot overlap a box by more than this are culled.
     """
     shown = np.unique(classes[classes >= 0])
-    rows = [np.nonzero(classes == one)[0] for one in shown]
-    frusta = np.array([_frustum(boxes[some]) for some in (*rows, classes >= 0)])
-    # of the greatest angle between the optical axis and a corner of each box
+    rows = [np.nonzero(classes == class_number)[0] for class_number in shown]
+    frusta = np.array([_frustum(boxes[of_group]) for of_group in (*rows, classes >= 0)])
+    # tangents of the greatest angle between the optical axis and a corner of each box
     tangents = np.linalg.norm(np.abs(boxes[:, :2]) + boxes[:, 2:], axis=1)
-    reaches = np.array([_reach(iou_threshold * float(boxes[some, 2:].prod(axis=1).min()),
-                               float(np.arctan(tangents[some].max()))) for some in rows],
+    reaches = np.array([_reach(iou_threshold * float(boxes[of_group, 2:].prod(axis=1).min()),
+                               float(np.arctan(tangents[of_group].max()))) for of_group in rows],
                        dtype=np.float64)
     members = _members(sorted_landmarks.classes, shown)
     radii = sorted_landmarks.radii[members[:, 0]]
@@ -118,7 +118,7 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
 
 
 def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return row and group (w, 2) of each landmark whose class is among the sorted classes."""
+    """Return row and group (w, 2) of each landmark whose class is among the shown classes."""
     if not len(shown):
         return np.empty((0, 2), dtype=np.int32)
     of_classes = np.full(max(classes.max(initial=0), shown[-1]) + 1, -1, dtype=np.int32)
@@ -130,7 +130,7 @@ def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np
 
 def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
                depths: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return levels and spheres of the tree over some landmarks, see Groups."""
+    """Build the tree over the members; return its levels and spheres, see Groups."""
     spheres = [np.c_[centers, radii, depths]]
     low = high = centers
     while len(low) > 1:
@@ -159,7 +159,7 @@ def morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:
 
 
 def _frustum(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sides (4, 2) of the frustum through some boxes, see Groups."""
+    """Return the sides (4, 2) of the frustum through boxes, see Groups."""
     if not len(boxes):
         return np.zeros((4, 2))
     low = (boxes[:, :2] - boxes[:, 2:]).min(axis=0)
@@ -184,14 +184,14 @@ def _reach(least_axes: float, angle: float) -> float:
 
 @compiled
 def visible_members(groups, poses, which, seen):
-    """Write the members that a pose may see into the first row of seen; return their number.
+    """Write the members that may be visible at a pose into seen[0]; return their number.
 
-    The inner loop has no branches: which members are visible is hard to predict.
+    The inner loop has no branches, because they would be hard to predict.
 
     Parameters
     ----------
     seen : ndarray (2, w) of int
-        The second row holds their parents in the tree.
+        Output; the second row is a buffer for their parents in the tree.
     """
     rotations, translations = poses.rotations, poses.translations
     frusta, members, levels, spheres = groups.frusta, groups.members, groups.levels, groups.spheres
@@ -230,14 +230,14 @@ def visible_members(groups, poses, which, seen):
 
 @compiled
 def project_visible(landmarks, groups, poses, which, seen, outlines, owners, out):
-    """Project the members that a pose may see; return where their outlines end.
+    """Project the members that may be visible at a pose; return the row after their outlines.
 
     Parameters
     ----------
     landmarks : ndarray (L, 9)
         See SortedLandmarks.
     outlines, owners : ndarray (o, 6), (o,)
-        Outlines that are visible and the group of each, written from row out on.
+        Output: visible outlines and the group of each, from row `out`.
     """
     members = groups.members
     for place in range(visible_members(groups, poses, which, seen)):

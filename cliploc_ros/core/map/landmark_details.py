@@ -10,7 +10,7 @@ from typing import Any
 
 from cliploc_ros.errors import MapError
 
-#: A class with a smaller share of its boxes makes no candidate of a landmark. A guess.
+#: Minimum share of a landmark's boxes for a class to yield candidates. A guess.
 LEAST_CLASS_SHARE = 0.1
 #: Labels that describe one landmark, with their weights.
 WeightedLabels = tuple[tuple[str, float], ...]
@@ -18,26 +18,26 @@ WeightedLabels = tuple[tuple[str, float], ...]
 
 @dataclass(frozen=True)
 class LandmarkDetails:
-    """Optional fields of a landmark. A field that the map lacks is None."""
+    """Optional fields of a landmark. A field that is missing in the map is None."""
 
     labels: WeightedLabels | None = None  #: Phrases with their weights, all above 0
-    #: Detector classes with their share of the landmark's boxes, all above 0
+    #: Detector classes with their shares of the landmark's boxes, all above 0
     class_weights: tuple[tuple[str, float], ...] | None = None
     position_sigma: float | None = None  #: Standard deviation of the centre on each axis [m]
-    #: In addition, the landmark and its neighbours are displaced together, and turned together
-    #: about the cameras near them: standard deviations on each axis [m] [deg]
+    #: Additional error that the landmark shares with its neighbours, a common shift and a common
+    #: rotation about nearby cameras: standard deviations on each axis [m] [deg]
     shared_sigma: float | None = None
     shared_sigma_deg: float | None = None
-    support: int | None = None  #: Frames that the landmark was fitted to
-    #: Share of the frames which show the landmark's place in which it was detected, 0 to 1
+    support: int | None = None  #: Number of frames that the landmark was fitted to
+    #: Share of the frames showing the landmark's place in which it was detected, 0 to 1
     seen_ratio: float | None = None
-    #: Greatest angle between two directions from which it was seen [deg]
+    #: Maximum angle between two directions from which it was seen [deg]
     baseline_deg: float | None = None
     last_seen: float | None = None  #: Time of the last frame that showed it [s]
-    source: str | None = None  #: Where it comes from
+    source: str | None = None  #: Origin of the landmark
 
     def labels_with(self, label: str) -> WeightedLabels:
-        """Return the labels; one that they lack, such as an edited one, counts like the best."""
+        """Return the labels including `label`; if it is new (edited), it gets the top weight."""
         if self.labels is None:
             return ((label, 1.0),)
         if any(text == label for text, _ in self.labels):
@@ -45,38 +45,39 @@ class LandmarkDetails:
         return ((label, max(weight for _, weight in self.labels)), *self.labels)
 
     def likely_classes(self) -> tuple[str, ...]:
-        """Return the classes whose share is great enough for a correspondence candidate."""
+        """Return the classes with a share of at least LEAST_CLASS_SHARE."""
         weights = dict(self.class_weights or ())
         least = LEAST_CLASS_SHARE * sum(weights.values())
         return tuple(name for name, weight in weights.items() if weight >= least)
 
     def class_shares(self) -> tuple[tuple[str, float], ...]:
-        """Return the likely classes, each with its weight over the greatest one."""
+        """Return the likely classes, each with its weight divided by the greatest weight."""
         weights = dict(self.class_weights or ())
         most = max(weights.values(), default=1.0)
         return tuple((name, weights[name] / most) for name in self.likely_classes())
 
 
 def join_details(parts: Sequence[tuple[str, str, LandmarkDetails]]) -> LandmarkDetails:
-    """Return the details of one thing that is several landmarks: label, class and details of each.
+    """Join the details of landmarks that are one object, given as (label, class, details).
 
-    It has the labels and classes of all, weighted by the frames that show each, and else what the
-    first one has.
+    The result has the labels and classes of all parts, weighted by their numbers of frames, and
+    the other fields of the first part.
     """
     first = parts[0][2]
-    labels = _shares([(one.labels_with(label), one.support or 1) for label, _, one in parts])
-    classes = _shares([(one.class_weights or ((name, 1.0),), one.support or 1)
-                       for _, name, one in parts])
+    labels = _shares([(details.labels_with(label), details.support or 1)
+                      for label, _, details in parts])
+    classes = _shares([(details.class_weights or ((name, 1.0),), details.support or 1)
+                       for _, name, details in parts])
     return replace(first, labels=labels if len(labels) > 1 else first.labels,
                    class_weights=classes if len(classes) > 1 else first.class_weights)
 
 
 def _shares(parts: Sequence[tuple[WeightedLabels, int]]) -> WeightedLabels:
-    """Return the shares of names in weighted parts, the greatest first."""
+    """Return the shares of names in weighted parts, in decreasing order."""
     shares = defaultdict[str, float](float)
     for names, weight in parts:
         for name, share in names:
-            shares[name] += share * weight / sum(one for _, one in names)
+            shares[name] += share * weight / sum(other for _, other in names)
     total = sum(shares.values())
     return tuple((name, shares[name] / total) for name in sorted(
         shares, key=lambda name: -shares[name]))
@@ -88,12 +89,13 @@ _NUMBERS = ('position_sigma', 'shared_sigma', 'shared_sigma_deg', 'support', 'se
 
 
 def read_details(tree: Mapping[str, Any], where: str) -> LandmarkDetails:
-    """Return the optional fields among a landmark's fields.
+    """Read the optional fields among a landmark's fields.
 
-    Labels are two lists of equal length, ``{text: [...], weight: [...]}``, since a ROS parameter
-    holds no list of mappings; such a list, ``[{text: ..., weight: ...}, ...]``, is read as well.
+    Labels are two lists of equal length, ``{text: [...], weight: [...]}``, because a ROS parameter
+    cannot be a list of mappings. A list of mappings, ``[{text: ..., weight: ...}, ...]``, is
+    accepted, too.
 
-    MapError: names the landmark and the field to correct.
+    Raises MapError if a field is invalid; the message names the landmark and the field.
     """
     values: dict[str, Any] = {}
     for name in OPTIONAL_FIELDS:
@@ -128,7 +130,7 @@ def _label_rows(value: Any, where: str) -> list[tuple[Any, Any]]:
 
 def _weighted(rows: list[tuple[Any, Any]], where: str) -> tuple[tuple[str, float], ...]:
     if not rows:
-        raise MapError(f'{where}: is empty; leave the field out')
+        raise MapError(f'{where}: is empty; omit the field')
     pairs = tuple((_text(text, where), _number(weight, where)) for text, weight in rows)
     if any(weight <= 0.0 for _, weight in pairs):
         raise MapError(f'{where}: weights must be above 0')
@@ -137,7 +139,7 @@ def _weighted(rows: list[tuple[Any, Any]], where: str) -> tuple[tuple[str, float
 
 def _text(value: Any, where: str) -> str:
     if not isinstance(value, str) or not value.strip():
-        raise MapError(f'{where}: must be text that is not empty, not {value!r}')
+        raise MapError(f'{where}: must be non-empty text, not {value!r}')
     return value
 
 

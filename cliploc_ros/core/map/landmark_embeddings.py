@@ -16,24 +16,24 @@ from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.arrays import UNIQUE, ArrayError, Arrays, Check, Field, Offsets, Schema
 
-#: The most medoids of one landmark.
+#: Maximum number of medoids of a landmark.
 MOST_MEDOIDS = 5
-# Landmarks whose images stand for crops where spreads are measured.
+# Number of landmarks whose images represent crops when spreads are measured.
 _CROPS_SAMPLED = 1024
 
 
 def _check_key(name: str, arrays: Arrays) -> None:
     if not str(arrays[name]):
-        raise ArrayError(f'array {name} is empty: it names no encoder')
+        raise ArrayError(f'array {name} is empty: the encoder is unknown')
 
 
 def _is_no_direction(rows: NDArray[Any]) -> NDArray[np.bool_]:
-    # float16 rounds each number by up to 5e-4 of it
+    # float16 has a relative rounding error of up to 5e-4
     lengths = np.linalg.norm(rows.astype(np.float32), axis=1)
     return np.asarray(~(np.abs(lengths - 1.0) <= 5e-3))  # true for NaN
 
 
-# L landmarks, m medoids, d numbers.
+# L landmarks, m medoids, d dimensions.
 _SCHEMA = Schema('file of embeddings', {
     'encoder_key': Field('text', (), (_check_key,)),
     'landmark_ids': Field('text', ('L',), (UNIQUE,)),
@@ -49,19 +49,18 @@ _SCHEMA = Schema('file of embeddings', {
 
 @dataclass(frozen=True)
 class LandmarkEmbeddings:
-    """Image embeddings of L landmarks: d numbers each."""
+    """Image embeddings of L landmarks, with d dimensions."""
 
-    #: Identifies the encoder: crops of another one must not be compared with these
+    #: Identifies the encoder: crops from another encoder must not be compared with the embeddings
     encoder_key: str
-    landmark_ids: tuple[str, ...]  #: The landmarks, each once
-    #: (L, d): the mean direction of each landmark's crops, unit rows; a zero row is unknown
+    landmark_ids: tuple[str, ...]  #: The landmarks, without repetitions
+    #: (L, d): mean direction of each landmark's crops, unit rows; zeros: unknown
     means: NDArray[np.float16]
-    #: (m, d): crops that stand for all crops of their landmark, unit rows
+    #: (m, d): representative crops of each landmark, unit rows
     medoids: NDArray[np.float16]
-    #: (L + 1,): landmark l has the medoids from medoid_offsets[l] up to medoid_offsets[l + 1], at
-    #: most five
+    #: (L + 1,): landmark l has the medoids [medoid_offsets[l], medoid_offsets[l + 1]), up to five
     medoid_offsets: NDArray[np.int64]
-    set_digest: str = ''  #: Digest of the map that they were written with; '' if it is unknown
+    set_digest: str = ''  #: Digest of the map that they were written with; '' if unknown
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -69,11 +68,11 @@ class LandmarkEmbeddings:
 
     @property
     def is_known(self) -> NDArray[np.bool_]:
-        """Return whether each landmark (L,) has an embedding."""
+        """Return a mask (L,) of the landmarks that have an embedding."""
         return np.asarray(self.means.any(axis=1))
 
     def in_order(self, landmark_ids: Sequence[str]) -> 'LandmarkEmbeddings':
-        """Return the embeddings of some landmarks in the order given, unknown if missing."""
+        """Return the embeddings of the given landmarks in the given order, unknown if missing."""
         rows_of = {landmark_id: row for row, landmark_id in enumerate(self.landmark_ids)}
         rows = np.array([rows_of.get(landmark_id, -1) for landmark_id in landmark_ids],
                         dtype=np.int64)
@@ -88,26 +87,26 @@ class LandmarkEmbeddings:
 
 def concatenated(several: Sequence[LandmarkEmbeddings], landmark_ids: Sequence[str]
                  ) -> LandmarkEmbeddings:
-    """Return the embeddings of several maps, of one encoder and in their order, as one."""
-    counts = np.concatenate([np.diff(one.medoid_offsets) for one in several])
+    """Concatenate the embeddings of several maps, which have the same encoder."""
+    counts = np.concatenate([np.diff(of_map.medoid_offsets) for of_map in several])
     return LandmarkEmbeddings(
         several[0].encoder_key, tuple(landmark_ids),
-        np.concatenate([one.means for one in several]),
-        np.concatenate([one.medoids for one in several]), np.append(0, np.cumsum(counts)))
+        np.concatenate([of_map.means for of_map in several]),
+        np.concatenate([of_map.medoids for of_map in several]), np.append(0, np.cumsum(counts)))
 
 
 def embeddings_path(map_path: str | os.PathLike[str]) -> Path:
-    """Return the file of a map's embeddings: NAME.embeddings.npz next to NAME.yaml."""
+    """Return the path of a map's embeddings: NAME.embeddings.npz next to NAME.yaml."""
     return Path(map_path).with_suffix('.embeddings.npz')
 
 
 def load_embeddings_of_map(map_path: str | os.PathLike[str], landmark_ids: Sequence[str],
                            map_set: MapSet = NO_SET) -> LandmarkEmbeddings | None:
-    """Return the embeddings of a map's landmarks, in its order; None if it has no such file.
+    """Read the embeddings of a map's landmarks, in the map's order; None if there is no file.
 
-    Landmarks that were removed from the map are left out; added landmarks are unknown.
+    Landmarks that were removed from the map are dropped; added landmarks are unknown.
 
-    MapError: the file is invalid, of another set, or has none of these landmarks.
+    Raises MapError if the file is invalid, belongs to another set, or has none of the landmarks.
     """
     path = embeddings_path(map_path)
     if not path.exists():
@@ -118,14 +117,16 @@ def load_embeddings_of_map(map_path: str | os.PathLike[str], landmark_ids: Seque
     except ValueError as error:
         raise _SCHEMA.invalid(path, error) from error
     if not set(embeddings.landmark_ids) & set(landmark_ids):
-        raise MapError(f'{path}: holds no landmark of {map_path}: it is of another map; remove it')
+        raise MapError(f'{path}: contains no landmark of {map_path}: it is of another map; '
+                       'remove it')
     return embeddings.in_order(landmark_ids)
 
 
 def load_landmark_embeddings(path: str | os.PathLike[str]) -> LandmarkEmbeddings:
     """Read and validate a file of landmark embeddings.
 
-    MapError: names the file, the array, what is wrong with it, and what to do.
+    Raises MapError if it is invalid; the message names the file, the array, the fault and what to
+    do.
     """
     arrays = _SCHEMA.read(Path(path))
     return LandmarkEmbeddings(
@@ -136,9 +137,9 @@ def load_landmark_embeddings(path: str | os.PathLike[str]) -> LandmarkEmbeddings
 
 def save_landmark_embeddings(path: str | os.PathLike[str], embeddings: LandmarkEmbeddings
                              ) -> None:
-    """Write landmark embeddings in one step: an existing file is replaced complete, or stays.
+    """Write landmark embeddings atomically.
 
-    MapError: the embeddings are malformed, or the file cannot be written.
+    Raises MapError if the embeddings are malformed or the file cannot be written.
     """
     _SCHEMA.write(Path(path), {
         'encoder_key': np.array(embeddings.encoder_key, dtype=np.str_),
@@ -151,27 +152,27 @@ def save_landmark_embeddings(path: str | os.PathLike[str], embeddings: LandmarkE
 
 def with_images(labels: LabelEmbeddings, images: LandmarkEmbeddings, compare: str
                 ) -> LabelEmbeddings:
-    """Return a row for each landmark that compares crops with images, or with images and labels.
+    """Combine label and image embeddings into one row for each landmark, for use with crops.
 
-    A landmark without images keeps its label; where images alone are compared, its label's
-    similarity is scaled and shifted to those of images.
+    A landmark without images keeps its label. If crops are compared with images alone, its label's
+    similarity is scaled and shifted to the range of image similarities.
 
     Parameters
     ----------
     labels : LabelEmbeddings
         Label embeddings of L landmarks.
     images : LandmarkEmbeddings
-        Image embeddings of the same landmarks, at least one of them known.
+        Image embeddings of these landmarks, at least one of them known.
     compare : str
         'image' or 'both'.
     """
     known = np.flatnonzero(images.is_known)
     means = images.means.astype(np.float32)
-    # The deviation of a crop's similarities over the map, with labels and with images.
+    # standard deviation of a crop's similarities over the map, with labels and with images
     sample = known[::-(-len(known) // _CROPS_SAMPLED)]
     crops = means[sample]
     with_labels = (crops @ labels.unique[labels.of_landmarks[sample]].T).std(axis=1).mean()
-    others = ~np.eye(len(sample), dtype=np.bool_)  # a mean's similarity with itself says nothing
+    others = ~np.eye(len(sample), dtype=np.bool_)  # without each mean's similarity to itself
     with_means = (crops @ crops.T).std(axis=1, where=others).mean() if len(sample) > 1 else 0.0
     text_spread, image_spread = max(float(with_labels), 1e-6), max(float(with_means), 1e-6)
     rows = np.asarray(labels, dtype=np.float32)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The map: ellipsoidal landmarks, each with a label in natural language; landmarks by class."""
+"""The map: ellipsoidal landmarks with labels in natural language, and their index by class."""
 
 import math
 import os
@@ -45,18 +45,18 @@ from cliploc_ros.files.storage import finish_set
 
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
-#: Standard deviation of a centre on each axis [m] where the map has no position_sigma: a guess for
-#: maps made by hand. Landmarks of build_map have .012 (median, TUM fr3), simulated ones .005 to
-#: .04. On the TUM map, which has none, 0 to .03 localize equally well.
+#: Standard deviation of a centre on each axis [m] if the map has no position_sigma: a guess for
+#: handmade maps. Landmarks of build_map have .012 (median, TUM fr3), simulated landmarks .005 to
+#: .04. On the TUM map, which has no position_sigma, 0 to .03 localize equally well.
 DEFAULT_SIGMA_M = 0.02
 _MAX_TEXT_LENGTH = 1000
 # Squares and fourth powers of lengths in this range neither underflow nor overflow.
 _SEMI_AXIS_RANGE_M = (1e-4, 1e4)
 _MAX_COORDINATE_M = 1e7
 _MAX_QUATERNION_NORM_ERROR = 0.01
-# Distance of two classes in the tree that has the class as a fourth coordinate.
+# Distance between two classes in the tree that has the class as a fourth coordinate.
 _CLASS_DISTANCE_M = 10.0
-# To find duplicates, each landmark is compared with its three nearest neighbours of the same class
+# To find duplicates, each landmark is compared with this number of nearest neighbours of its class
 # within this distance.
 _COMPARED, _NEAR_M = 3, 0.5
 
@@ -65,29 +65,29 @@ _COMPARED, _NEAR_M = 3, 0.5
 class ClassIndex:
     """The landmarks of each class: L landmarks, C classes, m memberships.
 
-    A landmark is a member of its own class, and of others that the detector takes it for.
+    A landmark is a member of its own class and of classes that the detector confuses it with.
     """
 
     numbers: Mapping[str, int]  #: Number of each class name, 0 to C - 1; own classes come first
     of_landmarks: NDArray[np.int64]  #: (L,): number of each landmark's own class
     #: (m,): landmarks grouped by class, in the map's order within a class
     landmarks: NDArray[np.int64]
-    starts: NDArray[np.int64]  #: (C + 1,): where each class begins in landmarks
-    #: Share of a class, by (landmark, class), relative to the landmark's most frequent class, 0 to
-    #: 1; missing pairs count 1
+    starts: NDArray[np.int64]  #: (C + 1,): index in `landmarks` of the first member of each class
+    #: Frequency of a class relative to the landmark's most frequent class, by (landmark, class),
+    #: 0 to 1; missing pairs have 1
     weights: Mapping[tuple[int, int], float] = field(default_factory=dict)
 
     @staticmethod
     def of(landmark_classes: Sequence[str], others: Sequence[tuple[int, str]] = (),
            weights: Mapping[tuple[int, str], float] | None = None) -> 'ClassIndex':
-        """Return the index of a map's classes.
+        """Build the index of a map's classes.
 
         Parameters
         ----------
         others : sequence of (int, str)
-            A landmark and another class of it, each pair once.
+            Unique pairs of a landmark and another of its classes.
         weights : mapping, optional
-            Weights of a landmark and a class of it, see ClassIndex.
+            Weight of each pair of a landmark and one of its classes, see ClassIndex.
         """
         names = [*landmark_classes, *(name for _, name in others)]
         numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
@@ -107,22 +107,22 @@ class ClassIndex:
         return np.column_stack([self.landmarks[order], classes[order]])
 
     def are_own(self, classes: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether each class (n,) is the own class of a landmark, not a confusion."""
+        """Return a mask (n,): the class is some landmark's own class, not only a confusion."""
         return np.asarray((classes >= 0) & (classes <= self.of_landmarks.max(initial=-1)))
 
     def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
              ) -> NDArray[np.bool_]:
-        """Return whether landmarks (p,) are members of classes (p,); no class below 0."""
-        # a class below 0 gets a key below 0, which no member has
+        """Return a mask (p,): the landmark is a member of the class; False for classes below 0."""
+        # a class below 0 gets the key -1, which no member has
         keys = np.where(classes < 0, -1, landmarks * (len(self.starts) - 1) + classes)
         return np.asarray((self.of_landmarks[landmarks] == classes)
                           | np.isin(keys, self._other_keys))
 
     def shares(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
                ) -> NDArray[np.float64]:
-        """Return how often landmarks (p,) have classes (p,), over their most frequent class.
+        """Return the frequency (p,) of a class relative to the landmark's most frequent class.
 
-        1 where nothing is known but that they have it, 0 where they do not have it.
+        1 for a class of the landmark without a known weight, 0 for other classes.
         """
         known = [self.weights.get(pair, 1.0) for pair in zip(landmarks.tolist(), classes.tolist(),
                                                              strict=True)]
@@ -130,7 +130,7 @@ class ClassIndex:
 
     @cached_property
     def _other_keys(self) -> NDArray[np.int64]:
-        """Return a key for each landmark and class of it that is not its own."""
+        """Return a key for each pair of a landmark and a class other than its own."""
         landmarks, classes = self.members.T
         other = classes != self.of_landmarks[landmarks]
         return np.asarray(landmarks[other] * (len(self.starts) - 1) + classes[other])
@@ -140,8 +140,8 @@ class ClassIndex:
         return np.array([self.numbers.get(name, -1) for name in names], dtype=np.int64)
 
     def sizes_of(self, classes: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return how many landmarks each class (n,) has; 0 for classes below 0."""
-        return np.append(np.diff(self.starts), 0)[classes]  # the last for -1
+        """Return the number of landmarks of each class (n,); 0 for classes below 0."""
+        return np.append(np.diff(self.starts), 0)[classes]  # -1 selects the appended 0
 
     def pairs(self, classes: NDArray[np.int64], order: NDArray[np.int64],
               limit: int | None = None) -> NDArray[np.int64]:
@@ -154,7 +154,7 @@ class ClassIndex:
         order : ndarray (m,) of int
             The detections in the order in which they are paired.
         limit : int, optional
-            Return at most this many pairs, from the first.
+            Maximum number of pairs; the first pairs are kept.
         """
         taken = self.sizes_of(classes)[order]
         if limit is not None:
@@ -167,17 +167,17 @@ class ClassIndex:
 
 def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
                neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the number of each landmark's object (L,): duplicates share one.
+    """Return the object number of each landmark (L,); duplicates share a number.
 
-    Landmarks of one class are duplicates if they stand in one another. Books side by side are not
-    duplicates.
+    Landmarks of one class are duplicates if their centres are close relative to their sizes. Books
+    side by side are not duplicates.
 
     Parameters
     ----------
     centers, shapes : ndarray (L, 3), (L, 6)
         See cliploc_ros.core.geometry.ellipsoid.
     neighbours : ndarray (p, 2) of int
-        Landmarks of one class that are near each other.
+        Pairs of nearby landmarks of one class.
     """
     first, second = neighbours.T
     inside = normalized_lengths(centers[second] - centers[first],
@@ -189,9 +189,9 @@ def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
 
 @dataclass(frozen=True)
 class LandmarkMap:
-    """Landmarks of one map frame. L is their number; 0 of a map of keyframes alone."""
+    """L landmarks in one map frame. L is 0 for a map of keyframes alone."""
 
-    frame_id: str  #: The coordinate frame of centres and orientations
+    frame_id: str  #: Coordinate frame of centres and orientations
     #: Name, description in natural language and detector class of each landmark
     landmark_ids: tuple[str, ...]
     labels: tuple[str, ...]
@@ -202,14 +202,14 @@ class LandmarkMap:
     quats_xyzw: NDArray[np.float64]
     #: Optional fields of each landmark; empty if the map has none
     details: tuple[LandmarkDetails, ...] = ()
-    map_set: MapSet = NO_SET  #: Identity that the files next to the map must have
+    map_set: MapSet = NO_SET  #: Identity that the files next to the map must share
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
         return len(self.landmark_ids)
 
     def select(self, rows: Sequence[int]) -> 'LandmarkMap':
-        """Return the map of some of the landmarks, at least one, in the order given."""
+        """Return a map of the given landmarks, at least one, in the given order."""
         def pick(values: tuple[Any, ...]) -> tuple[Any, ...]:
             return tuple(values[row] for row in rows)
 
@@ -219,9 +219,9 @@ class LandmarkMap:
             pick(self.details) if self.details else ())
 
     def with_more(self, other: 'LandmarkMap') -> 'LandmarkMap':
-        """Return the map with the landmarks of another one behind its own."""
-        def details(one: LandmarkMap) -> tuple[LandmarkDetails, ...]:
-            return one.details or (LandmarkDetails(),) * len(one)
+        """Return the map with the landmarks of another map appended."""
+        def details(part: LandmarkMap) -> tuple[LandmarkDetails, ...]:
+            return part.details or (LandmarkDetails(),) * len(part)
 
         return LandmarkMap(
             self.frame_id, self.landmark_ids + other.landmark_ids, self.labels + other.labels,
@@ -231,9 +231,10 @@ class LandmarkMap:
             map_set=self.map_set)
 
     def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
-        """Return the map in which each landmark has the labels and classes of its parts, too.
+        """Return the map with the labels and classes of parts added to their whole landmarks.
 
-        The array into (L,) is the row of the landmark that each is part of, or its own.
+        The array into (L,) has the row of the landmark that each landmark is a part of, or its own
+        row.
         """
         details = list(self.details or [LandmarkDetails()] * len(self))
         for row in np.unique(into[into != np.arange(len(into))]).tolist():
@@ -243,7 +244,7 @@ class LandmarkMap:
         return replace(self, details=tuple(details))
 
     def prepare(self) -> None:
-        """Compute the indices now, so that the first request does not wait for them."""
+        """Compute the indices in advance, so that the first request does not wait for them."""
         _ = self.shapes, self.classes, self.sorted_landmarks, self.tree, self.pairs
         _ = self.objects, self.position_sigmas, self.shared_sigmas
 
@@ -256,22 +257,23 @@ class LandmarkMap:
     def position_sigmas(self) -> NDArray[np.float64]:
         """Return the standard deviation of each centre on each axis (L,) [m]."""
         given = [detail.position_sigma for detail in self.details] or [None] * len(self)
-        return np.array([DEFAULT_SIGMA_M if one is None else one for one in given])
+        return np.array([DEFAULT_SIGMA_M if sigma is None else sigma for sigma in given])
 
     @cached_property
     def shared_sigmas(self) -> NDArray[np.float64]:
-        """Return by how much each landmark and its neighbours are off together (L, 2) [m] [rad].
+        """Return the standard deviations of errors shared with neighbours (L, 2) [m] [rad].
 
-        0 where the map does not say.
+        0 where the map has no value.
         """
-        given = [(one.shared_sigma or 0.0, one.shared_sigma_deg or 0.0) for one in self.details]
+        given = [(detail.shared_sigma or 0.0, detail.shared_sigma_deg or 0.0)
+                 for detail in self.details]
         if not given:
             return np.zeros((len(self), 2))
         return np.array(given) * [1.0, np.radians(1.0)]
 
     @property
     def weighted_labels(self) -> tuple[WeightedLabels, ...]:
-        """Return all labels that describe each landmark, with their weights."""
+        """Return all labels of each landmark, with their weights."""
         if not self.details:
             return tuple(((label, 1.0),) for label in self.labels)
         return tuple(detail.labels_with(label)
@@ -279,7 +281,7 @@ class LandmarkMap:
 
     @cached_property
     def classes(self) -> ClassIndex:
-        """Return the landmarks by class: their own, and classes that they are mistaken for."""
+        """Return the landmarks by class: their own classes, and classes they are mistaken for."""
         others = [(row, name) for row, detail in enumerate(self.details)
                   for name in detail.likely_classes() if name != self.class_ids[row]]
         weights = {(row, name): share for row, detail in enumerate(self.details)
@@ -288,22 +290,22 @@ class LandmarkMap:
 
     @cached_property
     def sorted_landmarks(self) -> SortedLandmarks:
-        """Return the landmarks sorted by place."""
+        """Return the landmarks sorted by position."""
         return sort_landmarks(self.centers, self.shapes, self.classes.members)
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Return the centres, to find the landmarks near a spot."""
+        """Return a tree of the centres, for searches of nearby landmarks."""
         return cKDTree(self.centers)
 
     @cached_property
     def pairs(self) -> LandmarkPairs:
-        """Return pairs of neighbours, to find what the map has more than once."""
+        """Return pairs of neighbours, for searches of repeated arrangements."""
         return make_pairs(self.centers, self.classes.of_landmarks, self.tree)
 
     @cached_property
     def objects(self) -> NDArray[np.int64]:
-        """Return the number of each landmark's object (L,): duplicates share one."""
+        """Return the object number of each landmark (L,); duplicates share a number."""
         rows = np.arange(len(self))
         ranks = [*range(2, min(_COMPARED + 1, len(self)) + 1)]
         if not ranks:
@@ -320,20 +322,21 @@ class LandmarkMap:
 
     def of_class_near(self, spots: NDArray[np.float64], landmarks: NDArray[np.int64],
                       near_m: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return the landmark nearest to each spot, of those of a landmark's class.
+        """Find the nearest landmark of a given class at each position.
 
         Parameters
         ----------
         spots : ndarray (..., n, 3)
+            Positions in the map [m].
         landmarks : ndarray (n,) of int
-            One for each spot.
+            A landmark for each position, which gives the class.
         near_m : float
-            How near it must be, below 10 [m].
+            Maximum distance, below 10 [m].
 
         Returns
         -------
         nearest : ndarray (..., n) of int
-            0 where there is none.
+            0 if there is none.
         found : ndarray (..., n) of bool
         """
         distances, rows = self._tree_of_classes.query(self._with_class(spots, landmarks),
@@ -343,7 +346,7 @@ class LandmarkMap:
 
     def _with_class(self, spots: NDArray[np.float64], landmarks: NDArray[np.int64]
                     ) -> NDArray[np.float64]:
-        """Return spots (..., n, 3) and the class of a landmark for each, as points (..., n, 4)."""
+        """Return positions (..., n, 3) with the class of a landmark as fourth coordinate."""
         classes = np.broadcast_to(self.classes.of_landmarks[landmarks], spots.shape[:-1])
         return np.concatenate([spots, _CLASS_DISTANCE_M * classes[..., None]], axis=-1)
 
@@ -354,7 +357,7 @@ class LandmarkMap:
         Raises
         ------
         MapError
-            Names the file, the landmark and the field to correct.
+            The file is invalid; the message names the file, the landmark and the field to correct.
         """
         text = read_text(path)
         map_set = set_of(text)
@@ -367,7 +370,7 @@ class LandmarkMap:
 
     @staticmethod
     def empty(frame_id: str) -> 'LandmarkMap':
-        """Return the map of a place that is known by keyframes alone."""
+        """Return a map without landmarks, for a place with keyframes alone."""
         return LandmarkMap(frame_id, (), (), (), np.empty((0, 3)), np.empty((0, 3)),
                            np.empty((0, 4)))
 
@@ -378,14 +381,15 @@ class LandmarkMap:
         Raises
         ------
         MapError
-            Names the source, the landmark and the field to correct.
+            The tree is invalid; the message names the source, the landmark and the field to
+            correct.
         """
         _check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map')
         frame_id = _text(tree['frame_id'], f'{source}: map: frame_id')
         landmarks = tree['landmarks']
         if not isinstance(landmarks, Mapping):
-            raise MapError(f'{source}: map: landmarks: the map is empty; one of keyframes alone '
-                           'has {}')
+            raise MapError(f'{source}: map: landmarks: the map is empty; write {{}} for a map of '
+                           'keyframes alone')
         if not landmarks:
             return LandmarkMap.empty(frame_id)
         rows = [_landmark(landmark_id, fields, source)
@@ -393,11 +397,12 @@ class LandmarkMap:
         labels, class_ids, centers, semi_axes, quats, details = zip(*rows, strict=True)
         return LandmarkMap(frame_id, tuple(map(str, landmarks)), labels, class_ids,
                            np.array(centers), np.array(semi_axes), _unit(np.array(quats)),
-                           details if any(one != LandmarkDetails() for one in details) else ())
+                           details if any(detail != LandmarkDetails() for detail in details)
+                           else ())
 
 
 def find_map_node(tree: Mapping[str, Any], path: str | os.PathLike[str]) -> str:
-    """Return the node of a parameter file that has the map; MapError: none has, or several."""
+    """Return the node of a parameter file that has the map; MapError unless exactly one has."""
     found = [name for name, node in tree.items()
              if isinstance(node, dict) and isinstance(node.get('ros__parameters'), dict)
              and 'map' in node['ros__parameters']]
@@ -412,7 +417,7 @@ def _unit(quats_xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _is_valid(written: WrittenMap) -> bool:
-    """Return whether from_mapping would accept a map that is finite and has unique ids."""
+    """Check whether from_mapping would accept a map with finite numbers and unique ids."""
     low, high = _SEMI_AXIS_RANGE_M
     norms = np.linalg.norm(written.quats_xyzw, axis=1)
     texts = ((written.frame_id,), written.labels, written.class_ids)
@@ -421,16 +426,16 @@ def _is_valid(written: WrittenMap) -> bool:
         and np.abs(written.centers).max() <= _MAX_COORDINATE_M
         and np.abs(norms - 1.0).max() <= _MAX_QUATERNION_NORM_ERROR
         and not any('.' in landmark_id for landmark_id in written.landmark_ids)
-        and all(len(one) <= _MAX_TEXT_LENGTH and not one.isspace() and one
-                for column in texts for one in set(column)))
+        and all(len(text) <= _MAX_TEXT_LENGTH and not text.isspace() and text
+                for column in texts for text in set(column)))
 
 
 def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
-    """Return one landmark's validated fields, in the order of _FIELDS, and its details."""
+    """Validate a landmark; return its fields in the order of _FIELDS, and its details."""
     where = f"{source}: landmark '{landmark_id}'"
     if not isinstance(landmark_id, str) or not landmark_id or '.' in landmark_id:
         # a dot would split the name of a ROS parameter
-        raise MapError(f'{where}: an id must be text without dots')
+        raise MapError(f'{where}: the id must be text without dots')
     labelled = isinstance(fields, Mapping) and 'labels' in fields
     _check_keys(fields, _FIELDS[1:] if labelled else _FIELDS, where, _FIELDS[:1] + OPTIONAL_FIELDS)
     details = read_details(fields, where)
@@ -439,14 +444,14 @@ def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
     semi_axes = _numbers(fields['semi_axes'], 3, f'{where}: semi_axes')
     low, high = _SEMI_AXIS_RANGE_M
     if not all(low <= axis <= high for axis in semi_axes):
-        raise MapError(f'{where}: semi_axes: {semi_axes} must be within {low:g} to {high:g} m')
+        raise MapError(f'{where}: semi_axes: {semi_axes} must be between {low:g} and {high:g} m')
     center = _numbers(fields['center'], 3, f'{where}: center')
     if max(map(abs, center)) > _MAX_COORDINATE_M:
         raise MapError(f'{where}: center: {center} is beyond {_MAX_COORDINATE_M:g} m')
     quat_xyzw = _numbers(fields['orientation'], 4, f'{where}: orientation')
     if abs(math.hypot(*quat_xyzw) - 1.0) > _MAX_QUATERNION_NORM_ERROR:
-        raise MapError(f'{where}: orientation: the quaternion {quat_xyzw} has the norm '
-                       f'{math.hypot(*quat_xyzw):.3g}, not 1')
+        raise MapError(f'{where}: orientation: the quaternion {quat_xyzw} has norm '
+                       f'{math.hypot(*quat_xyzw):.3g}, expected 1')
     return (_text(label, f'{where}: label'), _text(fields['class_id'], f'{where}: class_id'),
             center, semi_axes, quat_xyzw, details)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write a map as a ROS 2 parameter file, see LandmarkMap.from_file, and the files next to it."""
+"""Write a map as a ROS 2 parameter file, which LandmarkMap.from_file reads, and related files."""
 
 import hashlib
 import json
@@ -30,11 +30,11 @@ _INDENT = ' ' * 10
 def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
               comments: Iterable[str] = (), embeddings: LandmarkEmbeddings | None = None,
               besides: Mapping[Path, WriteOfSet | None] | None = None) -> None:
-    """Write a map file and the files next to it: the old set is replaced complete, or stays.
+    """Write a map file and the files next to it atomically, as one set.
 
-    Comments are lines for the head of the file. Image embeddings are written next to the map;
-    those of a map that is replaced are removed: they are not of the new one. `besides` are further
-    files, see cliploc_ros.files.storage.replace_set.
+    Comments are lines for the head of the file. Image embeddings are written next to the map.
+    Without embeddings, those of a replaced map are removed, because they belong to the old map.
+    `besides` are further files, see cliploc_ros.files.storage.replace_set.
 
     Raises
     ------
@@ -53,13 +53,13 @@ def write_map(path: str | os.PathLike[str], landmark_map: LandmarkMap,
             embeddings_path(path): None if embeddings is None else write_embeddings,
             **(besides or {})})
     except OSError as error:
-        raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed: '
+        raise MapError(f'{path}: cannot be written: {error.strerror}; nothing was changed; '
                        f'{MAKE_ROOM}') from error
 
 
 def write_landmarks(path: Path, digest: str, landmark_map: LandmarkMap,
                     comments: Iterable[str] = ()) -> None:
-    """Write a file of landmarks that is of a set; OSError: it cannot be written."""
+    """Write a file of landmarks that belongs to a set; OSError: it cannot be written."""
     family = landmark_map.map_set.family or digest
     with replace_file(path) as unfinished, unfinished.open('w', encoding='utf-8') as file:
         file.writelines(f'# {" ".join(line.split())}\n' for line in comments)
@@ -68,21 +68,21 @@ def write_landmarks(path: Path, digest: str, landmark_map: LandmarkMap,
 
 
 def removed_path(map_path: Path) -> Path:
-    """Return the file of the landmarks that updates took out of a map."""
+    """Return the path of the file with the landmarks that updates removed from a map."""
     return map_path.with_suffix('.removed.yaml')
 
 
 def load_removed(map_path: Path, family: str) -> LandmarkMap | None:
-    """Return what updates took out of a map; None for nothing, or of another family of maps."""
+    """Read the landmarks that updates removed from a map; None if none, or of another family."""
     path = removed_path(map_path)
     found = LandmarkMap.from_file(path) if path.exists() else None
     return found if found is not None and found.map_set.family == family else None
 
 
 def set_digest(landmark_map: LandmarkMap) -> str:
-    """Return the identity of a map and of the files that are written with it.
+    """Return the digest that identifies a map and the files written with it.
 
-    Maps of keyframes alone say the same: they get a random one.
+    Maps of keyframes alone have no landmarks to tell them apart: they get a random digest.
     """
     if not len(landmark_map):
         return secrets.token_hex(6)
@@ -129,18 +129,18 @@ def _detail_lines(details: LandmarkDetails) -> Iterator[str]:
 
 
 def _weight(weight: float) -> float:
-    """Return a weight that does not become 0 when written, which the reader refuses."""
+    """Return a weight that is not rounded to 0 when written: the reader refuses 0."""
     return max(weight, 1e-4)
 
 
 def quoted(text: str) -> str:
-    """Return text as YAML: a JSON string is one, except beyond 16 bits, as of an emoji."""
+    """Quote text as YAML: as a JSON string, except for characters beyond 16 bits such as emoji."""
     if max(text, default='') <= '\uffff':
         return json.dumps(text)
-    return '"' + ''.join(f'\\U{ord(one):08x}' if one > '\uffff' else json.dumps(one)[1:-1]
-                         for one in text) + '"'
+    return '"' + ''.join(f'\\U{ord(character):08x}' if character > '\uffff'
+                         else json.dumps(character)[1:-1] for character in text) + '"'
 
 
 def _floats(values: Iterable[float] | NDArray[np.float64]) -> str:
-    """Return numbers that ROS reads as floats, integers among them, too."""
+    """Return numbers as YAML that ROS reads as floats, even integers."""
     return f'[{", ".join(f"{value:.5f}" for value in values)}]'

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of neighbouring landmarks by their appearance: find the same pairs elsewhere in a map.
+"""Pairs of neighbouring landmarks by their appearance: find equal pairs elsewhere in a map.
 
-A turn about the vertical and a shift keep the classes of two landmarks, their horizontal distance
-and their difference in height. So landmarks whose pairs a map has twice may stand at places that
-look alike. Geometric hashing (Lamdan and Wolfson, "Geometric Hashing: A General and Efficient
-Model-Based Recognition Scheme", 1988), with pairs as bases.
+A rotation about the vertical and a shift preserve the classes of two landmarks, their horizontal
+distance and their difference in height. Landmarks whose pairs occur twice in a map may therefore
+stand at places that look alike. The method is geometric hashing (Lamdan and Wolfson, "Geometric
+Hashing: A General and Efficient Model-Based Recognition Scheme", 1988), with pairs as bases.
 """
 
 from math import atan2, floor, pi, sqrt
@@ -17,23 +17,23 @@ from scipy.spatial import cKDTree
 
 from cliploc_ros.core.kernels.compiled import compiled
 
-# Neighbours of a landmark that make pairs with it, and how far away they are [m]. Nearer ones do
-# not give the turn. 100,000 landmarks take 30 MB.
+# Number of neighbours that form pairs with a landmark, and range of their distances [m]. Closer
+# neighbours do not determine the rotation. 100,000 landmarks take 30 MB.
 _NEIGHBOURS = 10
 _LENGTH_M = (0.3, 3.0)
-# Larger maps have fewer neighbours of each landmark, down to two, which a repeat needs.
+# In larger maps, each landmark has fewer neighbours, down to two: a repeat requires two.
 _MOST_PAIRS, _LEAST_NEIGHBOURS = 2_000_000, 2
-# Pairs are alike if distance and height differ by less than this, also the side of a bin [m].
+# Pairs are alike if distance and height differ by less than this, which is also the bin width [m].
 _ALIKE_M = 0.25
 _LENGTH_BINS, _RISE_BINS = 14, 28
 _MIDDLE_BIN = 13
-# Turns are counted in bins twice as wide as their spacing.
+# Rotations are counted in bins that are twice as wide as their spacing.
 _TURN_BINS = 24
 _TURN_STEP = 2.0 * pi / _TURN_BINS
 _LEAST_VOTES = 2
-# Keys tell this number of classes apart.
+# Maximum number of classes that keys can distinguish.
 _CLASSES = 1 << 20
-# Bounds of time and memory: slots of votes, a power of 2, and pairs compared.
+# Limits on memory and time: number of slots for votes, a power of 2, and of compared pairs.
 _SLOTS, _MOST_COMPARED = 1 << 15, 100_000
 
 
@@ -41,7 +41,7 @@ class LandmarkPairs(NamedTuple):
     """Pairs of a landmark and a neighbour: L landmarks, p pairs."""
 
     neighbours: NDArray[np.int32]  #: (L, k): neighbours of each landmark; -1 for none
-    #: (L, 3), (L,): of the landmarks
+    #: (L, 3), (L,): centre and class of each landmark
     centers: NDArray[np.float64]
     classes: NDArray[np.int64]
     keys: NDArray[np.int64]  #: (p,): key of the appearance of each pair, ascending
@@ -51,18 +51,18 @@ class LandmarkPairs(NamedTuple):
 
 
 class Repeats(NamedTuple):
-    """Landmarks that may be where others would be after a turn and a shift, r of them."""
+    """r pairs of landmarks that a rotation and a shift may map onto each other."""
 
-    #: (r,)
+    #: (r,), (r,)
     landmarks: NDArray[np.int64]
     others: NDArray[np.int64]
-    turns: NDArray[np.float64]  #: (r,): about the vertical, from landmark to other [rad]
-    votes: NDArray[np.int64]  #: (r,): number of neighbours that agree
+    turns: NDArray[np.float64]  #: (r,): rotation about the vertical, from landmark to other [rad]
+    votes: NDArray[np.int64]  #: (r,): number of agreeing neighbours
 
 
 def make_pairs(centers: NDArray[np.float64], classes: NDArray[np.int64], tree: cKDTree
                ) -> LandmarkPairs:
-    """Return the pairs of landmarks (L, 3) of some classes (L,), whose tree is given."""
+    """Find the pairs of landmarks at centers (L, 3) with classes (L,), given their tree."""
     count = len(centers)
     columns = max(_LEAST_NEIGHBOURS, min(_NEIGHBOURS, _MOST_PAIRS // max(count, 1)))
     neighbours = np.full((count, columns), count, dtype=np.int32)
@@ -87,23 +87,23 @@ def make_pairs(centers: NDArray[np.float64], classes: NDArray[np.int64], tree: c
 
 @compiled
 def _key(first, second, length_bin, rise_bin):
-    """Return the number of a pair of classes, a bin of lengths and a bin of heights."""
+    """Return the key of a pair of classes, a length bin and a height bin."""
     return (((first * _CLASSES + second) * _LENGTH_BINS + length_bin) * _RISE_BINS
             + rise_bin + _MIDDLE_BIN)
 
 
 def find_repeats(pairs: LandmarkPairs, landmarks: NDArray[np.int64]) -> Repeats:
-    """Return where some landmarks (n,) may be after a turn and a shift.
+    """Find landmarks that landmarks (n,) may be mistaken for after a rotation and a shift.
 
-    A landmark with two neighbours that agree is a repeat: then three landmarks of equal classes
-    have the same arrangement. The work is bounded: of too many, the last landmarks are left out.
+    A landmark with two agreeing neighbours is a repeat: three landmarks of equal classes then have
+    the same arrangement. The work is limited: with too many landmarks, the last are skipped.
     """
     return Repeats(*_find_repeats(pairs, landmarks))
 
 
 @compiled
 def _find_repeats(pairs, landmarks):
-    """Count the votes of pairs for a repeat and a turn, in a table with open addresses."""
+    """Count the votes of pairs for a repeat and a rotation in an open-addressing hash table."""
     count, columns = pairs.neighbours.shape
     slots = np.full(_SLOTS, -1, dtype=np.int64)
     votes, turns = np.zeros(_SLOTS, dtype=np.int64), np.zeros(_SLOTS)
@@ -135,7 +135,7 @@ def _find_repeats(pairs, landmarks):
 
 @compiled
 def _vote(slots, votes, turns, candidate, turn):
-    """Write a vote into the two bins that a turn belongs to; return how many slots are new."""
+    """Add a vote to the two bins that contain a rotation; return the number of new slots."""
     new = 0
     nearest = int(turn / _TURN_STEP)
     for turn_bin in range(nearest, nearest + 2):
@@ -153,14 +153,14 @@ def _vote(slots, votes, turns, candidate, turn):
 
 @compiled
 def _offset(centers, first, second):
-    """Return horizontal distance, difference in height and direction of a pair."""
+    """Return horizontal distance, height difference and direction of a pair."""
     x, y = centers[second, 0] - centers[first, 0], centers[second, 1] - centers[first, 1]
     return sqrt(x * x + y * y), centers[second, 2] - centers[first, 2], atan2(y, x)
 
 
 @compiled
 def _elected(slots, votes, turns, landmarks, count):
-    """Return the fields of Repeats."""
+    """Return the fields of Repeats for the bins with enough votes."""
     rows = np.nonzero(votes >= _LEAST_VOTES)[0]
     found = slots[rows] // _TURN_BINS
     middles = slots[rows] % _TURN_BINS * _TURN_STEP

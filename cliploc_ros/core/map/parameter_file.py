@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading untrusted ROS 2 parameter files without ROS.
+"""Read untrusted ROS 2 parameter files without ROS.
 
 The tree is built from the parser's events, without recursion and without instantiating objects.
-Size and depth are limited, so a hostile file ends in an error and not in a crash.
+Size and depth are limited, so a hostile file causes an error and not a crash.
 
-PyYAML makes an object of each mark of the file: 100,000 landmarks take it 10 to 30 s. Files of
-build_map, import_map and the studio repeat one layout, so a regular expression for one landmark
-reads them ten times faster. It accepts a small part of YAML only, in which it agrees with the
-parser. Any other file, a hand-written or invalid one among them, gives None, and the parser reads
-it and names what is wrong.
+PyYAML creates an object for each token of a file: 100,000 landmarks take 10 to 30 s. Files of
+build_map, import_map and the studio have a fixed layout: a regular expression that matches one
+landmark reads them ten times faster. It accepts only a small subset of YAML, for which its result
+equals the parser's. For any other file, such as a handwritten or invalid file, parse_written_map
+returns None. The parser then reads the file and reports errors.
 """
 
 import json
@@ -28,20 +28,20 @@ from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import read_file
 
 _MAX_DEPTH = 16
-# Values, keys and collections, which PyYAML reads at 3 us each. A landmark has about 30; larger
-# maps have the layout of write_map.
+# Maximum number of values, keys and collections; PyYAML takes 3 us for each. A landmark has about
+# 30. Larger maps are expected in the layout of write_map.
 _MAX_EVENTS = 6_000_000
-# The labels of a landmark may be a list of mappings; no field has more.
+# Maximum number of collections in a list, such as the labels of a landmark as mappings.
 _MOST_IN_LIST = 1000
-# Words that YAML 1.1, and so ROS, reads as booleans.
+# Words that YAML 1.1, and therefore ROS, reads as booleans.
 _TRUE = frozenset({'y', 'yes', 'true', 'on'})
 _FALSE = frozenset({'n', 'no', 'false', 'off'})
 _QUOTED_STYLES = ('"', "'", '|', '>')
-# Longer text is no measured number; 300 digits would overflow a float.
+# Longer text is not a measured number; 300 digits would overflow a float.
 _MAX_NUMBER_LENGTH = 40
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-# Quoted text whose escapes mean the same in JSON and in YAML; halves of a pair of code units do
-# not. A key of YAML has at most 1024 characters.
+# Quoted text whose escapes have the same meaning in JSON and YAML: surrogates do not. A YAML key
+# has at most 1024 characters.
 _ESCAPE = r'\\(?:["\\nrtbf]|u(?!d[89a-f])[0-9a-f]{4})'
 _TEXT = rf'"(?:[ !#-\[\]-~]|{_ESCAPE})*+"'
 _KEY = rf'"(?:[ !#-\[\]-~]|{_ESCAPE}){{1,150}}+"'
@@ -53,23 +53,23 @@ _HEAD = re.compile(
     r'      landmarks:\n')
 _SET = re.compile(r'(?:#.*\n)*?# set ([0-9a-f]{12}) ([0-9a-f]{12})\n')
 _INDENT = ' ' * 10
-# Groups of _LANDMARK before those of the details.
+# Number of groups of _LANDMARK before the details.
 _PLAIN = 6
 
 
 def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the tree of a YAML file: dicts, lists, str, int, float, bool and None.
+    """Read a YAML file as a tree of dicts, lists, str, int, float, bool and None.
 
-    MapError: the file is unreadable, not a regular file, too large, no YAML mapping, nested too
-    deeply, or has an alias or a repeated key. The message names file and line.
+    Raises MapError if the file is unreadable, not a regular file, too large, not a YAML mapping,
+    nested too deeply, or has an alias or a repeated key. The message names the file and the line.
     """
     return parse_parameters(read_text(path), path)
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Return the text of a regular file in UTF-8 that is not too large.
+    """Read the text of a regular file in UTF-8, up to the maximum size of read_file.
 
-    MapError: names the file and what is wrong with it.
+    Raises MapError with the file and its fault.
     """
     path = Path(path)
     try:
@@ -81,27 +81,27 @@ def read_text(path: str | os.PathLike[str]) -> str:
 
 
 def parse_parameters(text: str, path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the tree of a YAML text as read_parameter_file does; messages name the path."""
+    """Parse a YAML text into a tree, see read_parameter_file; messages name the path."""
     try:
         tree = _build_tree(text)
     except yaml.YAMLError as error:
-        said = ' '.join(str(error).replace(' in "<unicode string>",', ' at').split())
-        raise MapError(f'{path}: not valid YAML: {said}') from error
+        fault = ' '.join(str(error).replace(' in "<unicode string>",', ' at').split())
+        raise MapError(f'{path}: not valid YAML: {fault}') from error
     except _TreeError as error:
         raise MapError(f'{path}: {error}') from error
     if not isinstance(tree, dict):
-        raise MapError(f'{path}: holds no YAML mapping')
+        raise MapError(f'{path}: not a YAML mapping')
     return tree
 
 
 class _TreeError(Exception):
-    """A construct that YAML allows and a parameter file must not have."""
+    """A construct that YAML allows but a parameter file must not contain."""
 
 
 def _build_tree(text: str) -> Any:
-    """Return the one document of a YAML text, from its events."""
+    """Build the tree of a YAML text with a single document, from its events."""
     root: list[Any] = []
-    # the open collections, innermost last, each with the key that waits for its value
+    # the open collections, innermost last, each with the key that has no value yet
     stack: list[tuple[Any, list[str]]] = [(root, [])]
     for number, event in enumerate(yaml.parse(text, Loader=_LOADER)):
         line = event.start_mark.line + 1
@@ -109,7 +109,8 @@ def _build_tree(text: str) -> Any:
             raise _TreeError(f'line {line}: more than {_MAX_EVENTS} values; write the map again '
                              'with import_map or the studio')
         if isinstance(event, yaml.AliasEvent):
-            raise _TreeError(f'line {line}: an alias (*{event.anchor}); write the value out')
+            raise _TreeError(f'line {line}: an alias (*{event.anchor}) is not supported; repeat '
+                             'the value')
         if isinstance(event, yaml.ScalarEvent):
             _add(stack[-1], _scalar(event), line)
         elif isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
@@ -145,7 +146,7 @@ def _add(open_collection: tuple[Any, list[str]], value: Any, line: int) -> None:
 
 
 def _scalar(event: yaml.ScalarEvent) -> Any:
-    """Return a scalar with the type that ROS gives it; quoted text stays text."""
+    """Convert a scalar to the type that ROS gives it; quoted text stays text."""
     text = event.value
     if event.style in _QUOTED_STYLES or event.tag == 'tag:yaml.org,2002:str':
         return text
@@ -181,30 +182,30 @@ _LANDMARK = re.compile(''.join([
 
 
 class MapSet(NamedTuple):
-    """The files that belong to a map, named in its head; '' if the head names none."""
+    """Identity of a map and the files next to it, from the head of the map; '' if unknown."""
 
-    family: str = ''  #: Digest of the first map, which updates keep: its keyframes hold for all
+    family: str = ''  #: Digest of the original map; updates keep it, and its keyframes stay valid
     digest: str = ''  #: Digest of this map
 
 
-#: The set of a map that names none.
+#: The set of a map whose head names none.
 NO_SET = MapSet()
 
 
 def check_set(digest: str, of_map: str) -> None:
-    """Raise ValueError for a file of another set than a map's. An unknown one is accepted."""
+    """Raise ValueError if a file and its map belong to different known sets."""
     if digest and of_map and digest != of_map:
-        raise ValueError(f'is of the set {digest[:12]}, its map of {of_map}')
+        raise ValueError(f'is of the set {digest[:12]}, but its map is of the set {of_map}')
 
 
 def set_of(text: str) -> MapSet:
-    """Return the set of a map file by its text, or by the beginning of it."""
+    """Read the set of a map file from its text, or from the beginning of its text."""
     found = _SET.match(text)
     return MapSet(found[1], found[2]) if found else NO_SET
 
 
 class WrittenMap(NamedTuple):
-    """The fields of LandmarkMap in their order, not yet validated."""
+    """The fields of LandmarkMap in the same order, not yet validated."""
 
     frame_id: str
     landmark_ids: tuple[str, ...]
@@ -217,9 +218,9 @@ class WrittenMap(NamedTuple):
 
 
 def parse_written_map(text: str) -> WrittenMap | None:
-    """Return the map of a file's text; None if it has another layout than write_map's.
+    """Read a map from text in the layout of write_map; return None for any other layout.
 
-    Ids are unique, numbers finite, weights above 0.
+    The result has unique ids, finite numbers, and weights above 0.
     """
     head = _HEAD.match(text)
     if head is None:
@@ -243,32 +244,34 @@ def parse_written_map(text: str) -> WrittenMap | None:
 
 
 def _values(texts: Iterable[str]) -> list[Any]:
-    """Return the values of JSON texts, lists joined."""
+    """Return the values of JSON texts as one list."""
     return list(json.loads(f'[{",".join(texts)}]'))
 
 
 def _details(columns: list[tuple[Any, ...]], count: int) -> tuple[LandmarkDetails, ...] | None:
-    """Return the optional fields of each landmark, empty if none has any; None for the parser."""
+    """Return the optional fields of each landmark, () if there are none; None if invalid."""
     if not any(map(any, columns)):
         return ()
     texts, weights, classes, *numbers, sources = columns
-    phrases, heavy = _values(_lists(texts)), _values(_lists(weights))
+    phrases, label_weights = _values(_lists(texts)), _values(_lists(weights))
     shares = _values('null' if kind is None else f'{{{kind[:-1]}}}'.replace('\n', ',')
                      for kind in classes)
     names = _values(source or 'null' for source in sources)
-    if (any(phrase and len(phrase) != len(its) for phrase, its in zip(phrases, heavy, strict=True))
-            # a class that is repeated
+    if (any(phrase and len(phrase) != len(its)
+            for phrase, its in zip(phrases, label_weights, strict=True))
+            # a repeated class
             or any(kind and len(its) < kind.count('\n')
                    for kind, its in zip(classes, shares, strict=True))):
         return None
     labels, likely = ([pairs and tuple(pairs) for pairs in column] for column in (
-        [one and zip(one, its, strict=True) for one, its in zip(phrases, heavy, strict=True)],
+        [phrase and zip(phrase, its, strict=True)
+         for phrase, its in zip(phrases, label_weights, strict=True)],
         [share and share.items() for share in shares]))
     if not (all(text.strip() and weight > 0.0 for column in (labels, likely)
                 for pairs in column if pairs for text, weight in pairs)
             and all(name is None or name.strip() for name in names)):
         return None
-    support, *others = ([None if one is None else kind(one) for one in column]
+    support, *others = ([None if number is None else kind(number) for number in column]
                         for kind, column in zip((int, *[float] * 6), numbers, strict=True))
     return tuple(map(LandmarkDetails, labels, likely, *others[:3], support, *others[3:], names))
 

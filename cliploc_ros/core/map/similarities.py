@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Similarities of crops and labels for maps of any size, a block of labels at a time.
+"""Similarities of crops and labels for maps of any size, computed in blocks of labels.
 
-A label that several landmarks share is stored and compared once. U different labels of d numbers
-and L landmarks take 4 U d + 8 L bytes as long as the map is loaded: with ViT-L-14 (d = 768), 1,000
-labels take 3 MB, 100,000 take 310 MB, and 1,000,000 take 3.1 GB. Comparing 12 crops takes 0.6 MB
-more, whatever the map.
+A label that several landmarks share is stored and compared once. The label embeddings of a loaded
+map take 4 U d + 8 L bytes, for U different labels of d dimensions and L landmarks. With ViT-L-14
+(d = 768), 1,000 labels take 3 MB, 100,000 take 310 MB, and 1,000,000 take 3.1 GB. A comparison
+with 12 crops takes another 0.6 MB, regardless of the map.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,37 +19,37 @@ from numpy.typing import NDArray
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.errors import OptionsError
 
-# Number of labels that gives mean and deviation of a crop's similarities to 2 %.
+# Number of labels that determines mean and deviation of a crop's similarities to within 2 %.
 _LABELS_SAMPLED = 4096
-# Labels compared at once: a block stays in the processor's cache from product to selection.
+# Labels in a block: it stays in the processor's cache from matrix product to selection.
 _BLOCK = 2048
 
 
 @dataclass(frozen=True)
 class LabelEmbeddings:
-    """The embeddings of a map's labels, each different label once. NumPy sees an array (L, d)."""
+    """The embeddings of a map's labels, without repetitions. NumPy sees an array (L, d)."""
 
-    #: (U, d): one row for each different label: of unit length, or a weighted mean of such rows
+    #: (U, d): one row for each different label: of unit length, or a weighted mean of unit rows
     unique: NDArray[np.float32]
-    #: (L,): the row of each landmark's label. Every row belongs to a landmark.
+    #: (L,): row of each landmark's label. Every row belongs to at least one landmark.
     of_landmarks: NDArray[np.int64]
-    #: Those of each of several maps, see in_parts; empty for a single map
+    #: Embeddings of each of several maps, see in_parts; empty for a single map
     parts: tuple['LabelEmbeddings', ...] = ()
 
     @staticmethod
     def of(embeddings: 'LabelEmbeddings | NDArray[np.float32]') -> 'LabelEmbeddings':
-        """Return label embeddings from an array (L, d), one row for each landmark."""
+        """Convert an array (L, d), one row for each landmark, to label embeddings."""
         if isinstance(embeddings, LabelEmbeddings):
             return embeddings
         return LabelEmbeddings(embeddings, np.arange(len(embeddings)))
 
     def in_parts(self, sizes: Sequence[int]) -> 'LabelEmbeddings':
-        """Return the same embeddings, those of each of several maps in rows of their own.
+        """Return the embeddings with separate rows for each of several maps.
 
-        A label of two maps is stored twice.
+        A label that two maps share is stored twice.
         """
-        pieces = [np.unique(some, return_inverse=True)
-                  for some in np.split(self.of_landmarks, np.cumsum(sizes)[:-1])]
+        pieces = [np.unique(of_part, return_inverse=True)
+                  for of_part in np.split(self.of_landmarks, np.cumsum(sizes)[:-1])]
         ends = np.cumsum([len(rows) for rows, _ in pieces])
         starts = [0, *ends[:-1].tolist()]
         unique = self.unique[np.concatenate([rows for rows, _ in pieces])]
@@ -71,7 +71,7 @@ class LabelEmbeddings:
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
-        """Return where each label's landmarks begin in landmarks (U + 1,)."""
+        """Return the index (U + 1,) in `landmarks` of the first landmark of each label."""
         counts = np.bincount(self.of_landmarks, minlength=len(self.unique))
         return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
@@ -82,7 +82,7 @@ class LabelEmbeddings:
 
 @dataclass(frozen=True)
 class CropSimilarities:
-    """Cosine similarities of crops and landmarks, computed when needed.
+    """Cosine similarities of crops and landmarks, computed on demand.
 
     NumPy sees an array (n, L).
     """
@@ -97,7 +97,7 @@ class CropSimilarities:
 
     @cached_property
     def spread(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the mean and the deviation (n,) of each crop, see sampled_spread."""
+        """Return mean and standard deviation (n,) of each crop, see sampled_spread."""
         step = _sample_step(self)
         return _spread(self.crops @ self.labels.unique[self.labels.of_landmarks[::step]].T)
 
@@ -111,13 +111,13 @@ Similarities = NDArray[np.float32] | CropSimilarities
 
 
 def split_similarities(similarities: Similarities, sizes: Sequence[int]) -> list[Similarities]:
-    """Return the similarities to the landmarks of each of several maps.
+    """Split similarities into those to the landmarks of each map.
 
     Parameters
     ----------
     similarities : ndarray (n, L) or CropSimilarities
     sizes : sequence of M int
-        Number of landmarks of each map, in order; L in all.
+        Number of landmarks of each map, in order; L in total.
     """
     if not isinstance(similarities, CropSimilarities):
         return [*np.split(similarities, np.cumsum(sizes)[:-1], axis=1)]
@@ -151,33 +151,33 @@ def nearest_landmarks(similarities: Similarities, k: int
     if len(labels.unique) < len(labels.of_landmarks):
         return _expanded(labels, found, values, k)
     landmarks = labels.landmarks[found]
-    order = np.lexsort((landmarks, -values), axis=1)[:, :k]  # of equals, the first landmark first
+    order = np.lexsort((landmarks, -values), axis=1)[:, :k]  # ties in the order of landmarks
     return np.take_along_axis(landmarks, order, axis=1), np.take_along_axis(values, order, axis=1)
 
 
 def _nearest_columns(blocks: Iterator[tuple[int, NDArray[np.float32]]], count: int, k: int
                      ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return columns and values (count, k) of the k greatest of each row, best first."""
+    """Return columns and values (count, k) of the k greatest values of each row, best first."""
     columns = np.full((count, k), -1, dtype=np.int64)
     values = np.full((count, k), -np.inf, dtype=np.float32)
     for start, block in blocks:
         if not keep_greatest(np.ascontiguousarray(block, dtype=np.float32), start, columns,
                              values):
-            raise OptionsError('similarities hold values that are not finite')
+            raise OptionsError('similarities contain values that are not finite')
     return columns, values
 
 
 @compiled
 def keep_greatest(block, start, columns, values):
-    """Take the values of a block that are among each row's greatest; of equals, the first.
+    """Update the greatest values of each row with a block; ties keep the first value.
 
     Parameters
     ----------
     block : ndarray (n, w)
     start : int
-        Column of its first value.
+        Column number of the block's first column.
     columns, values : ndarray (n, k)
-        The greatest so far, best first; updated.
+        Columns and values of the greatest values, best first; updated.
 
     Returns
     -------
@@ -205,7 +205,7 @@ def keep_greatest(block, start, columns, values):
 
 def _expanded(labels: LabelEmbeddings, found: NDArray[np.int64], values: NDArray[np.float32],
               k: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the k best landmarks of each row's best labels (n, <= k)."""
+    """Return the k best landmarks (n, k) of the best labels (n, <= k) of each row."""
     counts = np.minimum(np.diff(labels.starts)[found], k)
     rows = np.repeat(np.arange(len(found)), counts.sum(axis=1))
     counts = counts.ravel()
@@ -214,13 +214,13 @@ def _expanded(labels: LabelEmbeddings, found: NDArray[np.int64], values: NDArray
     alike = np.repeat(values.ravel(), counts)
     order = np.lexsort((landmarks, -alike, rows))
     ranks = np.arange(len(rows)) - np.searchsorted(rows, rows)
-    taken = order[ranks < k]  # k of each row: its k best labels have at least k landmarks
+    taken = order[ranks < k]  # k in each row: its k best labels have at least k landmarks
     return landmarks[taken].reshape(-1, k), alike[taken].reshape(-1, k)
 
 
 def pair_similarities(similarities: Similarities, crops: NDArray[np.int64],
                       landmarks: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Return the similarities (m,) of pairs of a crop (m,) and a landmark (m,)."""
+    """Return the similarities (m,) of crops (m,) and landmarks (m,), pair by pair."""
     if not isinstance(similarities, CropSimilarities):
         return similarities[crops, landmarks]
     labels = similarities.labels.unique[similarities.labels.of_landmarks[landmarks]]
@@ -229,10 +229,10 @@ def pair_similarities(similarities: Similarities, crops: NDArray[np.int64],
 
 def sampled_spread(similarities: Similarities, crops: NDArray[np.int64]
                    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return mean and standard deviation of the similarities of crops (m,) to any landmark.
+    """Return mean and standard deviation (m,) of the similarities of crops (m,) to landmarks.
 
-    They are those to landmarks spread evenly over the map: all of a map of _LABELS_SAMPLED,
-    otherwise half of _LABELS_SAMPLED at least.
+    They are computed from landmarks at regular steps through the map: all landmarks of a map with
+    up to _LABELS_SAMPLED, and at least half that number in a larger map.
     """
     if isinstance(similarities, CropSimilarities):
         means, deviations = similarities.spread

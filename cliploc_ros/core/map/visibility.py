@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the landmarks that an image should show at a pose, and landmarks that are gone.
 
-An image should show the landmarks that are near, large, wholly in view and not hidden. Walls are
-in no map, so an expected landmark may be hidden. If the image shows a landmark beside it, it is
-not hidden. cliploc_ros.offline.mapping.evidence judges whole recordings by the same criteria, and
-simulated detectors find what these let through, each with limits of its own.
+An image should show the landmarks that are near, large, entirely in view and not occluded. Maps
+contain no walls, so a wall may hide an expected landmark. If the image shows a landmark beside it,
+it is not hidden. cliploc_ros.offline.mapping.evidence and simulated detectors use these criteria
+with other limits, for whole recordings and for single detections.
 
-A detector finds some landmarks in each image and others hardly ever. The share of looks that find
-a landmark has a beta distribution, which each look narrows down. Then the probability of k misses
-in a row is B(a, b + k) / B(a, b), if the landmark is there.
+A detector finds some landmarks in each image and others rarely. The share of looks that find a
+landmark has a beta distribution, updated by each look. If the landmark is present, the probability
+of k consecutive misses is B(a, b + k) / B(a, b).
 """
 
 from collections import deque
@@ -33,37 +33,38 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 #: A detector finds a landmark only if the image shows this share of its box.
 SHOWN_SHARE = 0.6
-#: A place is out of view if nearer things hide more than this share of it. A guess.
+#: A landmark is out of view if nearer landmarks hide more than this share of it. A guess.
 HIDDEN_SHARE = 0.4
-# A detector surely finds landmarks up to here [m], with sides from here on [px], of which the
-# image shows this share. Guesses, on the safe side.
+# A detector is expected to find landmarks within this distance [m] whose boxes have at least these
+# sides [px] and are visible to at least this share. Conservative guesses.
 _REACH_M, _LEAST_SIDE_PX, _SURE_SHARE = 6.0, 20.0, 0.75
-# A landmark is beside a place within this angle of its direction, and before it if it is nearer
-# than this share of the place's distance. Guesses.
+# A landmark is beside a place if the angle between their directions is smaller than this, and in
+# front of it if its distance is less than this share of the place's distance. Guesses.
 _BESIDE_COSINE, _BESIDE_SHARE = np.cos(np.radians(20.0)), 0.8
-#: Sides of a landmark, equal angles about the vertical.
+#: Number of sides of a landmark, sectors of equal angle about the vertical.
 SIDES = 8
-# The share of looks that find a landmark which is there: its mean before any look, the looks that
-# this mean stands for, and the looks that the share of all landmarks, or the seen_ratio of a map,
-# stands for where one landmark is judged. Guesses.
+# Prior of the share of looks that find a present landmark: mean over all landmarks, weight of this
+# mean in looks, and weight of the overall share (or of the map's seen_ratio) in looks where a
+# single landmark is judged. Guesses.
 _FOUND, _OF_FOUND, _OF_SHARE = 0.75, 10.0, 3.0
+# Limits of this share.
 _SHARES = (0.1, 0.95)
-# Probability that a landmark is gone before any look, and the share of looks in which something is
-# matched with one that is gone by chance. Guesses.
+# Prior probability that a landmark is gone, and share of looks in which a detection matches a
+# landmark that is gone by chance. Guesses.
 _GONE, _BY_CHANCE = 0.05, 0.05
-# Named from this probability on. Not more sightings than this are counted, so a landmark that is
-# taken away after a day is soon missed.
+# A landmark is reported at this probability. The number of counted sightings is limited, so that a
+# landmark that is removed after a day is soon reported.
 _NAMED, _MOST_SEEN = 0.8, 15.0
-# The map is out of date where this many landmarks and this share of those that the last looks
-# expected are gone, by their probabilities.
+# The map is out of date at a place if, of the landmarks that this number of last looks expected,
+# this number and this share are gone, counted by their probabilities.
 _HERE, _LEAST_GONE, _LEAST_SHARE = 10, 2.0, 0.25
 
 
 def is_in_image(box: NDArray[np.float64], bounds: NDArray[np.float64], least_share: float
                 ) -> NDArray[np.bool_]:
-    """Return whether an image shows more than a share of a box (4,), or of each of n boxes (4, n).
+    """Check whether an image shows more than a share of a box (4,), or of each of n boxes (4, n).
 
-    Box and bounds (4,) of the image are left, top, right, bottom.
+    The box and the image's bounds (4,) are left, top, right, bottom.
     """
     width = np.minimum(box[2], bounds[2]) - np.maximum(box[0], bounds[0])
     height = np.minimum(box[3], bounds[3]) - np.maximum(box[1], bounds[1])
@@ -73,10 +74,10 @@ def is_in_image(box: NDArray[np.float64], bounds: NDArray[np.float64], least_sha
 
 def is_beside(cosine: NDArray[np.float64], distance: NDArray[np.float64],
               of_place: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether an image that shows a landmark also shows a place: no wall is before it.
+    """Check whether a visible landmark shows that no wall hides a place.
 
-    The landmark is beside the place or behind it, by the cosine between their directions, its
-    distance and that of the place.
+    The landmark must be beside the place or behind it. The arguments are the cosine of the angle
+    between their directions, the landmark's distance, and the place's distance.
     """
     return (cosine > _BESIDE_COSINE) & (distance >= _BESIDE_SHARE * of_place)
 
@@ -84,15 +85,15 @@ def is_beside(cosine: NDArray[np.float64], distance: NDArray[np.float64],
 class InImage(NamedTuple):
     """The boxes of n ellipsoids in an image [px]."""
 
-    boxes: NDArray[np.float64]  #: (n, 4): NaN where not wholly in front of the camera
-    shown: NDArray[np.float64]  #: (n, 4): the part in the image
-    is_shown: NDArray[np.bool_]  #: (n,): whether that is a large enough share, and large enough
+    boxes: NDArray[np.float64]  #: (n, 4): NaN if not entirely in front of the camera
+    shown: NDArray[np.float64]  #: (n, 4): the part within the image
+    is_shown: NDArray[np.bool_]  #: (n,): whether that part is large enough
 
 
 def boxes_in_image(camera: Camera, camera_from_map: NDArray[np.float64],
                    centers: NDArray[np.float64], shapes: NDArray[np.float64], least_share: float,
                    least_side_px: float) -> InImage:
-    """Return the boxes of ellipsoids (n, 3), (n, 6) in an image."""
+    """Project ellipsoids (n, 3), (n, 6) to boxes in an image."""
     boxes = ellipse_bboxes(ellipses_in_pixels(
         project_ellipsoids(camera_from_map, centers, shapes), camera))
     bounds = np.array([0.0, 0.0, camera.width, camera.height])
@@ -103,7 +104,7 @@ def boxes_in_image(camera: Camera, camera_from_map: NDArray[np.float64],
 
 def is_hidden(boxes: NDArray[np.float64], is_nearer: NDArray[np.bool_], most: float
               ) -> NDArray[np.bool_]:
-    """Tell which boxes (n, 4) are hidden: a nearer box covers more than a share of them.
+    """Return a mask (n,) of hidden boxes (n, 4): a nearer box covers more than a share of them.
 
     Row i of is_nearer (n, n) marks the boxes that are nearer than box i.
     """
@@ -113,24 +114,24 @@ def is_hidden(boxes: NDArray[np.float64], is_nearer: NDArray[np.bool_], most: fl
 
 
 class Expected(NamedTuple):
-    """The k landmarks that an image should show, and whether it shows each."""
+    """The k landmarks that an image should show, and whether it shows them."""
 
-    landmarks: NDArray[np.int64]  #: (k,): one of each object
+    landmarks: NDArray[np.int64]  #: (k,): one landmark of each object
     was_seen: NDArray[np.bool_]  #: (k,): whether a detection shows it
-    #: (k,): whether a shown landmark beside it or behind it tells that no wall hides it
+    #: (k,): whether a visible landmark beside or behind it shows that no wall hides it
     in_sight: NDArray[np.bool_]
-    sides: NDArray[np.int64]  #: (k,): from which of SIDES sides the camera looks at it
+    sides: NDArray[np.int64]  #: (k,): side of the landmark that the camera sees, 0 to SIDES - 1
 
 
 def expect(landmark_map: LandmarkMap, camera: Camera, map_from_camera: NDArray[np.float64],
            shown: NDArray[np.int64]) -> Expected:
-    """Return the landmarks that an image should show.
+    """Find the landmarks that an image should show.
 
     Parameters
     ----------
     map_from_camera : ndarray (4, 4)
     shown : ndarray (m,) of int
-        The landmarks that its detections show.
+        The landmarks that match its detections.
     """
     near = np.sort(np.array(landmark_map.tree.query_ball_point(map_from_camera[:3, 3], _REACH_M),
                             dtype=np.int64))
@@ -156,19 +157,20 @@ def expect(landmark_map: LandmarkMap, camera: Camera, map_from_camera: NDArray[n
 
 
 class _Record(NamedTuple):
-    """Looks that found a landmark and that missed it, by their weights."""
+    """Weighted numbers of looks that found and that missed a landmark."""
 
     found: float = 0.0
-    missed: float = 0.0  #: Before it was seen last
-    misses: float = 0.0  #: Since then
-    seen_from: int = 0  #: The sides from which it was seen, a bit each
+    missed: float = 0.0  #: Misses before the last sighting
+    misses: float = 0.0  #: Misses since the last sighting
+    seen_from: int = 0  #: Sides from which it was seen, as bits
 
     def gone(self, share: float) -> float:
-        """Return the probability that it is gone, where looks find a landmark at a share.
+        """Return the probability that it is gone, given the prior share of looks that find it.
 
-        Misses count up to the number that says most. Further ones would say that not even chance
-        matches it, thus that it is there and hardly ever found: a landmark that is taken away
-        would no longer be missed after some hundred looks.
+        Misses are counted up to the number with the strongest evidence. Further misses would be
+        evidence that it is present but rarely found, because a landmark that is gone is sometimes
+        matched by chance. A removed landmark would then no longer be reported after some hundred
+        looks.
         """
         found = _OF_SHARE * share + self.found
         missed = _OF_SHARE * (1.0 - share) + self.missed
@@ -179,7 +181,7 @@ class _Record(NamedTuple):
 
 
 class Missing:
-    """Counts of looks for each landmark that they expected."""
+    """Finds landmarks that are gone, from the looks that should have shown them."""
 
     def __init__(self, landmark_map: LandmarkMap) -> None:
         self._details = landmark_map.details
@@ -187,40 +189,43 @@ class Missing:
         self._expected: deque[list[int]] = deque(maxlen=_HERE)
 
     def add(self, expected: Expected, weight: float) -> None:
-        """Count a look at a right pose: 1 if it shares no errors with earlier looks, else less."""
-        for landmark, was_seen, in_sight, side in zip(*(one.tolist() for one in expected),
+        """Count a look at a right pose; its weight is 1 if it is independent of earlier looks."""
+        for landmark, was_seen, in_sight, side in zip(*(column.tolist() for column in expected),
                                                       strict=True):
-            one = self._records.get(landmark, _Record())
+            record = self._records.get(landmark, _Record())
             if was_seen:
-                keep = min(1.0, _MOST_SEEN / (one.found + weight))
+                keep = min(1.0, _MOST_SEEN / (record.found + weight))
                 self._records[landmark] = _Record(
-                    keep * (one.found + weight), keep * (one.missed + one.misses),
-                    seen_from=one.seen_from | 1 << side)
-            # a television does not show from behind; one that was never seen may from everywhere
-            elif in_sight and (not one.seen_from or any(
-                    one.seen_from >> (side + step) % SIDES & 1 for step in (-1, 0, 1))):
-                self._records[landmark] = one._replace(misses=one.misses + weight)
+                    keep * (record.found + weight), keep * (record.missed + record.misses),
+                    seen_from=record.seen_from | 1 << side)
+            # count misses only from sides where it was seen: a detector may not recognize a
+            # television from behind. A landmark that was never seen is missed from all sides.
+            elif in_sight and (not record.seen_from or any(
+                    record.seen_from >> (side + step) % SIDES & 1 for step in (-1, 0, 1))):
+                self._records[landmark] = record._replace(misses=record.misses + weight)
         if len(expected.landmarks):
             self._expected.append(expected.landmarks.tolist())
 
     def named(self) -> list[int]:
-        """Return the landmarks that are missing, those first that are most certainly gone."""
+        """Return the missing landmarks in decreasing order of probability."""
         gone = self._gone(self._records)
-        return sorted((one for one in gone if gone[one] >= _NAMED), key=lambda one: -gone[one])
+        return sorted((landmark for landmark in gone if gone[landmark] >= _NAMED),
+                      key=lambda landmark: -gone[landmark])
 
     @property
     def is_outdated(self) -> bool:
-        """Return whether the map is out of date at the place of the last looks."""
+        """Check whether the map is out of date at the place of the last looks."""
         here = {landmark for look in self._expected for landmark in look}
         gone = sum(self._gone(here).values())
         return bool(gone >= _LEAST_GONE and gone >= _LEAST_SHARE * len(here))
 
     def _gone(self, landmarks: Iterable[int]) -> dict[int, float]:
-        """Return the probability that each of some landmarks is gone."""
-        # of those that were seen, without the sighting that makes them so
+        """Return the probability that each landmark is gone."""
+        # overall share of the landmarks that were seen; the first sighting is not counted, because
+        # it selects them
         seen = [record for record in self._records.values() if record.found > 0.0]
-        found = sum(max(0.0, one.found - 1.0) for one in seen)
-        missed = sum(one.missed for one in seen)
+        found = sum(max(0.0, record.found - 1.0) for record in seen)
+        missed = sum(record.missed for record in seen)
         overall = (_OF_FOUND * _FOUND + found) / (_OF_FOUND + found + missed)
         result = {}
         for landmark in landmarks:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One frame: its association with the map, and the search by the algorithm that the options name.
+"""Associate one frame with the map, and search it by the algorithm that the options name.
 
 Candidates are pairs of a detection and a landmark that it may show. Matching types (Matsuzaki et
-al. 2024, Sec. IV-A3): *class* pairs equal detector classes, *clip* each detection with the k
-landmarks whose labels are most similar to its crop, *hybrid* samples from clip and verifies with
-both.
+al. 2024, Sec. IV-A3): *class* pairs detections and landmarks of equal detector class, *clip* pairs
+each detection with the k landmarks whose labels are most similar to its crop, and *hybrid* samples
+from the clip pairs and verifies with both.
 """
 
 from collections.abc import Iterator, Sequence
@@ -39,32 +39,32 @@ from cliploc_ros.core.search.strategies import (
 )
 from cliploc_ros.errors import OptionsError
 
-#: The most candidates of auto. Which of them are compatible takes this squared in bytes, and a
-#: few milliseconds. In sparse maps of 100,000 landmarks this limit ends the search before its
-#: iterations do: candidates of equal class are hardly ever neighbours.
+#: Maximum number of candidates of auto. Their compatibility mask takes the square of this number
+#: in bytes and a few milliseconds to compute. In sparse maps of 100,000 landmarks this limit ends
+#: the search before the limit of iterations does: candidates of equal class are rarely neighbours.
 MAX_CANDIDATES = 1_500
-# Coordinates on the plane z = 1 beyond this come from no lens; their squares are finite.
+# No lens yields larger coordinates on the plane z = 1; the squares of smaller ones are finite.
 _FARTHEST = 1e6
-# Depths beyond this have another unit.
+# Larger depths have a different unit.
 _FARTHEST_M = 40.0
-#: The number of best hypotheses that are refined. On the recorded frames, worse ones never led
-#: afterwards.
+#: Number of best hypotheses that are refined. On the recorded frames, a hypothesis of lower rank
+#: never became the best by refinement.
 REFINED = 32
-# The map's third axis is up (REP 103), and the optical frame's second is down.
+# The third axis of the map points up (REP 103), the second axis of the optical frame down.
 _UP_IN_MAP = (0.0, 0.0, 1.0)
 _UPRIGHT = (0.0, -1.0, 0.0)
 _UNIT_TOLERANCE = 1e-3
 
 
 class Candidates(NamedTuple):
-    """Correspondence candidates, in the order in which a sampler prefers them."""
+    """Correspondence candidates, in the sampler's order of preference."""
 
-    #: (c,): indices of the pair
+    #: (c,), (c,): indices of the detection and the landmark
     detections: NDArray[np.int64]
     landmarks: NDArray[np.int64]
     #: (c,): 0 for a detection's most similar landmark, 1 for the next, and so on
     ranks: NDArray[np.int64]
-    #: (c,): cosine similarity of crop and label; 0 where only the class is known
+    #: (c,): cosine similarity of crop and label; 0 for candidates by class
     similarities: NDArray[np.float64]
 
     @property
@@ -73,15 +73,15 @@ class Candidates(NamedTuple):
         return np.stack([self.detections, self.landmarks], axis=1)
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> 'Candidates':
-        """Return some of the candidates."""
+        """Return the selected candidates."""
         return Candidates._make(column[rows] for column in self)
 
     def moved(self, first: int) -> 'Candidates':
-        """Return the candidates of a map whose landmarks begin at a row of several maps'."""
+        """Return the candidates of one of several maps, whose landmarks start at row `first`."""
         return self._replace(landmarks=self.landmarks + first)
 
     def ordered(self, *keys: NDArray[np.float64] | NDArray[np.int64]) -> 'Candidates':
-        """Return the candidates sorted by keys, the first key first; ties keep their order."""
+        """Sort the candidates by keys, the primary key first; ties keep their order."""
         return self.select(np.lexsort(keys[::-1]))
 
 
@@ -89,13 +89,13 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int |
                      ) -> Candidates:
     """Return the pairs of equal class, detection by detection.
 
-    A limit keeps the pairs of the rarest classes: pairs of a class with few landmarks are the most
-    probable.
+    With a limit, the pairs of the rarest classes are kept: pairs of a class with few landmarks
+    are the most probable.
 
     Parameters
     ----------
     classes : ndarray (n,) of int
-        Class of each detection, as the index numbers them; below 0 for none.
+        Class of each detection, as numbered in the index; negative: no class of the map.
     """
     order = np.arange(len(classes)) if limit is None else np.argsort(index.sizes_of(classes),
                                                                      kind='stable')
@@ -105,7 +105,7 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int |
 
 
 def check_k(k: int, landmark_count: int) -> None:
-    """Refuse a k that exceeds the map with an OptionsError; a map of keyframes alone takes any."""
+    """Raise OptionsError if k exceeds the number of landmarks, unless the map has none."""
     if landmark_count and not 1 <= k <= landmark_count:
         raise OptionsError(f'k = {k}, but the map has {landmark_count} landmarks: '
                            f'set k to {landmark_count} or less')
@@ -114,7 +114,7 @@ def check_k(k: int, landmark_count: int) -> None:
 def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
 
-    OptionsError: the map has fewer than k landmarks.
+    Raises OptionsError if the map has fewer than k landmarks.
     """
     detection_count, landmark_count = similarities.shape
     check_k(k, landmark_count)
@@ -125,26 +125,26 @@ def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
 
 
 def prosac_order(candidates: Candidates) -> Candidates:
-    """Return the candidates by decreasing similarity (Chum and Matas 2005)."""
+    """Sort the candidates by decreasing similarity (Chum and Matas 2005)."""
     return candidates.ordered(-candidates.similarities)
 
 
 def balanced_order(candidates: Candidates) -> Candidates:
-    """Return all nearest landmarks by decreasing similarity, then all second-nearest, and so on.
+    """Sort by rank, then by decreasing similarity: all nearest landmarks, all second-nearest, ...
 
-    The order of B-PROSAC (Matsuzaki et al. 2024, Fig. 3): it keeps large, confident detections
-    from filling the head of the list.
+    The order of B-PROSAC (Matsuzaki et al. 2024, Fig. 3) keeps large, confident detections from
+    filling the head of the list.
     """
     return candidates.ordered(candidates.ranks, -candidates.similarities)
 
 
-def concatenated(some: Sequence[Candidates]) -> Candidates:
-    """Return the candidates of several lists, at least one, one list after the other."""
-    return Candidates(*map(np.concatenate, zip(*some, strict=True)))
+def concatenated(lists: Sequence[Candidates]) -> Candidates:
+    """Concatenate one or more lists of candidates."""
+    return Candidates(*map(np.concatenate, zip(*lists, strict=True)))
 
 
 def joined(first: Candidates, second: Candidates, landmark_count: int) -> Candidates:
-    """Return the first candidates, followed by those of the second that are new."""
+    """Return the first candidates, followed by the second candidates that are not among them."""
     known = first.detections * landmark_count + first.landmarks
     new = np.nonzero(~np.isin(second.detections * landmark_count + second.landmarks, known))[0]
     return concatenated([first, second.select(new)])
@@ -159,16 +159,16 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
     scene : Scene
         Its pairs are the candidates, in the order of the sampler.
     left_out : int
-        How many candidates exceed the limit of auto.
+        Number of candidates dropped because of the limit of auto.
 
     Raises
     ------
     OptionsError
-        The matching type needs similarities that are missing, of the wrong shape, or not finite;
-        depths are of the wrong shape.
+        The similarities that the matching type needs are missing, of the wrong shape, or not
+        finite, or the depths are of the wrong shape.
     """
     bboxes = observation.camera.normalize_bboxes(observation.detections.bboxes_xyxy)
-    # NaN where the lens model has no inverse; a box turned inside out has no ellipse
+    # where the lens model has no inverse, boxes are NaN; a box with swapped corners has no ellipse
     sound = (bboxes[:, 2:] > bboxes[:, :2]).all(axis=1) & (np.abs(bboxes) < _FARTHEST).all(axis=1)
     classes = landmark_map.classes.classes_of(observation.detections.class_ids)
     classes[~sound] = -1
@@ -177,14 +177,14 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
                                        nearest, options)
     by_class = classes if options.matching != 'clip' else np.full_like(classes, -1)
     single, sorted_landmarks = _potential(landmark_map, by_class, nearest)
-    # no pair uses the placeholder of a box that is not sound
+    # no pair refers to a box that is not sound: its placeholder has no effect
     return make_scene(np.where(sound[:, None], bboxes, 1.0), landmark_map.centers,
                       landmark_map.shapes, single, candidates.pairs, options.iou_threshold,
                       sorted_landmarks, by_class, _depths(observation, options)), left_out
 
 
 def _depths(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64] | None:
-    """Return the depths of a scene (n, 2); the paper's algorithms do not use them."""
+    """Return the depths of a scene (n, 2), or None: the paper's algorithms do not use depths."""
     depths, deviations = observation.depths, observation.depth_deviations
     if depths is None or options.algorithm != 'auto':
         return None
@@ -192,7 +192,7 @@ def _depths(observation: Observation, options: RelocalizerOptions) -> NDArray[np
         deviations = depth_deviations(depths)
     for name, values in (('depths', depths), ('depth_deviations', deviations)):
         if values.shape != (len(observation.detections),):
-            raise OptionsError(f'{name} of shape {values.shape}, but there are '
+            raise OptionsError(f'{name} has shape {values.shape}, but there are '
                                f'{len(observation.detections)} detections')
     with np.errstate(invalid='ignore'):
         known = ((depths > 0.0) & (depths < _FARTHEST_M)
@@ -204,7 +204,7 @@ def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: C
                ) -> tuple[NDArray[np.int64], SortedLandmarks | None]:
     """Return the pairs (p, 2) to verify, and further landmarks to verify by class.
 
-    In a small map the pairs are complete: culling costs more there than it saves.
+    In a small map the pairs include all pairs of equal class: culling costs more than it saves.
     """
     if len(landmark_map) <= FEW:
         of_class = class_candidates(landmark_map.classes, classes)
@@ -218,7 +218,10 @@ def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: C
 
 def _nearest(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions,
              sound: NDArray[np.bool_]) -> Candidates | None:
-    """Return the k most similar landmarks of each sound, compared detection; None without CLIP."""
+    """Return the k most similar landmarks of each sound detection that was compared, or None.
+
+    None: the matching type needs no similarities.
+    """
     if not options.needs_similarities:
         return None
     compared = observation.compared
@@ -232,11 +235,11 @@ def _nearest(landmark_map: LandmarkMap, observation: Observation, options: Reloc
                            f'{shape}, found {found}')
     parts = parts_of(landmark_map)
     sizes = [len(part.landmark_map) for part in parts]
-    # k of each map, so that the labels of one map do not hide the rivals on the others
+    # k landmarks from each map, so that the labels of one map do not hide rivals in other maps
     nearest = concatenated([
-        nearest_candidates(some, min(options.k, size)).moved(part.first)
-        for part, size, some in zip(parts, sizes, split_similarities(similarities, sizes),
-                                    strict=True)])
+        nearest_candidates(of_part, min(options.k, size)).moved(part.first)
+        for part, size, of_part in zip(parts, sizes, split_similarities(similarities, sizes),
+                                       strict=True)])
     nearest = nearest._replace(detections=compared[nearest.detections])
     return nearest.select(sound[nearest.detections])
 
@@ -244,10 +247,10 @@ def _nearest(landmark_map: LandmarkMap, observation: Observation, options: Reloc
 def _candidates(landmark_map: LandmarkMap, class_ids: Sequence[str],
                 classes: NDArray[np.int64], nearest: Candidates | None,
                 options: RelocalizerOptions) -> tuple[Candidates, int]:
-    """Return the candidates in the order of the sampler, and how many are left out.
+    """Return the candidates in the order of the sampler, and the number dropped.
 
-    auto uses at most MAX_CANDIDATES pairs of equal class. Several maps get equal shares and take
-    turns, so that a search that is cut short has looked for rivals in all of them.
+    auto uses at most MAX_CANDIDATES pairs of equal class. Several maps have equal shares, and
+    their candidates alternate, so that a search that is stopped early covers rivals in all maps.
     """
     index = landmark_map.classes
     if nearest is not None:
@@ -265,41 +268,41 @@ def _candidates(landmark_map: LandmarkMap, class_ids: Sequence[str],
         own = np.where(classes >= 0, of_part.classes_of(class_ids), -1)
         found.append(class_candidates(of_part, own, MAX_CANDIDATES // len(parts))
                      .moved(part.first))
-    turns = np.concatenate([np.arange(len(some.landmarks)) for some in found])
+    turns = np.concatenate([np.arange(len(candidates.landmarks)) for candidates in found])
     of_class = concatenated(found).ordered(turns)
     left_out = int(index.sizes_of(classes).sum()) - len(of_class.landmarks)
     return of_class if nearest is None else joined(nearest, of_class, len(landmark_map)), left_out
 
 
 class SearchedFrame(NamedTuple):
-    """A frame and the result of the search among its samples."""
+    """A frame and the result of its search."""
 
     observation: Observation
     scene: Scene  #: Scene of the observation
     vertical: NDArray[np.float64]  #: (7,): see VERTICAL_UNKNOWN
     leaders: Leaders  #: The best hypotheses, as poses of this frame's camera
-    tilted: Leaders  #: The best hypotheses that ignore the vertical, where it is known; else none
+    tilted: Leaders  #: The best hypotheses found without the vertical; unused if it is unknown
     progress: Progress
-    #: (t, 3): the samples tried; None for all samples of the first candidates, see progress.reach
+    #: (t, 3): the samples tried; None: all samples of the first candidates, see progress.reach
     samples: NDArray[np.int64] | None = None
-    firsts: tuple[int, ...] = (0,)  #: Row of the first landmark of each of several maps
+    firsts: tuple[int, ...] = (0,)  #: Row of the first landmark of each map
 
     @property
     def sample_size(self) -> int:
-        """Return how many candidates a minimal sample has."""
+        """Return the number of candidates in a minimal sample."""
         return SAMPLE_SIZE - 1 if self.vertical[6] > 0.0 else SAMPLE_SIZE
 
     @property
     def has_samples(self) -> bool:
-        """Return whether there are enough different detections and landmarks for a sample."""
+        """Check whether there are enough different detections and landmarks for a sample."""
         pairs = self.scene.pairs
         return min(len(np.unique(pairs[:, 0])), len(np.unique(pairs[:, 1]))) >= self.sample_size
 
     @property
     def known_tried(self) -> int:
-        """Return the number of samples tried or ruled out as incompatible, per map on average.
+        """Return the number of samples tried or rejected as incompatible, averaged over the maps.
 
-        Samples across maps are invalid and do not count.
+        Samples across maps are invalid and are not counted.
         """
         maps = np.searchsorted(self.firsts, self.scene.pairs[:self.progress.reach, 1], 'right')
         within = sum(comb(count, self.sample_size) for count in np.bincount(maps).tolist())
@@ -308,12 +311,12 @@ class SearchedFrame(NamedTuple):
 
 def search_frame(landmark_map: LandmarkMap, observation: Observation,
                  options: RelocalizerOptions, deadline: float) -> SearchedFrame:
-    """Search one frame, until a deadline of used_time_s [s].
+    """Search one frame until used_time_s reaches the deadline [s].
 
-    OptionsError: similarities that the matching type needs are missing or of the wrong shape, or
-    the vertical is not a unit vector.
+    Raises OptionsError if similarities that the matching type needs are missing or of the wrong
+    shape, or if the vertical is not a unit vector.
     """
-    if not len(landmark_map):  # of keyframes alone: boxes tell nothing
+    if not len(landmark_map):  # a map of keyframes alone: detections match nothing
         none = np.empty(0, dtype=np.int64)
         observation = replace(
             observation, detections=observation.detections.select(none), compared=none,
@@ -331,8 +334,8 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
                           constraint=constraint, limit=options.iterations)
         progress = _run(try_all(frame.leaders, size=frame.sample_size), deadline)
         if frame.vertical[6] > 0.0:
-            # The vertical may be wrong, as with a wrong camera mount. Then the pose that the boxes
-            # alone suggest must be among the rivals.
+            # The vertical may be wrong, for example because the stated camera mount is wrong. Then
+            # the pose that the boxes alone suggest must be among the rivals.
             free = _run(try_all(frame.tilted), deadline)
             progress = progress._replace(tried=progress.tried + free.tried)
     elif options.algorithm == 'bf':
@@ -342,7 +345,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
         seed = options.random_seed if options.random_seed >= 0 else None
         samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
         progress = _run(search_samples(scene, samples, frame.leaders, constraint), deadline)
-    if left_out:  # the share of all samples that consist of the candidates kept
+    if left_out:  # kept: the share of samples without dropped candidates
         kept = comb(len(scene.pairs), SAMPLE_SIZE) / max(
             comb(len(scene.pairs) + left_out, SAMPLE_SIZE), 1)
         progress = progress._replace(coverage=progress.coverage * kept)
@@ -350,7 +353,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
 
 
 def constraint_of(observation: Observation, options: RelocalizerOptions) -> Constraint:
-    """Return the constraints on the camera of a frame that hold before the search."""
+    """Return the constraints on the camera of a frame that are known before the search."""
     vertical, (low, high) = vertical_of(observation, options), options.height_range_m
     known = vertical[6] > 0.0
     return Constraint(tuple(vertical[:3]) if known else _UPRIGHT, _UP_IN_MAP, low, high,
@@ -358,20 +361,20 @@ def constraint_of(observation: Observation, options: RelocalizerOptions) -> Cons
 
 
 def coverage_of(frames: Sequence[SearchedFrame]) -> float:
-    """Return the share of its samples that the search of the least searched frame tried."""
+    """Return the minimum over the frames of the share of samples tried."""
     return min(frame.progress.coverage for frame in frames)
 
 
 def vertical_of(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64]:
-    """Return the vertical (7,) of a frame; the paper's algorithms do not use it.
+    """Return the vertical (7,) of a frame, unknown for the paper's algorithms.
 
-    OptionsError: it is not a unit vector.
+    Raises OptionsError if it is not a unit vector.
     """
     up = observation.up_in_camera
     if up is None or options.algorithm != 'auto':
         return VERTICAL_UNKNOWN
     if up.shape != (3,) or not abs(np.linalg.norm(up) - 1.0) < _UNIT_TOLERANCE:
-        raise OptionsError(f'up_in_camera: {up} is not a unit vector')
+        raise OptionsError(f'up_in_camera: {up} is not a unit vector (3,)')
     return np.array([*up, *_UP_IN_MAP, np.radians(options.vertical_deviation_deg)])
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One frame, the map and the constraints of the camera, as the compiled search reads them."""
+"""Input of the compiled search: one frame, the map, and the constraints on the camera."""
 
 from math import atan2, cos, hypot, inf, pi, sqrt
 from typing import NamedTuple
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.culling import Groups, SortedLandmarks, make_groups, no_landmarks
 
-#: A vertical (7,) holds up in the camera (3,) and in the map (3,), unit vectors, and the standard
-#: deviation of the angle between them [rad]. This one is unknown.
+#: A vertical (7,) consists of the up direction in the camera (3,) and in the map (3,), unit
+#: vectors, and the standard deviation of the angle between them [rad]. Zeros: unknown.
 VERTICAL_UNKNOWN = np.zeros(7)
 
 
 class Potential(NamedTuple):
-    """Landmarks that single detections may show: u landmarks, p pairs."""
+    """Pairs of a detection and a landmark that it may show: u landmarks, p pairs."""
 
-    landmarks: NDArray[np.int64]  #: (u,): rows in the map, each once
-    #: (u + 1,): where the detections of each landmark begin in detections
+    landmarks: NDArray[np.int64]  #: (u,): rows in the map, without repetitions
+    #: (u + 1,): index in `detections` of the first detection of each landmark
     starts: NDArray[np.int64]
-    detections: NDArray[np.int64]  #: (p,): the detections that may show each landmark
+    detections: NDArray[np.int64]  #: (p,): detections that may show each landmark
 
 
 class Scene(NamedTuple):
@@ -33,15 +33,15 @@ class Scene(NamedTuple):
     bearings: NDArray[np.float64]  #: (n, 3): unit vectors through the box centres
     #: (n, 2): depth of the object in each box and its standard deviation [m]; 0, 0 if unknown
     depths: NDArray[np.float64]
-    #: (L, 3), (L, 6): of the landmarks, see cliploc_ros.core.geometry.ellipsoid
+    #: (L, 3), (L, 6): centres and shapes of the landmarks, see cliploc_ros.core.geometry.ellipsoid
     centers: NDArray[np.float64]
     shapes: NDArray[np.float64]
-    potential: Potential  #: Landmarks that single detections may show
+    potential: Potential  #: Pairs of single detections and landmarks to verify
     #: (c, 2): detection and landmark of each correspondence candidate, in order of preference
     pairs: NDArray[np.int64]
-    iou_threshold: float  #: A detection and a landmark match only if their IoU is above this
-    #: For a large map: the landmarks of the detected classes. For a small map both are empty,
-    #: and potential holds these pairs.
+    iou_threshold: float  #: A detection and a landmark match only if their IoU exceeds this
+    #: Large map: the landmarks of the detected classes. Small map: both are empty, and `potential`
+    #: contains these pairs.
     sorted_landmarks: SortedLandmarks
     groups: Groups
 
@@ -52,7 +52,7 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
                sorted_landmarks: SortedLandmarks | None = None,
                classes: NDArray[np.int64] | None = None,
                depths: NDArray[np.float64] | None = None) -> Scene:
-    """Return the scene of one frame.
+    """Build the scene of one frame.
 
     Parameters
     ----------
@@ -61,15 +61,15 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
     centers, shapes : ndarray (L, 3), (L, 6)
         Centres and shapes of the landmarks.
     potential : ndarray (n, L) of bool, or (p, 2) of int
-        Which landmarks each detection may show: a mask, or pairs of detection and landmark.
+        The landmarks that each detection may show: a mask, or pairs of detection and landmark.
     pairs : ndarray (c, 2)
         Correspondence candidates, in order of preference.
     iou_threshold : float
         0 to 1.
     sorted_landmarks : SortedLandmarks, optional
-        The map's. Each detection may also show every landmark of its class.
+        The landmarks of the map: each detection may also show every landmark of its class.
     classes : ndarray (n,) of int, optional
-        Class of each detection, as the sorted landmarks have them; below 0 for none.
+        Class of each detection, as numbered in sorted_landmarks; negative: no class of the map.
     depths : ndarray (n, 2), optional
         See Scene.
     """
@@ -93,31 +93,32 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
 
 
 class Constraint(NamedTuple):
-    """Vertical and height of the camera, which rule poses out; by default nothing is known.
+    """Vertical and height of the camera. Poses that contradict them are rejected.
 
-    Where the robot probably is rules none out, see cliploc_ros.core.acceptance.confidence.
+    Default: both unknown. A prior of the robot's position rejects no poses, see
+    cliploc_ros.core.acceptance.confidence.
     """
 
-    #: The vertical, unit vectors in the camera's optical frame and in the map frame
+    #: The up direction, unit vectors in the camera's optical frame and in the map frame
     up_in_camera: tuple[float, float, float] = (0.0, -1.0, 0.0)
     up_in_map: tuple[float, float, float] = (0.0, 0.0, 1.0)
     #: Limits of the camera's centre along up_in_map, from the map's origin [m]
     min_height: float = -inf
     max_height: float = inf
-    #: Greatest angle between both verticals at a pose from three points [rad]. Poses from two
-    #: points hold them equal.
+    #: Maximum angle between the two verticals at a pose from three points [rad]. At poses from
+    #: two points they are equal by construction.
     max_tilt: float = pi
-    #: Standard deviation of the angle between both verticals [rad]; inf: only max_tilt counts
+    #: Standard deviation of the angle between the two verticals [rad]; inf: only max_tilt applies
     vertical_deviation: float = inf
 
     def as_array(self) -> NDArray[np.float64]:
-        """Return up in camera and map, height range, and least cosine of the tilt (9,)."""
+        """Return up in camera and map, height range, and minimum cosine of the tilt (9,)."""
         least_cosine = cos(self.max_tilt) if self.max_tilt < pi else -inf
         return np.array([*self.up_in_camera, *self.up_in_map, self.min_height, self.max_height,
                          least_cosine])
 
     def allows(self, map_from_camera: NDArray[np.float64]) -> bool:
-        """Return whether the height range and max_tilt allow a pose (4, 4)."""
+        """Check whether the height range and max_tilt allow a pose (4, 4)."""
         height = float(np.dot(self.up_in_map, map_from_camera[:3, 3]))
         up = map_from_camera[:3, :3] @ self.up_in_camera
         return self.min_height <= height <= self.max_height and (
@@ -125,10 +126,11 @@ class Constraint(NamedTuple):
 
     def tilt_error(self, map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64]
                    ) -> float:
-        """Return the angle between both verticals at a pose (4, 4), in its standard deviations.
+        """Return the angle between the two verticals at a pose (4, 4), in standard deviations.
 
-        The deviations are those of the vertical and of the pose with covariance (6, 6). With a
-        right vertical, one right pose in 1,000 exceeds 3.7. 0 where the vertical is unknown.
+        The standard deviation combines the vertical's with that of the pose, whose covariance is
+        (6, 6). If the vertical is correct, one correct pose in 1,000 exceeds 3.7. An unknown
+        vertical gives 0.
         """
         up = map_from_camera[:3, :3] @ self.up_in_camera
         axis = np.cross(up, self.up_in_map)

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The search kernel: hypotheses from minimal samples, verified no further than they may lead.
+"""The search kernel: hypotheses from minimal samples, verified only while they can become leaders.
 
-Of the poses that a minimal solver finds, the hypothesis is the one whose sampled landmarks overlap
-their boxes most (Matsuzaki et al. 2024, Sec. III-D2). Verification gives each detection the
-potential landmark that overlaps it most; see cliploc_ros.core.fit.verification for the definition.
+The hypothesis of a sample is the solution of the minimal solver at which the sampled landmarks
+overlap their boxes most (Matsuzaki et al. 2024, Sec. III-D2). Verification assigns each detection
+the potential landmark that overlaps it most, see cliploc_ros.core.fit.verification.
 
-Upper bounds of IoUs, from extents and areas alone, replace the IoUs wherever these cannot change
-the result: a pose is dropped as soon as its bounds sum to no more than the worst leader's score,
-and a detection is compared exactly only with landmarks whose bound beats its best IoU so far.
-Results equal those of plain verification, to rounding.
+Upper bounds of IoUs, computed from extents and areas alone, replace IoUs that cannot change the
+result. A pose is dropped as soon as the sum of its bounds does not exceed the worst leader's
+score. A detection is compared exactly only with landmarks whose bound exceeds its best IoU. The
+results equal those of full verification up to rounding.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from cliploc_ros.core.search.scene import Constraint, Scene
 
 
 class Targets(NamedTuple):
-    """The data that poses are verified against."""
+    """Detections and landmarks that verify poses."""
 
     boxes: NDArray[np.float64]  #: (n, 4): box ellipses of the detections
     iou_threshold: float  #: See Scene
@@ -42,29 +42,29 @@ class Targets(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Memory of one minimal sample: three candidates, or two."""
+    """Buffers for one minimal sample of three candidates, or two."""
 
     bearings: NDArray[np.float64]  #: (3, 3): through the box centres
     boxes: NDArray[np.float64]  #: (3, 4): box ellipses
     landmarks: NDArray[np.float64]  #: (3, 9): centres and shapes
     #: (12, 6): outlines of the landmarks at each of up to four poses, see project
     outlines: NDArray[np.float64]
-    #: (4,): upper bound of the summed IoUs at each pose; -1 where the pose is impossible
+    #: (4,): upper bound of the summed IoUs at each pose; -1 if the pose is impossible
     uppers: NDArray[np.float64]
 
 
 class Overlaps(NamedTuple):
-    """Memory of one verification.
+    """Buffers for one verification.
 
-    There is room for every landmark and every pair. The system provides only the pages that are
-    written.
+    They have room for every landmark and every pair. The operating system allocates only the
+    pages that are written.
     """
 
-    #: (2, w): members of the groups that the pose may see, see visible_members
+    #: (2, w): members of the groups that may be visible, see visible_members
     visible: NDArray[np.int64]
-    #: (o, 6): outlines of all landmarks that it may see, see project
+    #: (o, 6): outlines of all landmarks that may be visible, see project
     outlines: NDArray[np.float64]
-    owners: NDArray[np.int64]  #: (o,): row in the starts of each outline's detections
+    owners: NDArray[np.int64]  #: (o,): row of each outline in `starts`, which gives its detections
     #: (x, 2), (x,): pairs of detection and outline that may overlap enough, and upper bounds of
     #: their IoUs
     pairs: NDArray[np.int64]
@@ -73,20 +73,20 @@ class Overlaps(NamedTuple):
 
 
 class Bench(NamedTuple):
-    """A scene laid out for one search, and the memory that its hypotheses reuse."""
+    """A scene as tables for one search, and the buffers that all hypotheses share."""
 
-    #: (c, 16): bearing (3,) and box ellipse (4,) of the detection, centre (3,) and shape (6,) of
-    #: the landmark of each correspondence candidate
+    #: (c, 16): for each correspondence candidate, bearing (3,) and box ellipse (4,) of the
+    #: detection, centre (3,) and shape (6,) of the landmark
     candidates: NDArray[np.float64]
     constraint: NDArray[np.float64]  #: (9,): see Constraint.as_array
     targets: Targets
     sample: Sample
-    poses: Poses  #: Those that the sample allows
+    poses: Poses  #: Solutions of the minimal solver for the sample
     overlaps: Overlaps
 
 
 def set_up(scene: Scene, constraint: Constraint | None = None) -> Bench:
-    """Return the bench of a scene."""
+    """Prepare a scene for a search."""
     detections, landmarks = scene.pairs[:, 0], scene.pairs[:, 1]
     candidates = np.concatenate([scene.bearings[detections], scene.box_ellipses[detections],
                                  scene.centers[landmarks], scene.shapes[landmarks]], axis=1)
@@ -102,7 +102,7 @@ def set_up(scene: Scene, constraint: Constraint | None = None) -> Bench:
 
 
 def _overlaps(targets: Targets) -> Overlaps:
-    """Return memory for the verification of one pose."""
+    """Allocate the buffers for the verification of one pose."""
     single, members = len(targets.landmarks), targets.groups.members
     shown = np.diff(targets.groups.starts)
     pairs = len(targets.detections) + int(
@@ -116,12 +116,13 @@ def _overlaps(targets: Targets) -> Overlaps:
 
 @compiled
 def make_hypothesis(candidates, constraint, sample, poses, samples, number, least_iou):
-    """Write the poses of one of some samples; return which of them to verify, or -1.
+    """Solve samples[number] for poses; return the index of the pose to verify, or -1.
 
     Parameters
     ----------
     candidates, constraint, sample, poses
-        Of the bench. A bench as a whole is slow to pass: its arrays are counted at each call.
+        Fields of the Bench. Passing the whole Bench is slow: each call would update the reference
+        counts of all its arrays.
     samples : ndarray (t, 3) of int
         Three candidates, or two and -1.
     least_iou : float
@@ -139,7 +140,7 @@ def make_hypothesis(candidates, constraint, sample, poses, samples, number, leas
 
 @compiled
 def _load(candidates, samples, number, size, sample):
-    """Copy the candidates of a sample from the table to its memory."""
+    """Copy the candidates of a sample from the table to its buffers."""
     for row in range(size):
         candidate = samples[number, row]
         for column in range(3):
@@ -152,10 +153,10 @@ def _load(candidates, samples, number, size, sample):
 
 @compiled
 def _choose_pose(constraint, sample, size, poses, count, least_iou):
-    """Return the pose with the greatest sum of IoUs over the sampled pairs; -1 if there is none.
+    """Return the index of the pose with the greatest sum of IoUs of the sampled pairs, or -1.
 
-    A pose must have all sampled ellipsoids wholly in front of it, agree with the constraint,
-    and reach the least sum.
+    All sampled ellipsoids must be entirely in front of the camera, the pose must agree with the
+    constraint, and the sum of IoUs must be at least least_iou.
     """
     boxes, outlines, uppers = sample.boxes, sample.outlines, sample.uppers
     visible, last = 0, -1
@@ -171,7 +172,7 @@ def _choose_pose(constraint, sample, size, poses, count, least_iou):
         return last
     best, best_total = -1, -1.0
     for _ in range(visible):
-        which = 0  # the greatest bound, the first of equals
+        which = 0  # the greatest bound; of equal bounds, the first
         for other in range(1, count):
             if uppers[other] > uppers[which]:
                 which = other
@@ -186,7 +187,7 @@ def _choose_pose(constraint, sample, size, poses, count, least_iou):
 
 @compiled
 def _agrees(constraint, poses, which):
-    """Return whether a pose agrees with the known vertical and range of heights."""
+    """Check whether a pose agrees with the known vertical and range of heights."""
     rotations, translations, height, cosine = poses.rotations, poses.translations, 0.0, 0.0
     for axis in range(3):
         up = (rotations[which, axis, 0] * constraint[3] + rotations[which, axis, 1] * constraint[4]
@@ -198,7 +199,10 @@ def _agrees(constraint, poses, which):
 
 @compiled
 def _sampled_bound(boxes, size, outlines, first):
-    """Return an upper bound of the summed IoUs of sampled pairs; -1 if one is not in front."""
+    """Return an upper bound of the sum of IoUs of the sampled pairs.
+
+    -1 if a sampled landmark is not entirely in front of the camera.
+    """
     upper = 0.0
     for row in range(size):
         if not outlines[first + row, 2] > 0.0:
@@ -218,7 +222,7 @@ def _sampled_iou(boxes, size, outlines, first):
 
 @compiled
 def _outline_bound(boxes, box, outlines, out):
-    """Return an upper bound of the IoU of one of some boxes and one of some outlines."""
+    """Return an upper bound of the IoU of boxes[box] and outlines[out]."""
     return iou_bound(boxes[box, 0], boxes[box, 1], boxes[box, 2], boxes[box, 3],
                      outlines[out, 0], outlines[out, 1], outlines[out, 2], outlines[out, 3],
                      outlines[out, 5])
@@ -226,7 +230,7 @@ def _outline_bound(boxes, box, outlines, out):
 
 @compiled
 def _outline_iou(boxes, box, outlines, out):
-    """Return the IoU of one of some boxes and one of some outlines."""
+    """Return the IoU of boxes[box] and outlines[out]."""
     return ellipse_iou(boxes[box, 0], boxes[box, 1], boxes[box, 2], boxes[box, 3],
                        outlines[out, 0], outlines[out, 1], outlines[out, 2] * outlines[out, 2],
                        outlines[out, 4], outlines[out, 3] * outlines[out, 3])
@@ -234,7 +238,7 @@ def _outline_iou(boxes, box, outlines, out):
 
 @compiled
 def verify_beyond(targets, poses, which, overlaps, floor):
-    """Return the score of a pose if it is above a floor; if not, the floor."""
+    """Return the score of a pose, or the floor if the score does not exceed it."""
     groups, outlines = targets.groups, overlaps.outlines
     overlaps.best_bounds[:] = targets.iou_threshold
     single = targets.landmarks.shape[0]
@@ -249,7 +253,7 @@ def verify_beyond(targets, poses, which, overlaps, floor):
 
 @compiled
 def _bound(targets, starts, detections, first, last, overlaps, count):
-    """Append the pairs of outlines first to last to count pairs; return their new number."""
+    """Append the pairs of the outlines [first, last) after `count` pairs; return the new count."""
     boxes, iou_threshold = targets.boxes, targets.iou_threshold
     outlines, owners = overlaps.outlines, overlaps.owners
     pairs, bounds, best_bounds = overlaps.pairs, overlaps.bounds, overlaps.best_bounds
@@ -270,7 +274,7 @@ def _bound(targets, starts, detections, first, last, overlaps, count):
 
 @compiled
 def _score_beyond(boxes, iou_threshold, overlaps, count, floor):
-    """Return the score of the pairs with bounds if it is above a floor; if not, the floor."""
+    """Return the score of the bounded pairs, or the floor if the score does not exceed it."""
     outlines, pairs, bounds = overlaps.outlines, overlaps.pairs, overlaps.bounds
     best_bounds = overlaps.best_bounds
     upper = 0.0

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Minimal samples, and the order of a search: random, all, or most likely first.
+"""Minimal samples, and the order of a search: random, exhaustive, or most likely first.
 
 A sample is three candidates with three different detections and three different landmarks.
 
-The size of a box gives the distance of its landmark, roughly. So two boxes and the angle between
-them bound the distance between their landmarks, which the map knows: two candidates that cannot be
-right at once never form a sample.
+The size of a box gives an approximate distance to its landmark. Two boxes and the angle between
+them therefore bound the distance between their landmarks, which the map contains. Two candidates
+that cannot both be correct never form a sample.
 
-Leaders are the best hypotheses of a search, each at a place of its own. Poses that contradict the
-constraint are not verified. Each search yields its progress after each block of samples, where the
-caller may stop it.
+Leaders are the best hypotheses of a search, at most one at each place. Poses that contradict the
+constraint are not verified. Each search yields its progress after each block of samples, and the
+caller may stop it there.
 """
 
 import time
@@ -28,51 +28,52 @@ from cliploc_ros.core.search.scene import Constraint, Scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 
 SAMPLE_SIZE = 3
-# An enumeration returns after this number of steps of some nanoseconds, even without a sample.
+# An enumeration returns after this number of steps, of a few nanoseconds each, even if it found no
+# sample.
 _MAX_STEPS = 500_000
-# A draw without a valid sample in this many attempts is skipped (its row is -1): the first
-# candidates of PROSAC may not have any.
+# A draw that yields no valid sample within this number of attempts is skipped (its row is -1):
+# PROSAC's first candidates may not contain a valid sample.
 _MAX_ATTEMPTS = 100
-# Limits of a landmark's distance, divided by the distance that the size of its box gives. Of 1375
-# boxes of the recorded TUM frames, to which the map was fitted, 99.8 % lie between .67 and 2.5:
-# boxes are larger than the ellipsoid, or cut by the border.
+# Limits of the ratio of a landmark's distance to the distance that the size of its box gives. Of
+# 1375 boxes of the recorded TUM frames, to which the map was fitted, 99.8 % lie between .67 and
+# 2.5: boxes are larger than the ellipsoid, or cut off by the border of the image.
 NEAREST, FARTHEST = 0.55, 2.5
 MAX_DISTINCT = 8
-# Plain numbers, for the kernels.
+# Compiled kernels need plain numbers.
 _PLACE_M, _PLACE_TRACE = SAME_PLACE.distance_m, SAME_PLACE.least_trace
-# Scores nearer than this differ by rounding only: the hypothesis found first stays.
+# Scores that differ by less than this are equal up to rounding: the hypothesis found first stays.
 _TIE = 1e-9
-# search_progressively drops a sample whose three pairs have a smaller sum of IoUs: it tries every
-# sample, so a better one of the same place follows.
+# search_progressively drops a sample whose three pairs have a smaller sum of IoUs: it tries all
+# samples, so a better sample of the same place follows.
 _MIN_SAMPLED_IOU = 0.9
-# The same of two pairs, whose poses inherit the noise of the vertical.
+# The same limit for samples of two pairs, whose poses inherit the noise of the vertical.
 _MIN_SAMPLED_PAIR_IOU = 0.2
-# A block of a search takes about this long, so that it keeps time limits.
+# Target duration of a block: a search can stop only between blocks.
 _BLOCK_S = 1e-3
 # Samples in a block.
 _FIRST_BLOCK, _LARGEST_BLOCK = 64, 1024
 
 
 def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
-    """Return T'_3 .. T'_N (N - 2,): PROSAC's last iteration with each size of its candidate set.
+    """Return T'_3 .. T'_N (N - 2,): PROSAC's last iteration at each size of its candidate set.
 
     Chum and Matas, "Matching with PROSAC", CVPR 2005, Eqs. 3 to 5, for N >= 3 candidates. T_N,
-    after which PROSAC becomes RANSAC, is the number of iterations: with the textbook's 200,000 a
-    search of 500 never leaves its first five candidates.
+    after which PROSAC becomes RANSAC, equals the number of iterations here. With the paper's
+    200,000, a search of 500 iterations would never go beyond its first five candidates.
     """
     sizes = np.arange(SAMPLE_SIZE, candidate_count)
     drawn = iterations * np.prod([(SAMPLE_SIZE - i) / (candidate_count - i)
                                   for i in range(SAMPLE_SIZE)])
     expected = drawn * np.cumprod(np.concatenate(
         [[1.0], (sizes + 1) / (sizes + 1 - SAMPLE_SIZE)]))
-    # The tolerance keeps whole numbers from being rounded up because of their last digit.
+    # The tolerance prevents floating-point error from rounding whole numbers up.
     steps = np.ceil(np.diff(expected) - 1e-9).astype(np.int64)
     return 1 + np.concatenate([[0], np.cumsum(steps)])
 
 
 def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
                 ) -> NDArray[np.int64]:
-    """Return samples (iterations, 3) of uniformly drawn candidates; rows of -1 are skipped.
+    """Draw samples (iterations, 3) of candidates uniformly; rows of -1 are skipped.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Genera
     """
     samples = np.full((iterations, SAMPLE_SIZE), -1, dtype=np.int64)
     if len(pairs) >= SAMPLE_SIZE:
-        # the whole set from the first iteration on
+        # sample from all candidates from the first iteration on
         growth = np.zeros(len(pairs) - SAMPLE_SIZE + 1, dtype=np.int64)
         _draw(np.ascontiguousarray(pairs), growth, rng, samples)
     return samples
@@ -89,7 +90,7 @@ def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Genera
 
 def draw_prosac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
                 ) -> NDArray[np.int64]:
-    """Return samples (iterations, 3) as PROSAC draws them; rows of -1 are skipped.
+    """Draw samples (iterations, 3) in the order of PROSAC; rows of -1 are skipped.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ def draw_prosac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Genera
 
 @compiled
 def _draw(pairs, growth, rng, samples):
-    """Fill samples: u_n and two of the n - 1 before it while t <= T'_n, then three of all."""
+    """Fill samples: while t <= T'_n, u_n and two of the n - 1 before it; then any three."""
     size = SAMPLE_SIZE
     for t in range(1, samples.shape[0] + 1):
         while size < pairs.shape[0] and t > growth[size - SAMPLE_SIZE]:
@@ -131,9 +132,9 @@ def enumerate_triples(pairs, cursor, samples):
     pairs : ndarray (c, 2)
         Detection and landmark of each candidate.
     cursor : ndarray (3,)
-        The next sample, at first 0, 1, 2; updated. Its first value is c - 2 at the end.
+        The next sample, initially 0, 1, 2; updated. Its first value is c - 2 at the end.
     samples : ndarray (t, 3)
-        Filled from the first row on.
+        Output, filled from the first row.
     """
     count = pairs.shape[0]
     first, second, third = cursor[0], cursor[1], cursor[2]
@@ -158,22 +159,22 @@ def enumerate_triples(pairs, cursor, samples):
 
 @compiled
 def _clash(pairs, a, b):
-    """Return whether two candidates share a detection or a landmark."""
+    """Check whether two candidates share a detection or a landmark."""
     return pairs[a, 0] == pairs[b, 0] or pairs[a, 1] == pairs[b, 1]
 
 
 @compiled
 def enumerate_compatible_triples(compatible, cursor, samples):
-    """Write the next samples of compatible candidates, by their newest; return their number.
+    """Write the next compatible triples, ordered by newest candidate; return their number.
 
     Parameters
     ----------
     compatible : ndarray (c, c) of bool
         See compatible_pairs.
     cursor : ndarray (3,)
-        Newest, first and second candidate, at first 2, 0, 1; updated. The newest is c at the end.
+        Newest, first and second candidate, initially 2, 0, 1; updated. The newest is c at the end.
     samples : ndarray (t, 3)
-        Filled from the first row on: first, second, newest.
+        Output, filled from the first row: first, second, newest.
     """
     count = compatible.shape[0]
     newest, first, second = cursor[0], cursor[1], cursor[2]
@@ -204,7 +205,7 @@ def enumerate_compatible_triples(compatible, cursor, samples):
 
 @compiled
 def _compatible_before(compatible, newest, earlier):
-    """Write the candidates before the newest one that are compatible; return their number."""
+    """Write the earlier candidates that are compatible with the newest; return their number."""
     known = 0
     for candidate in range(newest):
         if compatible[newest, candidate]:
@@ -215,10 +216,10 @@ def _compatible_before(compatible, newest, earlier):
 
 @compiled
 def enumerate_compatible_pairs(compatible, cursor, samples):
-    """Write the next pairs of compatible candidates, by their newer; return their number.
+    """Write the next compatible pairs, ordered by newer candidate; return their number.
 
-    As enumerate_compatible_triples does, into two columns: older, newer. The cursor (2,) starts
-    at 1, 0; at the end its first value is c.
+    Like enumerate_compatible_triples, but with two columns: older, newer. The cursor (2,) starts
+    at 1, 0; its first value is c at the end.
     """
     count = compatible.shape[0]
     newest, first = cursor[0], cursor[1]
@@ -237,10 +238,10 @@ def enumerate_compatible_pairs(compatible, cursor, samples):
 
 
 def compatible_pairs(scene: Scene) -> NDArray[np.bool_]:
-    """Return which pairs of candidates (c, c) may form a sample; symmetric.
+    """Return a symmetric mask (c, c) of the pairs of candidates that may form a sample.
 
-    Detections and landmarks must differ, and the landmarks' distance in the map must be within
-    the range that their boxes allow.
+    The two candidates must have different detections and different landmarks. The distance
+    between the landmarks in the map must be within the range that their boxes allow.
     """
     depths = _depths(scene)
     compatible = np.zeros((len(scene.pairs), len(scene.pairs)), dtype=np.bool_)
@@ -249,13 +250,13 @@ def compatible_pairs(scene: Scene) -> NDArray[np.bool_]:
 
 
 def _depths(scene: Scene) -> NDArray[np.float64]:
-    """Return the distance (c,) [m] at which each candidate's landmark is as large as its box."""
+    """Return the distance (c,) [m] at which each landmark would appear as large as its box."""
     xx, xy, xz, yy, yz, zz = scene.shapes[scene.pairs[:, 1]].T
     # the determinant of a shape matrix is the product of the squared semi-axes
     determinant = (xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
     radius = np.cbrt(np.sqrt(np.maximum(determinant, 0.0)))
     half = scene.box_ellipses[scene.pairs[:, 0], 2:]
-    # boxes are on the plane z = 1, whose points are farther away off the axis
+    # the last factor converts depth along the optical axis to distance along the ray
     middle = scene.box_ellipses[scene.pairs[:, 0], :2]
     return np.asarray(radius / np.sqrt(half.prod(axis=1))
                       * np.sqrt(1.0 + (middle * middle).sum(axis=1)))
@@ -263,9 +264,9 @@ def _depths(scene: Scene) -> NDArray[np.float64]:
 
 @compiled
 def _compare_near(scene, depths, along_x, compatible):
-    """Compare each candidate with those before it along the x axis, as far as it may reach.
+    """Compare each candidate with its predecessors along the x axis, within its reach.
 
-    In a large map, and in several maps side by side, most are beyond.
+    In a large map, and in several maps side by side, most predecessors are out of reach.
     """
     pairs, deepest = scene.pairs, 0.0
     for depth in depths:
@@ -281,7 +282,7 @@ def _compare_near(scene, depths, along_x, compatible):
                 continue
             p, q = scene.centers[pairs[i, 1]], scene.centers[pairs[j, 1]]
             apart = sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
-            # most pairs of a large map are farther apart than any camera between them allows
+            # in a large map, most pairs are too far apart for any camera position
             if apart > FARTHEST * (depths[i] + depths[j]):
                 continue
             a, b = scene.bearings[pairs[i, 0]], scene.bearings[pairs[j, 0]]
@@ -293,10 +294,11 @@ def _compare_near(scene, depths, along_x, compatible):
 
 @compiled
 def _distance_range(depth_a, depth_b, cosine):
-    """Return the least and greatest distance of two points whose depths are about these."""
+    """Return the minimum and maximum distance between two points of roughly known depths."""
     near_a, far_a = NEAREST * depth_a, FARTHEST * depth_a
     near_b, far_b = NEAREST * depth_b, FARTHEST * depth_b
-    # The squared distance is convex in both depths: greatest at a corner, least on an edge.
+    # The squared distance is convex in both depths: the maximum is at a corner, the minimum on an
+    # edge.
     high = max(_square(near_a, near_b, cosine), _square(near_a, far_b, cosine),
                _square(far_a, near_b, cosine), _square(far_a, far_b, cosine))
     low = min(_square(near_a, min(max(near_a * cosine, near_b), far_b), cosine),
@@ -312,31 +314,31 @@ def _square(depth_a, depth_b, cosine):
 
 
 class Leaders(NamedTuple):
-    """The best hypotheses so far, at distinct places; unused rows have the score -1."""
+    """The best hypotheses of a search, at distinct places; unused rows have the score -1."""
 
     scores: NDArray[np.float64]  #: (m,)
-    iterations: NDArray[np.int64]  #: (m,): in which iteration each was found, from 1
-    samples: NDArray[np.int64]  #: (m, 3): its minimal sample, as candidate numbers
+    iterations: NDArray[np.int64]  #: (m,): iteration that found each hypothesis, from 1
+    samples: NDArray[np.int64]  #: (m, 3): minimal sample of each, as candidate numbers
     #: (m, 3, 3), (m, 3): of camera_from_map
     rotations: NDArray[np.float64]
     translations: NDArray[np.float64]
 
     @staticmethod
     def none_yet(count: int = MAX_DISTINCT) -> 'Leaders':
-        """Return storage for a number of leaders, all of it unused."""
+        """Allocate storage for a number of leaders, all unused."""
         return Leaders(np.full(count, -1.0), np.zeros(count, dtype=np.int64),
                        np.full((count, 3), -1, dtype=np.int64),
                        np.zeros((count, 3, 3)), np.zeros((count, 3)))
 
     def ranked(self) -> NDArray[np.int64]:
-        """Return the used rows, best first."""
+        """Return the indices of the used rows, best first."""
         order = np.argsort(-self.scores, kind='stable')
         return order[self.scores[order] >= 0.0]
 
 
 @compiled
 def worst_score(leaders):
-    """Return the score that a hypothesis must exceed to lead."""
+    """Return the score that a hypothesis must exceed to become a leader."""
     worst = leaders.scores[0]
     for row in range(1, leaders.scores.shape[0]):
         worst = min(worst, leaders.scores[row])
@@ -345,7 +347,7 @@ def worst_score(leaders):
 
 @compiled
 def remember(leaders, score, iteration, sample, rotation, translation):
-    """Add a hypothesis, unless a better hypothesis leads at its place; drop worse ones there."""
+    """Add a hypothesis, unless its place has a better leader; drop worse leaders of that place."""
     scores = leaders.scores
     free = -1
     for row in range(scores.shape[0]):
@@ -374,7 +376,7 @@ def remember(leaders, score, iteration, sample, rotation, translation):
 
 @compiled
 def same_place(rotation_a, translation_a, rotation_b, translation_b):
-    """Return whether two camera_from_map poses are within SAME_PLACE of each other.
+    """Check whether two camera_from_map poses are within SAME_PLACE of each other.
 
     The trace of the rotation between them is 1 + 2 cos(angle).
     """
@@ -390,16 +392,16 @@ def same_place(rotation_a, translation_a, rotation_b, translation_b):
 
 
 class Progress(NamedTuple):
-    """The progress of a search."""
+    """Progress of a search."""
 
-    tried: int  #: Hypotheses tried so far
-    coverage: float  #: The share of its samples that were tried, 0 to 1
-    reach: int = 0  #: A progressive search tried all samples among this number of candidates
+    tried: int  #: Number of samples tried
+    coverage: float  #: Share of all samples that were tried, 0 to 1
+    reach: int = 0  #: Progressive search: all samples among this number of candidates were tried
 
 
 def search_samples(scene: Scene, samples: NDArray[np.int64], leaders: Leaders,
                    constraint: Constraint | None = None) -> Iterator[Progress]:
-    """Try given minimal samples, a block at a time.
+    """Try the given minimal samples, a block at a time.
 
     Parameters
     ----------
@@ -436,17 +438,17 @@ def search_exhaustively(scene: Scene, leaders: Leaders, constraint: Constraint |
 def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: Leaders,
                          constraint: Constraint | None = None, limit: float = inf,
                          size: int = SAMPLE_SIZE) -> Iterator[Progress]:
-    """Try every sample of compatible candidates, those of the first candidates first.
+    """Try every sample of compatible candidates, starting with the first candidates.
 
-    All samples among the first n candidates precede those with the next one. PROSAC draws in this
-    order at random; this search does not repeat samples, and ends when all are tried.
+    All samples among the first n candidates precede the samples with candidate n + 1. PROSAC
+    draws at random in this order; this search repeats no sample and ends when all were tried.
 
     Parameters
     ----------
     compatible : ndarray (c, c) of bool
         See compatible_pairs.
     size : int, optional
-        Candidates in a sample: three, or two where the constraint's vertical is known (see
+        Candidates in a sample: three, or two if the constraint's vertical is known (see
         cliploc_ros.core.geometry.minimal_solvers). With two, the third column of the leaders'
         samples is -1.
     """
@@ -468,7 +470,7 @@ def search_progressively(scene: Scene, compatible: NDArray[np.bool_], leaders: L
 def _blocks(scene: Scene, constraint: Constraint | None, leaders: Leaders,
             fill: Callable[[NDArray[np.int64]], int], limit: float = inf, least_iou: float = 0.0
             ) -> Iterator[int]:
-    """Try blocks of samples of about equal time; yield how many were tried after each.
+    """Try blocks of samples of about equal duration; yield the number tried after each block.
 
     Results do not depend on the sizes of the blocks. `fill` writes the next samples into a block
     (b, 3) and returns their number.
@@ -488,7 +490,7 @@ def _blocks(scene: Scene, constraint: Constraint | None, leaders: Leaders,
 
 @compiled
 def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
-    """Make the hypotheses of the first samples, and remember those that lead."""
+    """Make the hypotheses of the first `count` samples, and add the best to the leaders."""
     candidates, constraint, targets, sample, poses, overlaps = bench
     floor = worst_score(leaders)
     for number in range(count):

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The watch: evidence that a localizer's pose is right, look by look.
+"""The watch: evidence, look by look, that a localizer's pose is right.
 
 look
-    The pose near the given one that fits the detections best, and the log odds that the given pose
-    is right.
+    The pose near the given pose that fits the detections best, and the log odds that the given
+    pose is right.
 camera
-    Faults of the images, and how the camera is turned against its stated mount.
+    Faults of the images, and the rotation of the camera relative to its stated mount.
 watch
-    The probability over looks, which odometry and the time between them correlate; all of it, and
+    The entry point: the probability that the pose is right, filtered over correlated looks, and
     the state with its reason.
 
-The landmarks that an image should show, and those that are gone, are in core.map.visibility.
+core.map.visibility finds the landmarks that an image should show, and landmarks that are gone.
 """

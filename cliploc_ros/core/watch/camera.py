@@ -1,18 +1,19 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of a camera over several looks: in its images, and in the orientation of its mount.
+"""Detect faults of a camera over several looks: in its images and in its mount's orientation.
 
-Each sign of a fault has to last for some looks. A wall before a standing robot is as bare as a
-cloth over its lens, and its image as smooth as one that is out of focus, so what is blurred or
-dirty shows in different views only. An image that stays the same to the last bit is frozen once
-the robot moves.
+Each sign of a fault must persist for several looks. A wall in front of a standing robot looks as
+bare as a cloth over the lens and as smooth as an image out of focus. Blur and dirt are therefore
+detected only over different views. An image that stays bitwise identical while the robot moves is
+frozen.
 
 If the stated orientation of the mount is wrong, it is off by the same angle in all looks at right
 poses. Each look gives the turn from the given pose to the fitted pose, with its information. The
-given pose is off by decimetres and its yaw by degrees, which changes along the way, while the turn
-of the camera stays. So looks are averaged by their information and by how much they scatter, far
-ones with less weight (Cauchy). A yaw error of the localizer that never changes is the same as a
-camera that is turned about the vertical: the images cannot tell which.
+given pose is off by decimetres and its yaw by degrees; these errors change along the way, while
+the turn of the camera is constant. The estimate is the mean of the turns, weighted by their
+information, with smaller weights for outliers (Cauchy). Its covariance includes their scatter. A
+constant yaw error of the localizer has the same effect as a camera that is turned about the
+vertical: the images cannot distinguish the two.
 """
 
 import math
@@ -30,17 +31,16 @@ from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import SAME_VIEW
 from cliploc_ros.core.watch.look import Alignment
 
-# The names of the faults.
-_FAULTS = {'dark': 'the camera is in the dark, or covered',
-           'bare': 'the camera is covered, or before a bare wall',
+_FAULTS = {'dark': 'the camera is in the dark or covered',
+           'bare': 'the camera is covered or faces a bare wall',
            'frozen': 'the image is frozen',
-           'smooth': 'the image is blurred, or the lens dirty'}
-# Steps of the iteration for the weighted mean of some turns: a numerical bound.
+           'smooth': 'the image is blurred or the lens is dirty'}
+# Number of iterations of the weighted mean, a numerical bound.
 _ROUNDS = 10
 
 
 class ImageFaults:
-    """Signs of faults over the images of one camera."""
+    """Detects faults in the images of one camera."""
 
     def __init__(self) -> None:
         self._counts = dict.fromkeys(_FAULTS, 0)
@@ -48,9 +48,9 @@ class ImageFaults:
         self._checksum = -1
 
     def add(self, image: NDArray[np.uint8], pose: NDArray[np.float64]) -> str:
-        """Take in an image (h, w, 3) from a pose (4, 4), by odometry if known; return the fault.
+        """Add an image (h, w, 3) and its pose (4, 4); return the fault as text, empty if none.
 
-        The text is empty if there is none.
+        The pose should come from odometry if available.
         """
         terms = CALIBRATION.images
         width = int(terms.width_px)
@@ -61,7 +61,7 @@ class ImageFaults:
         is_dark = mean < terms.dark and np.quantile(grey, terms.dark_part) < terms.dark_high
         is_bare = deviation < terms.bare and not is_dark
         is_smooth = cv2.Laplacian(grey, cv2.CV_32F).std() < terms.smooth
-        moved = not SAME_VIEW.agree(pose, self._pose)  # true of the first one
+        moved = not SAME_VIEW.agree(pose, self._pose)  # True for the first image: NaN
         for name, shown in (('dark', is_dark), ('bare', is_bare),
                             ('smooth', is_smooth and not (is_dark or is_bare))):
             if not shown:
@@ -80,13 +80,13 @@ class ImageFaults:
 
 @dataclass(frozen=True)
 class CameraTurn:
-    """The camera is turned against its stated mount."""
+    """Rotation of the camera relative to its stated mount."""
 
     #: (3,): rotation vector that turns the stated axes of the camera into the true axes [deg];
     #: optical axes: x right, y down, z forward
     rotvec_deg: NDArray[np.float64]
     sigma_deg: float  #: Standard deviation on each axis
-    #: Whether it is about the vertical: a constant yaw error of the localizer looks the same
+    #: Whether the axis is vertical: a constant yaw error of the localizer looks the same
     is_yaw: bool = False
 
     @property
@@ -97,7 +97,7 @@ class CameraTurn:
         return turn
 
     def in_words(self) -> str:
-        """Return the turn as text: 'turned by 3.1 degrees about y'."""
+        """Return the turn as text, such as 'turned by 3.1 degrees about y'."""
         angle = float(np.linalg.norm(self.rotvec_deg))
         shares = np.abs(self.rotvec_deg) / max(angle, 1e-9)
         names = [name for name, share in zip('xyz', shares, strict=True) if share > 0.4]
@@ -106,7 +106,7 @@ class CameraTurn:
 
 
 class _Turn(NamedTuple):
-    """A turn that one look shows [rad], its information, and the vertical, in the camera."""
+    """The turn that one look measured [rad], its information, and the vertical in the camera."""
 
     rotvec: NDArray[np.float64]
     information: NDArray[np.float64]
@@ -114,15 +114,15 @@ class _Turn(NamedTuple):
 
 
 class TurnEstimate:
-    """The turns of the last looks. A look from the same spot replaces the last one."""
+    """Estimate of the turn from the last looks; a look from the same spot replaces the last."""
 
     def __init__(self) -> None:
         self._turns: deque[_Turn] = deque(maxlen=int(CALIBRATION.turn.most_looks))
-        #: None while it is unknown or may be chance
+        #: None while it is unknown or not significant
         self.turn: CameraTurn | None = None
 
     def add(self, alignment: Alignment, given: NDArray[np.float64], is_new: bool) -> None:
-        """Take in a look at a right pose (4, 4)."""
+        """Add a look at a right pose (4, 4)."""
         fit, terms = alignment.fit, CALIBRATION.turn
         information = fit.finalist.information
         if fit.support.inliers < terms.matched or information is None or not information.any():
@@ -147,14 +147,15 @@ def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
              given: NDArray[np.float64]) -> _Turn:
     """Return the turn from a given pose (4, 4) to the fitted pose, at the most likely position.
 
-    The given position is right to within the drift of a localizer, so what moves the fit away from
-    it is in part a turn: the least squares of the fit and of the given position together.
+    The given position is right up to the drift of a localizer, so part of the shift between the
+    given and the fitted pose is caused by a turn. The turn is the least-squares solution of the
+    fit and a prior on the position.
     """
     terms, back = CALIBRATION.turn, given[:3, 3] - pose[:3, 3]
     prior = np.diag(1.0 / np.square([terms.drift_m, terms.drift_m, terms.drift_up_m]))
     of_step, mixed, of_turn = information[:3, :3], information[:3, 3:], information[3:, 3:]
     marginal = of_turn - mixed.T @ np.linalg.solve(of_step + prior, mixed)
-    # of position and turn together, with the prior of the position
+    # information of position and turn, with the prior on the position
     joint = information.copy()
     joint[:3, :3] += prior
     step = np.linalg.solve(joint, np.concatenate([prior @ back, np.zeros(3)]))
@@ -167,19 +168,19 @@ def _turn_of(pose: NDArray[np.float64], information: NDArray[np.float64],
 
 
 def _robust_mean(turns: deque[_Turn]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean of some turns (3,) and its covariance (3, 3), by their scatter."""
+    """Return the robust mean of turns (3,) and its covariance (3, 3), including their scatter."""
     vectors = np.array([turn.rotvec for turn in turns])
     informations = np.array([turn.information for turn in turns])
     mean = np.median(vectors, axis=0)
     for _ in range(_ROUNDS):
         off = vectors - mean
-        # 3 axes: a deviation on each has half the weight
+        # divided by the 3 axes: an error of one standard deviation on each axis halves the weight
         weights = 1.0 / (1.0 + np.einsum('ni,nij,nj->n', off, informations, off) / 3.0)
         weighted = weights[:, None, None] * informations
         total = np.linalg.inv(weighted.sum(axis=0))
         mean = total @ np.einsum('nij,nj->i', weighted, vectors)
     pulls = np.einsum('nij,nj->ni', weighted, vectors - mean)
-    # errors of neighbouring looks are alike: those of two in a row count together
+    # errors of consecutive looks are correlated: each is summed with its predecessor's
     pulls = pulls + np.roll(pulls, 1, axis=0) * (np.arange(len(pulls)) > 0)[:, None]
     scatter = total @ (pulls.T @ pulls) @ total
     return mean, np.asarray(np.maximum(scatter, 0.0) * np.eye(3) + total)

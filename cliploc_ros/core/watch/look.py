@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """One look at a given pose: the best pose near it, and the evidence that the given pose is right.
 
-A localizer drifts by decimetres and a few degrees, and a camera may be turned on its robot. Then
-outlines miss the boxes of small objects. A grid of turns and shifts about the given pose is
-therefore scored, and the best few are refined. The rest of the map is not searched.
+A localizer drifts by decimetres and a few degrees, and a camera may be rotated on its robot. The
+projected outlines of small objects then miss their boxes. A grid of turns and shifts around the
+given pose is therefore scored, and the best poses are refined. No other part of the map is
+searched.
 
-The evidence is the log odds that the given pose is right rather than a pose elsewhere. They come
-from a logistic model, fitted to equal numbers of looks at right and at wrong poses in simulated
-worlds, so they are the logarithm of a likelihood ratio. Right poses include places that changed
-since they were mapped: some objects fit, others are missing or stand where nothing is mapped. At a
-wrong pose of the same map, little fits.
+The evidence is the log odds that the given pose is right and not elsewhere. They come from a
+logistic model, fitted to equal numbers of looks at right and at wrong poses in simulated worlds,
+so they are log likelihood ratios. The right poses include places that changed since they were
+mapped: some objects fit, others are missing or stand where nothing is mapped. At a wrong pose of
+the same map, few objects fit.
 """
 
 import math
@@ -55,28 +56,29 @@ _ROLLS_DEG, _SHIFTS_M = (-_TERMS.grid_roll_deg, _TERMS.grid_roll_deg), (
     -_TERMS.grid_shift_m, 0.0, _TERMS.grid_shift_m)
 _STEPS = np.array([*product(_TURNS_DEG, _TURNS_DEG, (0.0,), _SHIFTS_M, _SHIFTS_M),
                    *product(_TURNS_DEG, _TURNS_DEG, _ROLLS_DEG, (0.0,), (0.0,))])
-# Poses (k, 4, 4) of the grid, in the camera at the given pose.
+# Poses (k, 4, 4) of the grid, in the camera frame at the given pose.
 _GRID = np.tile(np.eye(4), (len(_STEPS), 1, 1))
 _GRID[:, :3, :3] = Rotation.from_rotvec(_STEPS[:, :3], degrees=True).as_matrix()
 _GRID[:, [0, 2], 3] = _STEPS[:, 3:]
-# Least distance between poses that are refined.
+# Minimum distance between poses that are refined.
 _APART = Tolerance(_TERMS.apart_m, _TERMS.apart_deg)
 
 
 class Alignment(NamedTuple):
-    """The best pose near a given one."""
+    """The best pose near a given pose."""
 
     joined: JoinedFrames  #: The frame, without its vertical
     fit: Contender
-    away_m: float  #: From the given pose
+    away_m: float  #: Distance from the given pose
     away_deg: float
 
 
 def look_at(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions
             ) -> JoinedFrames:
-    """Return an observation as a frame that poses are compared on.
+    """Prepare an observation for the comparison of poses.
 
-    Its vertical depends on the given mount, which may be wrong, so it must not bias the fit.
+    Its vertical is dropped: it depends on the stated mount, which may be wrong, and must not bias
+    the fit.
     """
     if observation.similarities is None:
         options = replace(options, matching='class')
@@ -88,43 +90,44 @@ def look_at(landmark_map: LandmarkMap, observation: Observation, options: Reloca
 
 
 def align(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Alignment:
-    """Return the best pose near a given one (4, 4)."""
+    """Find the best pose near a given pose (4, 4)."""
     starts = map_from_camera @ _GRID
     rotations = np.ascontiguousarray(starts[:, :3, :3].transpose(0, 2, 1))
     translations = -np.einsum('kij,kj->ki', rotations, starts[:, :3, 3])
     scores = scores_of(joined.rig, rotations, translations)
     order = np.argsort(-scores, kind='stable')
     starts = starts[order[scores[order] > 0.0]]
-    some = [unrefined(map_from_camera),
-            *(unrefined(starts[row]) for row in _APART.distinct(starts, int(_TERMS.refined)))]
-    if len(some) > 1:
-        some += [refined(joined, one) for one in some]
-    found = contenders_of(joined, some, [True] * len(some))
-    errors = [pose_error(one.pose, map_from_camera) for one in found]
+    finalists = [unrefined(map_from_camera),
+                 *(unrefined(starts[row]) for row in _APART.distinct(starts, int(_TERMS.refined)))]
+    if len(finalists) > 1:
+        finalists += [refined(joined, finalist) for finalist in finalists]
+    found = contenders_of(joined, finalists, [True] * len(finalists))
+    errors = [pose_error(contender.pose, map_from_camera) for contender in found]
     near = [row for row, error in enumerate(errors)
             if error[0] < SAME_NEIGHBOURHOOD.distance_m
             and error[1] < SAME_NEIGHBOURHOOD.angle_deg]
-    odds = [one.odds - 0.5 * ((away_m / _TERMS.pull_m) ** 2 + (away_deg / _TERMS.pull_deg) ** 2)
-            for one, (away_m, away_deg) in zip(found, errors, strict=True)]
+    odds = [contender.odds
+            - 0.5 * ((away_m / _TERMS.pull_m) ** 2 + (away_deg / _TERMS.pull_deg) ** 2)
+            for contender, (away_m, away_deg) in zip(found, errors, strict=True)]
     fit = max(near, key=lambda row: odds[row])
     return Alignment(joined, found[fit], *errors[fit])
 
 
 class LookEvidence(NamedTuple):
-    """The evidence of one look about the given pose."""
+    """The evidence of one look for or against the given pose."""
 
     known: int  #: Detections of the map's classes
-    matched: int  #: Objects that are where the pose expects them
+    matched: int  #: Objects that are where the pose predicts them
     unexplained: int  #: Other detections of the map's classes
-    utility: float  #: Utility of the matched objects, by the acceptance's model [log odds]
+    utility: float  #: Utility of the matched objects in the model of the acceptance [log odds]
     expected: int  #: Landmarks that the image should show
     missed: int  #: Expected landmarks that no detection shows
-    away_m: float  #: From the given pose to the best pose near it
+    away_m: float  #: Distance from the given pose to the best pose near it
     away_deg: float
-    crowd: float  #: Logarithm of the pairs of a detection and a landmark in view of its class
+    crowd: float  #: log(1 + number of pairs of a detection and a landmark in view of its class)
 
     def is_full(self, has_jumped: bool) -> bool:
-        """Return whether a wrong pose would show. After a jump, no mapped spot is needed."""
+        """Check whether the look would reveal a wrong pose; after a jump, by any objects."""
         return self.known >= _TERMS.full_objects and (
             has_jumped or self.expected >= _TERMS.full_mapped)
 
@@ -139,7 +142,7 @@ class LookEvidence(NamedTuple):
 
 
 def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
-    """Return the evidence of an aligned look, and the landmarks that it expects."""
+    """Measure the evidence of an aligned look, and find the landmarks that it should show."""
     joined, fit = alignment.joined, alignment.fit
     landmark_map, observation = joined.landmark_map, joined.frames[0].observation
     index, (matches,) = landmark_map.classes, fit.matches
@@ -149,10 +152,10 @@ def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
     unexplained = sum(row not in taken for row in np.nonzero(own)[0].tolist())
     found = expect(landmark_map, observation.camera, fit.pose,
                    np.array([match.landmark for match in matches], dtype=np.int64))
-    # detections that nothing explains are a term of their own
+    # unexplained detections are a separate term: remove them from the utility
     utility, = utilities([fit.support]) - CALIBRATION.objects.unexplained * fit.support.unexplained
     in_view = index.of_landmarks[found.landmarks]
-    pairs = sum(int((in_view == kind).sum()) for kind in classes[own])
+    pairs = sum(int((in_view == class_number).sum()) for class_number in classes[own])
     return LookEvidence(int(own.sum()), round(fit.support.inliers), unexplained, float(utility),
                         len(found.landmarks), int((~found.was_seen).sum()), alignment.away_m,
                         alignment.away_deg, math.log1p(pairs)), found
@@ -160,21 +163,21 @@ def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
 
 def log_odds(evidence: LookEvidence, is_full: bool, calibration: Calibration = CALIBRATION
              ) -> float:
-    """Return the log odds of a look by its objects that the given pose is right.
+    """Return the log odds that the given pose is right, from the objects of a look.
 
-    Neither a place that the map lacks nor a view without objects makes the pose wrong: a look that
-    is not full says little against a pose.
+    At a right pose, the place may be unmapped or the view without objects. So the evidence of a
+    look that is not full against a pose is limited.
     """
     terms = calibration.watch
     if not evidence.known:
-        return 0.0  # something may hide everything
+        return 0.0  # something may occlude all objects
     found = sum(terms[name] * value for name, value in evidence.terms.items())
     return min(max(found, terms.least if is_full else terms.least_unsure), terms.most)
 
 
 def by_keyframes(recognizer: ImageRecognizer, alignment: Alignment,
                  given: NDArray[np.float64]) -> float:
-    """Return the log odds by keyframes that a given pose (4, 4) is right."""
+    """Return the log odds that a given pose (4, 4) is right, from keyframes."""
     joined, terms = alignment.joined, CALIBRATION.keyframes
     constraint = constraint_of(joined.frames[0].observation, joined.options)
     seen = recognizer.recognize([given], constraint)
@@ -187,7 +190,7 @@ def by_keyframes(recognizer: ImageRecognizer, alignment: Alignment,
 
 def by_vertical(map_from_camera: NDArray[np.float64], up_in_camera: NDArray[np.float64] | None,
                 deviation_deg: float) -> float:
-    """Return the log odds, 0 or less, of a given pose (4, 4) by the vertical (3,)."""
+    """Return the log odds, at most 0, that a pose (4, 4) is right, from the vertical (3,)."""
     if up_in_camera is None:
         return 0.0
     cosine = float(map_from_camera[2, :3] @ up_in_camera)

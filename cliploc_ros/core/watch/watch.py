@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The entry point of the watch: Watch.look(observation, map_from_camera) -> WatchReport.
+"""Entry point of the watch: Watch.look(observation, map_from_camera) -> WatchReport.
 
-The probability that a localizer is right is a Bayes filter over looks. Between looks a localizer
-may get lost, or find itself: the probability goes to one half, at a rate of the time and the way.
-A pose that moves against odometry is another statement. Looks of the same place from the same spot
-share their errors, such as those of the map, so a standing robot learns little from more of them.
+The probability that a localizer is right is estimated by a Bayes filter over looks. Between looks
+a localizer may get lost or recover, so the probability decays to one half with time and distance.
+A pose that jumps relative to odometry starts a new hypothesis. Looks from the same spot share
+errors, such as the errors of the map, so further looks of a standing robot add little information.
 """
 
 import math
@@ -42,24 +42,24 @@ from cliploc_ros.core.watch.look import (
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
-# Rounding of a given pose: a matrix further from a rigid transform is refused as input.
+# Tolerance for rounding of a given pose: a matrix farther from a rigid transform is refused.
 _RIGID = 1e-3
 
 
 class _Look(NamedTuple):
     observation: Observation
     log_odds: float
-    is_full: bool  #: Whether a wrong pose would show: enough objects, and enough mapped objects
+    is_full: bool  #: Whether a wrong pose would be noticed: enough objects and mapped objects
 
 
 class Belief:
-    """The filter. Looks come in the order of time."""
+    """The Bayes filter. Looks must be added in the order of time."""
 
     def __init__(self) -> None:
         self._log_odds = 0.0
         self._looks: deque[_Look] = deque(maxlen=int(CALIBRATION.watch.most_looks))
         self._last: tuple[Observation, NDArray[np.float64]] | None = None
-        #: Whether the localizer made another statement since it was right last
+        #: Whether the localizer's pose has jumped since it was last found right
         self.has_jumped = False
 
     @property
@@ -69,22 +69,22 @@ class Belief:
 
     @property
     def against(self) -> int:
-        """Return how many of the last full looks speak against the pose."""
-        return sum(one.is_full and one.log_odds < 0.0 for one in self._looks)
+        """Return the number of recent full looks with evidence against the pose."""
+        return sum(look.is_full and look.log_odds < 0.0 for look in self._looks)
 
     def wait(self, observation: Observation, map_from_camera: NDArray[np.float64]) -> None:
-        """Let the time to a look pass, and the way to its pose (4, 4)."""
+        """Predict: the time up to an observation passes, and the camera moves to a pose (4, 4)."""
         last, terms = self._last, CALIBRATION.watch
         self._last = observation, map_from_camera
         if last is None:
             return
         before, pose = last
-        away_m, away_deg = 0.0, 0.0  # against odometry
+        away_m, away_deg = 0.0, 0.0  # difference between the pose's motion and odometry
         if before.odom_from_camera is not None and observation.odom_from_camera is not None:
             away_m, away_deg = pose_error(pose @ invert_transform(
                 before.odom_from_camera) @ observation.odom_from_camera, map_from_camera)
         if away_m > SAME_PLACE.distance_m or away_deg > SAME_PLACE.angle_deg:
-            # Where the camera had confirmed the pose before, this one is wrong, unless that was.
+            # If the looks had confirmed the previous pose, the new pose is probably wrong.
             self._log_odds = -min(max(self._log_odds, 0.0), terms.most_jump)
             self._looks.clear()
             self.has_jumped = True
@@ -96,9 +96,9 @@ class Belief:
         self._log_odds = math.log(likely / (1.0 - likely))
 
     def add(self, observation: Observation, log_odds: float, is_full: bool) -> float:
-        """Take in a look after wait; return its weight, 1 if it shares no errors with others."""
+        """Add a look after wait(); return its weight, 1 if it is independent of earlier looks."""
         look = _Look(observation, log_odds, is_full)
-        weight = 1.0 - max((_correlation(one, look) for one in self._looks), default=0.0)
+        weight = 1.0 - max((_correlation(earlier, look) for earlier in self._looks), default=0.0)
         self._log_odds += weight * log_odds
         self._looks.append(look)
         if self.probability > CALIBRATION.watch.localized:
@@ -106,17 +106,17 @@ class Belief:
         return weight
 
 
-def _correlation(one: _Look, look: _Look) -> float:
+def _correlation(earlier: _Look, look: _Look) -> float:
     """Return the correlation of the errors of two looks, 0 to 1."""
     terms = CALIBRATION.watch
-    then, now = one.observation, look.observation
+    then, now = earlier.observation, look.observation
     if then.odom_from_camera is None or now.odom_from_camera is None:
         away = abs(now.stamp_ns - then.stamp_ns) / NS_PER_S / terms.correlated_s
     else:
         way_m, turn_deg = pose_error(then.odom_from_camera, now.odom_from_camera)
         away = way_m / terms.correlated_m + turn_deg / terms.correlated_deg
-    # looks that say the opposite are not a repetition: the robot was carried away, or back
-    return terms.correlated * math.exp(-away - abs(one.log_odds - look.log_odds) / terms.most)
+    # looks with contradictory evidence are not repetitions: the robot was carried away, or back
+    return terms.correlated * math.exp(-away - abs(earlier.log_odds - look.log_odds) / terms.most)
 
 
 class WatchState(StrEnum):
@@ -135,13 +135,13 @@ class WatchReport:
     #: Probability that the localizer's pose is right (within 1 m and 45 degrees), after all looks,
     #: 0 to 1
     probability: float
-    reason: str  #: In one line: what happened, with which value, and what to do
-    looks: int  #: Looks that said something since the last forget()
-    matched: int  #: Objects of the last look that are where the pose expects them
-    expected: int  #: Landmarks that the last look should have shown
-    missing: tuple[str, ...] = ()  #: Landmarks that several looks expected and did not see
-    camera_turn: CameraTurn | None = None  #: Once it is known and significant
-    fault: str = ''  #: What is wrong with the images, such as 'the camera is covered'
+    reason: str  #: One line: what happened, with which value, and what to do
+    looks: int  #: Number of looks with evidence since the last forget()
+    matched: int  #: Number of objects in the last look that are where the pose predicts them
+    expected: int  #: Number of landmarks that the last look should have shown
+    missing: tuple[str, ...] = ()  #: Landmarks that several looks should have shown but did not
+    camera_turn: CameraTurn | None = None  #: None unless it is known and significant
+    fault: str = ''  #: Fault of the images, such as 'the image is frozen'
 
 
 class Watch:
@@ -153,7 +153,7 @@ class Watch:
         self.forget()
 
     def forget(self) -> None:
-        """Begin again: the localizer was given another pose, time jumped, or the map changed."""
+        """Start over: the localizer was given another pose, time jumped, or the map changed."""
         self._belief, self._missing = Belief(), Missing(self._map)
         self._turn, self._faults = TurnEstimate(), ImageFaults()
         self._count, self._stamp_ns = 0, -1
@@ -166,14 +166,14 @@ class Watch:
         Parameters
         ----------
         observation : Observation
-            Its odometry tells which looks are independent; without odometry the watch learns more
-            slowly.
+            Its odometry shows which looks are independent. Without odometry, time is used, and the
+            probability converges more slowly.
         map_from_camera : ndarray (4, 4)
             The localizer's pose of the camera at the stamp of the image.
         image : ndarray (h, w, 3) of uint8, optional
-            To find faults of the camera.
+            Needed to detect faults of the camera.
         recognizer : ImageRecognizer, optional
-            Recognizer of the keyframes, for this image.
+            Keyframe recognizer of the image.
 
         Raises
         ------
@@ -185,7 +185,7 @@ class Watch:
                            ('odom_from_camera', observation.odom_from_camera)):
             if pose is not None and not is_rigid(pose, _RIGID):
                 raise OptionsError(f'{name} is not a rigid transform: {np.asarray(pose).tolist()}')
-        vertical_of(observation, self._options)  # refuses an invalid one
+        vertical_of(observation, self._options)  # raises OptionsError if invalid
         if image is not None and not image.size:
             raise OptionsError(f'image of shape {image.shape} has no pixels')
         if observation.stamp_ns < self._stamp_ns:
@@ -201,12 +201,12 @@ class Watch:
 
     def _weigh(self, observation: Observation, given: NDArray[np.float64],
                recognizer: ImageRecognizer | None) -> LookEvidence:
-        """Take in a look at a given pose (4, 4)."""
+        """Add the evidence of a look at a given pose (4, 4)."""
         turn = self._turn.turn
         alignment = align(look_at(self._map, observation, self._options),
                           given if turn is None else given @ turn.stated_from_true)
         evidence, expected = measure(alignment)
-        # where the map is out of date, objects that nothing explains are not a wrong pose
+        # where the map is out of date, unexplained objects are no evidence of a wrong pose
         is_full = evidence.is_full(self._belief.has_jumped) and (
             self._belief.has_jumped or not self._missing.is_outdated)
         odds = log_odds(evidence, is_full) + by_vertical(
@@ -225,7 +225,7 @@ class Watch:
         return evidence
 
     def _report(self, evidence: LookEvidence | None, fault: str = '') -> WatchReport:
-        """Return the state, and as its reason what happened, with which value, and what to do."""
+        """Return the state, with a reason that says what happened and what to do."""
         terms, belief = CALIBRATION.watch, self._belief
         likely, state = belief.probability, WatchState.UNCERTAIN
         missing = tuple(self._map.landmark_ids[row] for row in self._missing.named())
