@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Shared by the executables: errors in one line, and a clean end on Ctrl-C or SIGTERM."""
+"""Shared by the executables: one-line error messages, clean exit on Ctrl-C and SIGTERM."""
 
 import argparse
 import math
@@ -27,16 +27,17 @@ _LONGEST_WAIT_S = 2e6
 
 def run_main(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int],
              args: Sequence[str] | None) -> int:
-    """Run an executable that SIGTERM interrupts as Ctrl-C does; return its exit code.
+    """Run an executable and return its exit code. SIGTERM interrupts it as Ctrl-C does.
 
     Parameters
     ----------
     parser : argparse.ArgumentParser
-        Parser of the arguments that are not for ROS; those go to the options as ``ros_args``.
+        Parser of the program's own arguments. Arguments for ROS are stored in the options as
+        ``ros_args``.
     command : callable
         Takes the options and returns the exit code, see run_command.
     args : sequence of str, optional
-        The command line without the program's name; None: that of this process.
+        The command line without the program's name. Default: the command line of this process.
     """
     plain_args, ros_args = split_ros_args(sys.argv[1:] if args is None else args)
     options = parser.parse_args(plain_args, argparse.Namespace(ros_args=ros_args))
@@ -57,13 +58,13 @@ def run_command(command: Callable[[], int], failure: int = 1) -> int:
     Returns
     -------
     int
-        The exit code: `failure` after a CliplocError or a missing library, which it prints in one
-        line on stderr, and 130 when interrupted. Other exceptions keep their traceback.
+        The exit code: `failure` after a CliplocError or a missing library, 130 when interrupted.
+        The error is printed in one line on stderr. Other exceptions keep their traceback.
     """
     try:
         return command()
     except CliplocError as error:
-        # the library names its own `parameters`
+        # messages name `parameters` of the library; show the option of the command instead
         text = re.sub('`([a-z_]+)`', lambda name: f'--{name[1].replace("_", "-")}', str(error))
         print('error:', ' '.join(text.split()), file=sys.stderr)
         return failure
@@ -80,18 +81,18 @@ def run_command(command: Callable[[], int], failure: int = 1) -> int:
 
 
 def _extra_with(package: str) -> str:
-    """Return the extra of this package that installs another, from the installed metadata."""
+    """Return the extra that installs a package, as written after pip install."""
     try:
         requirements = metadata.requires('cliploc_ros') or []
-    except metadata.PackageNotFoundError:  # it runs from its sources
+    except metadata.PackageNotFoundError:  # cliploc_ros runs from its source tree
         requirements = []
     extras = re.findall(rf"^{re.escape(package)}\b.*extra == ['\"](\w+)",
                         '\n'.join(requirements), re.MULTILINE)
-    return f"'cliploc_ros[{extras[0]}]'" if extras else 'the extra that has it, see doc/install.md'
+    return f"'cliploc_ros[{extras[0]}]'" if extras else 'the extra that includes it, see doc/install.md'
 
 
 def printable(text: str) -> str:
-    """Return text for a terminal: ids in a map may hold any characters."""
+    """Return text that is safe to print: ids in a map may contain control characters."""
     return ''.join(char if char.isprintable() else ' ' for char in text)
 
 
@@ -99,7 +100,7 @@ def number[Number: (int, float)](kind: type[Number], allows: Callable[[Number], 
                                  ) -> Callable[[str], Number]:
     """Return an argparse type that accepts the numbers for which `allows` holds.
 
-    `what` names them, as in "2 is not a number above 3".
+    `what` describes them in the error message, as in "2 is not a number above 3".
     """
     def parse(text: str) -> Number:
         try:
@@ -118,33 +119,33 @@ positive = number(float, lambda value: 0.0 < value < math.inf, 'a number above 0
 not_negative = number(float, lambda value: 0.0 <= value < math.inf, 'a number of 0 or more')
 finite = number(float, math.isfinite, 'a finite number')
 limit = number(float, lambda value: not math.isnan(value), 'a number')  # may be infinite
-#: Seeds that NumPy takes
+#: Least and greatest seed that NumPy accepts
 SEEDS = 0, 2**63 - 1
 
 
 def within[Number: (int, float)](low: Number, high: Number) -> Callable[[str], Number]:
-    """Return a type for argparse: numbers of the limits' type, from low to high."""
+    """Return an argparse type that accepts numbers from low to high, of the type of the limits."""
     return number(type(low), lambda value: low <= value <= high,
                   f'within {low:g} and {high:g}')
 
 
-# Placeholders in the help that stand for paths.
+# Placeholders of paths in the help.
 _PATHS = ('DIR', 'NPZ', 'YAML', 'FILE', 'JSON', 'MAP', 'BAG|DIR', 'IN')
 
 
 def option(group: Any, shown: str, text: str | None = None,
            kind: Callable[[str], Any] | None = None, default: Any = None, **more: Any) -> None:
-    """Add an option or argument to a parser, or to a group of it.
+    """Add an option or argument to a parser, or to an argument group.
 
     Parameters
     ----------
     shown : str
-        Its names and values as the help shows them: '-r --rate X'. Without a value, a kind, a
-        default and choices it is a switch.
+        The names and values as the help shows them: '-r --rate X'. An option without a value, a
+        kind, a default and choices is a switch.
     text : str, optional
         The help.
     kind : callable, optional
-        The type for argparse; by default that of a path where the value is DIR, FILE and so on.
+        The type for argparse. Default: Path if the value is DIR, FILE and so on.
     more
         Further arguments of add_argument.
     """
@@ -166,7 +167,7 @@ def option(group: Any, shown: str, text: str | None = None,
 
 
 def check_output(path: Path) -> None:
-    """Refuse a file that cannot be written, before the work is done; MapError says why."""
+    """Check that an output file can be written, before the work is done; else raise MapError."""
     if not path.parent.is_dir():
         raise MapError(f'{path}: there is no folder {path.parent}; create it')
     if not os.access(folder := Path(os.path.realpath(path)).parent, os.W_OK):
@@ -177,7 +178,7 @@ def check_output(path: Path) -> None:
 
 @contextmanager
 def needs_ros(program: str) -> Iterator[None]:
-    """Turn a failing import of ROS into an error that says how to get it."""
+    """Convert an ImportError of ROS to an OptionsError that says how to install ROS."""
     try:
         yield
     except ImportError as error:
@@ -189,16 +190,16 @@ def needs_ros(program: str) -> Iterator[None]:
 def running_ros(args: Sequence[str]) -> Iterator[None]:
     """Run rclpy without its signal handlers.
 
-    OptionsError: it does not start with these arguments, or cannot write its log.
+    OptionsError: rclpy does not start with these arguments, or cannot write its log.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
     try:
         rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rcl has its own types, for arguments and for missing folders
+    except Exception as error:  # rcl raises different types for arguments and for folders
         raise OptionsError(f'ROS 2 does not start: {error}; correct the arguments after '
-                           '--ros-args, or set ROS_LOG_DIR to a folder with room') from error
+                           '--ros-args, or set ROS_LOG_DIR to a writable folder') from error
     try:
         yield
     finally:
@@ -206,9 +207,10 @@ def running_ros(args: Sequence[str]) -> Iterator[None]:
 
 
 def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split off the arguments from each ``--ros-args`` to its ``--``, which launch appends.
+    """Split off the ROS arguments: from each ``--ros-args`` to the next ``--``.
 
-    rclpy's own function also removes every OLD:=NEW, an early notation of ROS 2.
+    Launch files append them. rclpy's own function also removes every OLD:=NEW, an early notation
+    of ROS 2.
 
     Parameters
     ----------
@@ -235,7 +237,7 @@ def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 class StageBar:
-    """A progress bar that names the stage; nothing if there is no terminal."""
+    """A progress bar that names the stage. It is not shown without a terminal."""
 
     def __enter__(self) -> Self:
         """Show the bar."""
@@ -256,11 +258,11 @@ class StageBar:
 
 
 class Interruption:
-    """A flag that signals set, and that ends a wait.
+    """A flag that signal handlers set and that ends a wait.
 
-    Not a threading.Event: a signal may come while its thread holds the lock of the event, in a
-    wait or in the handler of another signal, and the handler would wait for that lock for ever.
-    While it catches signals, it lasts as long as its process.
+    A threading.Event could deadlock: if a signal arrives while its thread holds the lock of the
+    event, in a wait or in the handler of another signal, the handler waits for that lock for ever.
+    An object that catches signals is kept until the process ends.
     """
 
     def __init__(self) -> None:
@@ -283,8 +285,8 @@ class Interruption:
         return self._happened
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until the flag is set, or until the time-out; return whether it is set."""
-        poll = select.poll()  # select() takes no descriptor above 1023
+        """Wait until the flag is set or the time is up; return whether it is set."""
+        poll = select.poll()  # select() is limited to descriptors up to 1023
         poll.register(self._descriptor, select.POLLIN)
         poll.poll(1e3 * min(max(0.0, timeout_s), _LONGEST_WAIT_S))
         return self._happened

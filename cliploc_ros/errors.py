@@ -6,19 +6,20 @@ import difflib
 from collections import Counter
 from collections.abc import Iterable
 
-# A longer message loses its middle: it begins with what is wrong and ends with what to do.
+# Longer messages are cut in the middle: the fault is at the beginning, the remedy at the end.
 _HEAD, _TAIL = 700, 250
-# Share of the letters that a misspelt class has in common with the right one. A guess: bokk, book.
+# Share of letters that a misspelt class has in common with the right one, as bokk and book. The
+# value is not measured.
 _ALIKE = 0.75
-# More pairs of classes take seconds to compare.
+# Comparing more pairs of classes takes seconds.
 _MOST_PAIRS = 100_000
 
 
 class CliplocError(Exception):
     """Bad input. The message names the thing to fix, so no traceback is needed.
 
-    The message may quote untrusted text and goes to logs, answers and diagnostics, so it is cut
-    to one line of bounded length.
+    The message may quote untrusted text, and is copied to logs, answers and diagnostics.
+    Therefore it is cut to one line of bounded length.
     """
 
     def __str__(self) -> str:
@@ -30,30 +31,31 @@ class CliplocError(Exception):
 
 
 def did_you_mean(name: str, known: Iterable[str], most: int = 1, alike: float = 0.6) -> str:
-    """Return a hint with the known names nearest to a name, for a message; empty if none is near.
+    """Return a hint with the known names that are most similar to a name; empty without any.
 
-    `alike` is how much of a name has to agree, 0 to 1.
+    `alike` is the least similarity, 0 to 1, as in difflib.
     """
-    by_lower_case = {one.lower(): one for one in known}
+    by_lower_case = {candidate.lower(): candidate for candidate in known}
     near = difflib.get_close_matches(name.lower(), by_lower_case, most, alike)
-    names = ' or '.join(f"'{by_lower_case[one]}'" for one in near)
+    names = ' or '.join(f"'{by_lower_case[key]}'" for key in near)
     return f' (did you mean {names}?)' if near else ''
 
 
 def misspelt_classes(class_ids: Iterable[str], known: Iterable[str], all_known: bool = False
                      ) -> dict[str, str]:
-    """Return the classes of a map that look misspelt, each with a hint of the right one.
+    """Return the classes of a map that look misspelt, each with a hint of the right spelling.
 
-    They are unknown, and nearly a known one. With too many classes, none is returned.
+    Such a class is unknown, but similar to a known one. With too many classes to compare, the
+    result is empty.
 
     Parameters
     ----------
     class_ids : iterable of str
         Classes of the landmarks.
     known : iterable of str
-        Classes that are right: of the detector, of a vocabulary.
+        Correct classes, from a detector or a vocabulary.
     all_known : bool
-        Whether these are all. Otherwise the classes of several landmarks are right, too.
+        Whether `known` is complete. If not, a class of several landmarks is also correct.
     """
     counts = Counter(class_ids)
     right = {*known, *(name for name, count in counts.items() if count > 1 and not all_known)}

@@ -28,18 +28,19 @@ from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults, c
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
-# The places of red, green and blue in each pixel, and its bytes.
+# Offsets of red, green and blue in each pixel, and the bytes per pixel.
 _CHANNELS = {'rgb8': ((0, 1, 2), 3), 'bgr8': ((2, 1, 0), 3), '8UC3': ((2, 1, 0), 3),
              'rgba8': ((0, 1, 2), 4), 'bgra8': ((2, 1, 0), 4), '8UC4': ((2, 1, 0), 4),
              'mono8': ((0, 0, 0), 1), '8UC1': ((0, 0, 0), 1)}
-# A small file may declare any size: an image takes 200 MB at most.
+# Limits the memory of an image to 200 MB: a small file may declare any size.
 _MAX_PIXELS = 2**26
 _DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
-_DEPTH_HEADER = struct.Struct('<iff')  # of compressedDepth: format, and two parameters of floats
-# Rounding of a depth image that is a whole fraction of the colour image.
+# Header of compressedDepth: format, and the two parameters of inverse depth.
+_DEPTH_HEADER = struct.Struct('<iff')
+# Tolerance of the aspect ratio, for a depth image that is a rounded fraction of the colour image.
 _SAME_ASPECT = 0.02
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
-# The markers of JPEG that are followed by the size of the image.
+# JPEG markers that are followed by the image size.
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
@@ -77,7 +78,7 @@ class CameraInfoMessage(Protocol):
 
 
 def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uint8]:
-    """Return an image (h, w, 3) uint8, red first.
+    """Return an image (h, w, 3) uint8, RGB.
 
     ImageError: a field is invalid; the message names it.
     """
@@ -86,7 +87,7 @@ def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uin
 
 def _unpacked(msg: ImageMessage) -> NDArray[np.uint8]:
     if msg.encoding not in _CHANNELS:
-        raise ImageError(f"image encoding '{msg.encoding}' is none of {', '.join(_CHANNELS)}")
+        raise ImageError(f"image encoding '{msg.encoding}' is not one of {', '.join(_CHANNELS)}")
     order, channels = _CHANNELS[msg.encoding]
     pixels = _rows(msg, msg.width * channels).reshape(msg.height, msg.width, channels)
     return np.ascontiguousarray(pixels[:, :, order])
@@ -109,24 +110,24 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
     check_size(*declared_size(bytes(msg.data), msg.format))
     data = np.frombuffer(msg.data, dtype=np.uint8)
     try:
-        # EXIF may ask to turn the image, but the intrinsics are those of the sensor.
+        # EXIF orientation is ignored: the intrinsics belong to the image as the sensor took it.
         image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise ImageError(f"compressed image ('{msg.format}') does not decode: {error.err}"
                          ) from error
     if image is None:
         raise ImageError(f"compressed image ('{msg.format}', {len(data)} bytes) does not decode")
-    # 'rgb8; jpeg compressed bgr8': the encoding of the compressed pixels. With rgb8, red took the
-    # place of blue, as compressed_image_transport does it
+    # 'rgb8; jpeg compressed bgr8': the last word is the encoding of the compressed pixels. With
+    # rgb8, compressed_image_transport has swapped red and blue.
     _, _, packed = msg.format.partition('compressed')
     is_red_first = packed.strip().startswith('rgb')
     return np.ascontiguousarray(image if is_red_first else image[:, :, ::-1])
 
 
 def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
-    """Return width and height as a JPEG or PNG declares them, before it is decoded.
+    """Read the width and height of a JPEG or PNG from its header.
 
-    ImageError: the data is neither.
+    ImageError: the data is neither JPEG nor PNG.
     """
     if data.startswith(_PNG) and len(data) >= 24:
         return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
@@ -142,7 +143,7 @@ def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
 def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.generic]:
     """Return the pixels (h, w) of a depth image, uint16 or float32, as recorded.
 
-    Its encoding is 16UC1, mono16 or 32FC1; 0 or NaN stands for no depth. ImageError: a field is
+    The encoding is 16UC1, mono16 or 32FC1; 0 or NaN means no depth. ImageError: a field is
     invalid.
     """
     if isinstance(msg, CompressedImageMessage):
@@ -154,7 +155,7 @@ def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray
 
 def _depth_type(encoding: str) -> np.dtype[Any]:
     if encoding not in _DEPTH_TYPES:
-        raise ImageError(f"depth encoding '{encoding}' is none of {', '.join(_DEPTH_TYPES)}")
+        raise ImageError(f"depth encoding '{encoding}' is not one of {', '.join(_DEPTH_TYPES)}")
     return np.dtype(_DEPTH_TYPES[encoding])
 
 
@@ -172,8 +173,8 @@ def _decode_depth_png(msg: CompressedImageMessage) -> NDArray[np.generic]:
     except cv2.error as error:
         raise ImageError(f"depth image ('{msg.format}') does not decode: {error.err}") from error
     if values is None or values.dtype != np.uint16 or values.ndim != 2:
-        raise ImageError(f"depth image ('{msg.format}', {len(data)} bytes) is not a PNG of 16 "
-                         'bits with one channel')
+        raise ImageError(f"depth image ('{msg.format}', {len(data)} bytes) is not a 16-bit PNG "
+                         'with one channel')
     if not is_inverse:
         return values
     _, a, b = _DEPTH_HEADER.unpack_from(data)
@@ -184,7 +185,7 @@ def _decode_depth_png(msg: CompressedImageMessage) -> NDArray[np.generic]:
 
 
 def check_size(width: int, height: int) -> None:
-    """Refuse an image that is empty or larger than any camera's with an ImageError."""
+    """Raise ImageError for an image that is empty or implausibly large."""
     if not (width > 0 and height > 0 and width * height <= _MAX_PIXELS):
         raise ImageError(f'image size {width}x{height} must have 1 to {_MAX_PIXELS} pixels')
 
@@ -193,16 +194,17 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
                     ) -> Camera:
     """Return the camera that took an image.
 
-    K and P are those of the whole sensor (REP 104); the camera is that of the image: region of
-    interest and binning move and scale its pixels, as in image_geometry, and not the distortion.
-    ``roi.do_rectify`` changes nothing, there as here: the region is the same in a rectified image.
+    K and P describe the whole sensor (REP 104), the returned camera describes the image. Region of
+    interest and binning shift and scale the pixels, as in image_geometry, but not the distortion.
+    ``roi.do_rectify`` is ignored, as in image_geometry: the region is the same in a rectified
+    image.
 
     Parameters
     ----------
     image_size : tuple of int
         Width and height of the image [px].
     rectified : bool
-        The image is rectified: take P and no distortion.
+        The image is rectified: use P and no distortion.
 
     Raises
     ------
@@ -224,12 +226,12 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
 
 def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool
                           ) -> list[Fault]:
-    """Return contradictory or implausible fields of a message; the certain faults first.
+    """Return contradictory or implausible fields of a message, certain faults first.
 
-    `camera` is the camera of the image that camera_from_msg makes of the message.
+    `camera` is the result of camera_from_msg for this message.
     """
     (columns, rows), roi = _binning(msg), msg.roi
-    # a part of the sensor has any principal point, and the whole sensor has not
+    # check the whole sensor: the principal point of a region of interest may be anywhere
     sensor = replace(
         camera, width=msg.width or roi.x_offset + (roi.width or columns * camera.width),
         height=msg.height or roi.y_offset + (roi.height or rows * camera.height),
@@ -241,13 +243,15 @@ def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: boo
 
 
 def faults_of_headers(image: str, camera_info: str, detections: str = '') -> list[Fault]:
-    """Return which messages are of another coordinate frame than their image; '' is unknown.
+    """Return faults of messages whose coordinate frame differs from that of their image.
 
-    Boxes of another camera are certainly wrong. Simulators and drivers are known that name
-    camera_info and image differently.
+    An empty name is unknown and never a fault. Boxes in another frame are certainly wrong. For
+    camera_info it is only a suspicion, because some simulators and drivers name its frame
+    differently.
     """
-    return [Fault(f"{what} is of the coordinate frame '{other}', its image of '{image}': is it of "
-                  "another camera? publish it with the image's header", is_certain)
+    return [Fault(f"the coordinate frame of {what} is '{other}', that of the image is '{image}': "
+                  "publish it with the image's header, or remap it if it is of another camera",
+                  is_certain)
             for what, other, is_certain in (('detections', detections, True),
                                             ('camera_info', camera_info, False))
             if other and image and other.strip('/') != image.strip('/')]
@@ -255,10 +259,10 @@ def faults_of_headers(image: str, camera_info: str, detections: str = '') -> lis
 
 def faults_of_rectified(image_topic: str, rectified: bool,
                         msg: CameraInfoMessage | None = None) -> list[Fault]:
-    """Return whether images are probably rectified though they are read as raw, or the reverse.
+    """Return a fault if the topic's name contradicts the parameter `rectified`; else nothing.
 
-    Not where the camera_info `msg` makes no difference between the two. The names of image_proc,
-    image_rect and image_rect_color, are certain where it does.
+    There is no fault if raw and rectified images are the same by the camera_info `msg`. If they
+    differ, the topic names of image_proc (image_rect, image_rect_color) make the fault certain.
     """
     name = image_topic.removesuffix('/compressed')
     sounds = 'raw' if name.endswith('/image_raw') else \
@@ -267,7 +271,7 @@ def faults_of_rectified(image_topic: str, rectified: bool,
         np.array_equal(_left_of_p(msg), np.reshape(msg.k, (3, 3)))
     if is_same or sounds != ('raw' if rectified else 'rectified'):
         return []
-    return [Fault(f'{image_topic} sounds {sounds}, but the parameter rectified is '
+    return [Fault(f'by its name, {image_topic} is {sounds}, but the parameter rectified is '
                   f'{str(rectified).lower()}: poses would be wrong by the distortion of the lens',
                   msg is not None and '/image_rect' in name)]
 
@@ -277,18 +281,21 @@ def _left_of_p(msg: CameraInfoMessage) -> NDArray[np.float64]:
 
 
 def _binning(msg: CameraInfoMessage) -> tuple[int, int]:
-    """Return how many columns and rows of the sensor are one pixel; 0 stands for 1."""
+    """Return the columns and rows of the sensor that form one pixel; 0 in the message means 1."""
     return max(msg.binning_x, 1), max(msg.binning_y, 1)
 
 
 def _check_image_size(msg: CameraInfoMessage, image_size: tuple[int, int]) -> None:
-    """Refuse an image of another size than camera_info says; 0 stands for any, or for all."""
+    """Raise CameraError unless the image has the size that camera_info states.
+
+    In the message, width or height 0 means any size, and a region of size 0 the whole sensor.
+    """
     roi, (columns, rows) = msg.roi, _binning(msg)
     for pixels, whole, offset, given, binning in (
             (image_size[0], msg.width, roi.x_offset, roi.width, columns),
             (image_size[1], msg.height, roi.y_offset, roi.height, rows)):
         region = given or whole - offset
-        # A last bin that is not full is in the image or not.
+        # The image may or may not include a last bin that is incomplete.
         if (whole and offset + region > whole) or (
                 (whole or given) and abs(pixels * binning - region) >= binning):
             break
@@ -310,12 +317,13 @@ def detections_from_msg(msg: Any, class_map: Mapping[str, str] | None = None) ->
     Parameters
     ----------
     class_map : mapping, optional
-        The map's names for some of the detector's classes, see parse_class_map.
+        The map's names of some of the detector's classes, see parse_class_map.
     """
     names, classes, scores, boxes = class_map or {}, [], [], []
     for detection in msg.detections:
-        hypotheses = [(one.hypothesis.score, one.hypothesis.class_id) for one in detection.results]
-        # the first of equal scores; NaN sorts last
+        hypotheses = [(result.hypothesis.score, result.hypothesis.class_id)
+                      for result in detection.results]
+        # of equal scores, the first; NaN counts as lowest
         score, name = max(hypotheses, default=(0.0, ''), key=lambda pair: (
             -math.inf if math.isnan(pair[0]) else pair[0]))
         classes.append(names.get(name, name))
@@ -323,8 +331,8 @@ def detections_from_msg(msg: Any, class_map: Mapping[str, str] | None = None) ->
         box, center = detection.bbox, detection.bbox.center
         boxes.append((center.position.x, center.position.y, center.theta, box.size_x, box.size_y))
     x, y, theta, size_x, size_y = np.array(boxes, dtype=np.float64).reshape(-1, 5).T
-    # A turned box becomes the upright one around it. With theta 0 the sizes stay exactly equal. An
-    # infinite angle gives a box of NaN, which is left out later.
+    # A rotated box is replaced by the upright box around it. With theta 0 the sizes stay exactly
+    # equal. An infinite angle gives a box of NaN, which is dropped later.
     with np.errstate(invalid='ignore'):
         cosine, sine = np.abs(np.cos(theta)), np.abs(np.sin(theta))
     width, height = size_x * cosine + size_y * sine, size_x * sine + size_y * cosine
@@ -334,9 +342,9 @@ def detections_from_msg(msg: Any, class_map: Mapping[str, str] | None = None) ->
 
 
 def parse_class_map(text: str) -> dict[str, str]:
-    """Return the map's name for each class of the detector that has another, of the parameter.
+    """Parse the parameter class_map: the map's name for each class that the detector renames.
 
-    OptionsError: a pair has not the form theirs=ours, or a name occurs twice.
+    OptionsError: a pair does not have the form theirs=ours, or a name occurs twice.
     """
     found: dict[str, str] = {}
     for pair in filter(None, map(str.strip, text.split(','))):
@@ -352,24 +360,26 @@ def parse_class_map(text: str) -> dict[str, str]:
 def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDArray[np.float64],
                     camera_info: Any = None,
                     color_from_depth: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """Return the depths (n,) of boxes (n, 4) by a message of depth, NaN where there is none [m].
+    """Return the depths (n,) of boxes (n, 4) from a depth image, NaN without depth [m].
 
     Parameters
     ----------
     msg : sensor_msgs/Image or CompressedImage
+        The depth image.
     image_frame : str
-        The coordinate frame of the colour image. Depth in another one is not registered.
+        The coordinate frame of the colour image. A depth image in another coordinate frame is not
+        registered.
     camera : Camera
         Camera of the colour image.
     camera_info : sensor_msgs/CameraInfo, optional
         camera_info of a depth camera that is not registered.
     color_from_depth : ndarray (4, 4), optional
-        Its pose, seen from the colour camera.
+        Pose of that depth camera in the colour camera's frame.
 
     Raises
     ------
     CliplocError
-        The message is invalid, or does not belong to the image; says what to do.
+        The message is invalid, or does not belong to the image.
     """
     depths_m = depth_from_counts(depth_counts_from_msg(msg), None, 'depth')
     height, width = depths_m.shape
@@ -378,12 +388,13 @@ def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDA
         if camera_info is None or color_from_depth is None:
             raise ImageError(
                 f"depth is in the coordinate frame '{msg.header.frame_id}', the image in "
-                f"'{image_frame}', without {'tf' if camera_info else 'depth_camera_info'} between "
-                'them: publish that, or depth registered to the image')
+                f"'{image_frame}', and {'tf' if camera_info else 'depth_camera_info'} is missing: "
+                'publish it, or depth registered to the image')
         seen_by = camera_from_msg(camera_info, (width, height), False)
         check_faults(faults_of_camera_info(camera_info, seen_by, False))
         if not seen_by.is_pinhole:
-            raise ImageError('depth is distorted, by its camera_info: publish it rectified')
+            raise ImageError('depth is not rectified according to its camera_info: publish '
+                             'rectified depth')
         own = DepthCamera(seen_by.fx, seen_by.fy, seen_by.cx, seen_by.cy, color_from_depth)
     elif abs(width * camera.height / (height * camera.width) - 1.0) > _SAME_ASPECT:
         raise ImageError(f'depth has {width}x{height} px, the image {camera.width}x'
@@ -391,6 +402,6 @@ def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDA
     depths = depths_of_boxes(DepthImage(depths_m, own), camera, bboxes_xyxy)[0].astype(np.float64)
     known, (least, greatest) = depths[np.isfinite(depths)], PLAUSIBLE_DEPTH_M
     if len(known) and not least < np.median(known) < greatest:
-        raise ImageError(f'depth of the boxes is {np.median(known):.3g} m: 16UC1 is in '
-                         'millimetres, 32FC1 in metres')
+        raise ImageError(f'the median depth of the boxes is {np.median(known):.3g} m: publish '
+                         '16UC1 in millimetres, 32FC1 in metres')
     return depths

@@ -4,7 +4,7 @@
 
 # ros2 launch cliploc_ros relocalization.launch.py map_file:=office.yaml \
 #     image:=/camera/image_raw camera_info:=/camera/camera_info base_frame:=base_footprint
-# Of several cameras, the names of topics follow that of each: front/image_raw and so on.
+# With several cameras, topics are in the namespace of their camera: front/image_raw and so on.
 # ros2 launch cliploc_ros relocalization.launch.py map_file:=office.yaml \
 #     cameras:='[front, left, right]' image:=image_raw base_frame:=base_footprint
 
@@ -19,51 +19,53 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 
-# Launch files that include each other share their arguments: apart from namespace, use_sim_time,
-# autostart and log_level, which mean the same there, no name is one of Nav2's bringup.
+# Launch files that include each other share their arguments. Therefore the arguments differ from
+# those of Nav2's bringup, except namespace, use_sim_time, autostart and log_level, which have the
+# same meaning there.
 
-# Topics and services, each remapped by the argument of its name.
+# Topics and services. The argument with the same name remaps each of them.
 NAMES = {
-    'image': 'the raw topic of the camera driver; image/compressed follows it',
-    'camera_info': 'the topic of the camera driver',
-    'detections': 'from the detector to the relocalizer',
-    'depth': 'of an RGB-D camera, with depth_transport; depth/compressedDepth follows it',
-    'depth_camera_info': 'of a depth camera that is not registered to the image',
-    'odom': 'tells whether the robot moves; without it the robot is assumed to stand',
-    'imu': 'the vertical, with gravity:=imu',
-    'initialpose': 'what AMCL subscribes to',
-    'amcl_pose': 'what AMCL publishes: tells that it has taken the pose',
-    'request_nomotion_update': 'what AMCL serves',
-    'reinitialize_global_localization': "what Nav2's behaviour tree calls; AMCL serves this name, "
-                                        'too',
+    'image': 'raw images of the camera driver; image/compressed is remapped accordingly',
+    'camera_info': 'camera_info of the camera driver',
+    'detections': 'detections from the detector to the relocalizer',
+    'depth': 'depth of an RGB-D camera, with depth_transport; depth/compressedDepth is remapped '
+             'accordingly',
+    'depth_camera_info': 'camera_info of a depth camera that is not registered to the image',
+    'odom': 'odometry, which shows motion; without it the robot is assumed to be at rest',
+    'imu': 'IMU, the source of the vertical with gravity:=imu',
+    'initialpose': 'the pose that AMCL subscribes to',
+    'amcl_pose': 'the pose that AMCL publishes, which shows that it has taken initialpose',
+    'request_nomotion_update': 'service of AMCL that processes a scan while the robot is at rest',
+    'reinitialize_global_localization': "service of the relocalizer that Nav2's behaviour tree "
+                                        'calls; AMCL has a service of this name, too',
 }
 _OF_CAMERA = ('image', 'camera_info', 'detections', 'depth', 'depth_camera_info')
-# An argument that is not given leaves the choice to the file `parameters`, then to the default.
+# For an argument that is not given, the file `parameters` is used, then the default.
 DETECTOR_PARAMETERS = {
     'profile': 'detector and CLIP: auto, accurate, balanced or fast',
     'model': 'weights of the detector',
-    'vocabulary': 'what a YOLO-World or YOLOE looks for: map, or names',
-    'map_file': 'the map of objects: a path, or package://PACKAGE/PATH',
-    'cameras': 'names of several cameras, the namespaces of their topics: [front, left]',
+    'vocabulary': 'classes of a YOLO-World or YOLOE: map, or names',
+    'map_file': 'map of objects: a path, or package://PACKAGE/PATH',
+    'cameras': 'names of several cameras, which are the namespaces of their topics: [front, left]',
     'image_transport': 'raw or compressed',
     'autostart': 'false: a lifecycle manager configures and activates the nodes',
     'use_sim_time': 'true: use the time of /clock',
 }
 RELOCALIZER_PARAMETERS = {
     'profile': 'detector and CLIP: auto, accurate, balanced or fast',
-    'map_file': 'the map of objects: a path, or package://PACKAGE/PATH',
-    'map_files': 'instead of map_file, the maps of several floors: [ground.yaml, first.yaml]',
+    'map_file': 'map of objects: a path, or package://PACKAGE/PATH',
+    'map_files': 'maps of several floors, instead of map_file: [ground.yaml, first.yaml]',
     'keyframes_file': "layer of keyframes; 'auto': next to map_file",
-    'base_frame': "the robot's frame, whose pose is published; empty: the camera's",
-    'cameras': 'names of several cameras, the namespaces of their topics: [front, left]',
+    'base_frame': "the robot's frame, whose pose is published; empty: the camera's frame",
+    'cameras': 'names of several cameras, which are the namespaces of their topics: [front, left]',
     'gravity': 'source of the vertical: none, base_frame or imu',
     'matching': 'hybrid, clip or class; class needs no CLIP',
     'mode': 'on_request or continuous',
-    'watch': "where the localizer's pose is watched: none, tf or amcl_pose",
-    'on_lost': 'report, or relocalize once the robot stands',
+    'watch': "source of the localizer's pose that is watched: none, tf or amcl_pose",
+    'on_lost': 'report, or relocalize as soon as the robot is at rest',
     'require_localizer': 'false: a request succeeds without AMCL, for ~/pose or publish_tf',
     'clip_model': 'open_clip architecture',
-    'clip_pretrained': 'tag or file',
+    'clip_pretrained': 'tag or file of the weights',
     'image_transport': 'raw or compressed',
     'depth_transport': 'none, raw or compressed',
     'autostart': 'false: a lifecycle manager configures and activates the nodes',
@@ -71,8 +73,8 @@ RELOCALIZER_PARAMETERS = {
 }
 OTHERS = {
     'parameters': ('', 'parameter file of both nodes; other arguments override it'),
-    'namespace': ('', 'of both nodes: one for each robot and for each camera'),
-    'tf': ('/tf', 'tf: transforms in the namespace, as Nav2 has them for several robots'),
+    'namespace': ('', 'namespace of both nodes, different for each robot or camera'),
+    'tf': ('/tf', 'tf: use transforms in the namespace, as Nav2 does for several robots'),
     'detector': ('true', 'false: another program publishes detections'),
     'log_level': ('info', 'debug, info, warn or error'),
 }
@@ -81,7 +83,7 @@ _LISTS = ('map_files', 'cameras')
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return both nodes, with the most common settings as arguments."""
+    """Return the description of both nodes, with the most common settings as arguments."""
     arguments = {name: (name, text) for name, text in NAMES.items()} | {
         name: ('', text) for name, text in (DETECTOR_PARAMETERS | RELOCALIZER_PARAMETERS).items()}
     declared = [DeclareLaunchArgument(name, default_value=default, description=text)
@@ -90,7 +92,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
-    """Return the nodes with the parameters that are given."""
+    """Return the nodes with the parameters that were given as arguments."""
     check_parameter_file(context.launch_configurations['parameters'])
     given = {name for name, value in context.launch_configurations.items() if value}
     cameras = yaml.safe_load(context.launch_configurations['cameras'] or '[]')
@@ -101,10 +103,11 @@ def _nodes(context: LaunchContext) -> list[Node]:
 
 
 def _topics(cameras: list[str]) -> list[tuple[str, list]]:
-    """Return the remappings of all topics, those of each camera in its namespace."""
+    """Return the remappings of all topics; topics of cameras are in their namespaces."""
     remapped = []
+    prefixes = [f'{camera}/' for camera in cameras] or ['']
     for name in NAMES:
-        for prefix in [f'{one}/' for one in cameras] if cameras and name in _OF_CAMERA else ['']:
+        for prefix in prefixes if name in _OF_CAMERA else ['']:
             given = [prefix, LaunchConfiguration(name)]
             remapped.append((prefix + name, given))
             if name in ('image', 'depth'):
@@ -114,7 +117,7 @@ def _topics(cameras: list[str]) -> list[tuple[str, list]]:
 
 
 def check_parameter_file(path: str) -> None:
-    """Raise RuntimeError if a file is named that does not exist; launch_ros would only warn."""
+    """Raise RuntimeError if a given file does not exist; launch_ros would only warn."""
     if path and not Path(path).is_file():
         raise RuntimeError(f"parameters:={path}: there is no such file ('~' is not expanded); "
                            'correct the path, or omit the argument to use the defaults')
@@ -129,9 +132,9 @@ def _type_of(parameter: str) -> type:
 def _node(name: str, parameters: set[str], given: set[str], topics: list[tuple[str, list]],
           **keywords) -> Node:
     files = [ParameterFile(LaunchConfiguration('parameters'))] if 'parameters' in given else []
-    changes = {one: ParameterValue(LaunchConfiguration(one),
-                                   value_type=_type_of(one))
-               for one in sorted(parameters)}
+    changes = {parameter: ParameterValue(LaunchConfiguration(parameter),
+                                         value_type=_type_of(parameter))
+               for parameter in sorted(parameters)}
     tf = LaunchConfiguration('tf')
     return Node(
         package='cliploc_ros', executable=name, name=name, output='screen',

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Wake the robot up once detector and relocalizer are there; see doc/nav2.md."""
+"""Wake up the robot as soon as detector and relocalizer are running; see doc/nav2.md."""
 
 # ros2 launch cliploc_ros wake_up.launch.py wake_up_timeout:=120
 
@@ -11,21 +11,22 @@ from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-# As in relocalization.launch.py, no name is one of Nav2's bringup but those that mean the same.
+# The arguments differ from those of Nav2's bringup, see relocalization.launch.py.
 ARGUMENTS = {
-    'namespace': ('', 'of the relocalizer'),
+    'namespace': ('', 'namespace of the relocalizer'),
     'relocalizer': ('relocalizer', 'name of the relocalizer in the namespace'),
-    'spin': ('spin', "the action that Nav2's behavior_server serves"),
-    'wake_up_timeout': ('60.0', 'no turn begins later [s]'),
-    'wake_up_turn_deg': ('45.0', 'turn by this much between looks [deg]; 0: never'),
-    'wake_up_watch': ('false', 'true: wake up again whenever the relocalizer finds it lost'),
+    'spin': ('spin', "action of Nav2's behavior_server"),
+    'wake_up_timeout': ('60.0', 'no turn begins after this time [s]'),
+    'wake_up_turn_deg': ('45.0', 'angle of the turn between requests [deg]; 0: never turn'),
+    'wake_up_watch': ('false', 'true: wake up again whenever the relocalizer finds the robot '
+                               'lost'),
     'log_level': ('info', 'debug, info, warn or error'),
 }
 MEANINGS = {0: 'accepted', 1: 'refused', 2: 'not ready'}
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the wake-up, and a line that tells how it ended."""
+    """Return the description of the wake-up, which logs its result at the end."""
     declared = [DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, (default, text) in ARGUMENTS.items()]
     wake_up = Node(

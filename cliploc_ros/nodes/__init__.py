@@ -4,6 +4,6 @@
 
 import os
 
-# OpenBLAS's threads wait for each other by spinning. Where a robot's cores are busy, one thread
-# compares labels ten times as fast as two. NumPy reads this when it is loaded.
+# OpenBLAS's threads wait for each other by spinning. On busy cores, one thread compares labels ten
+# times as fast as two. NumPy reads this variable when it is loaded.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The detector node: images in, detections out, and only while something subscribes to them."""
+"""The detector node: publishes detections in images, while the detections have a subscriber."""
 
 import math
 import threading
@@ -29,7 +29,7 @@ from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 _LOG_PERIOD_S = 5.0
 ABOUT = """\
-Publishes what a network detects in the newest image, while something subscribes to it.
+Publishes the detections of a network in the newest image, while they have a subscriber.
 
   in    image, image/compressed
   out   detections, /diagnostics
@@ -37,22 +37,22 @@ Publishes what a network detects in the newest image, while something subscribes
 
 
 class TimedImage(NamedTuple):
-    """An image, and when it arrived (monotonic clock) [s]."""
+    """An image and its arrival (monotonic clock) [s]."""
 
     msg: Image | CompressedImage
     received_at: float
 
 
 class NewestInstant:
-    """Passes images of several cameras to a worker: one of each, as near in time as they come.
+    """Passes images of several cameras to a worker, one of each with the closest stamps.
 
-    While the worker is busy, the two newest images of each camera wait: the newest may be of an
-    instant that other cameras have not delivered yet.
+    While the worker is busy, the two newest images of each camera wait. The other cameras may not
+    have delivered an image of the newest instant yet.
 
     Parameters
     ----------
     work : callable
-        Takes the name of a camera and an image, in the worker's thread.
+        Called with the name of a camera and an image, in the worker's thread.
     """
 
     def __init__(self, worker: Worker, work: Callable[[str, TimedImage], None]) -> None:
@@ -64,10 +64,10 @@ class NewestInstant:
 
     @property
     def waiting_since(self) -> float | None:
-        """Return when the oldest image that waits arrived (monotonic clock) [s]."""
+        """Return when the oldest waiting image arrived (monotonic clock) [s]; None without any."""
         with self._lock:
-            return min((one.received_at for images in self._waiting.values() for one in images),
-                       default=None)
+            return min((image.received_at for images in self._waiting.values()
+                        for image in images), default=None)
 
     def offer(self, camera: str, image: TimedImage) -> None:
         """Queue an image of a camera."""
@@ -80,13 +80,13 @@ class NewestInstant:
         self._signal.offer(camera)
 
     def _take(self, camera: str) -> None:
-        """Work on the newest instant that all cameras with an image have."""
+        """Process the newest instant of which all cameras with waiting images have one."""
         with self._lock:
             waiting = {name: images for name, images in self._waiting.items() if images}
             newest_ns = min(_image_ns(images[-1]) for images in waiting.values())
             taken = {}
             for name, images in waiting.items():
-                taken[name] = min(images, key=lambda one: abs(_image_ns(one) - newest_ns))
+                taken[name] = min(images, key=lambda image: abs(_image_ns(image) - newest_ns))
                 while images.popleft() is not taken[name]:
                     self.dropped += 1
             more = any(waiting.values())
@@ -101,7 +101,7 @@ def _image_ns(image: TimedImage) -> int:
 
 
 class _Camera:
-    """Images of a camera while its detections have a subscriber, and the detections published."""
+    """Receives the images of a camera while they are wanted, and publishes its detections."""
 
     def __init__(self, node: ManagedNode[DetectorParameters], name: str, newest: NewestInstant,
                  on_match: Callable[[], None]) -> None:
@@ -109,7 +109,7 @@ class _Camera:
         is_raw = node.settings.values.image_transport == 'raw'
         self._type = Image if is_raw else CompressedImage
         self._topic = of_camera(name, 'image' if is_raw else 'image/compressed')
-        #: None while its images are not wanted
+        #: None while the images are not wanted
         self.subscription: qos.AdaptiveSubscription | None = None
         self._heard_at = 0.0
         self._counts, self._rates = {'image': 0, 'detections': 0}, Rates()
@@ -120,13 +120,13 @@ class _Camera:
 
     @property
     def is_wanted(self) -> bool:
-        """Return whether something subscribes to its detections."""
+        """Return whether the detections have a subscriber."""
         return bool(self._publisher.get_subscription_count() > 0)
 
     def open(self) -> None:
-        """Subscribe, if it does not yet."""
+        """Subscribe to the images, unless already subscribed."""
         if self.subscription is None:
-            self._heard_at = time.monotonic()  # silence counts from here
+            self._heard_at = time.monotonic()  # the time of silence starts here
             self.subscription = qos.AdaptiveSubscription(self._node, self._type, self._topic,
                                                      self._take, qos.IMAGE)
 
@@ -142,7 +142,7 @@ class _Camera:
         self._publisher.publish(detections)
 
     def examine(self, health: Health, stale_after_s: float) -> None:
-        """Report a topic without a publisher, silence, and rates."""
+        """Report a missing publisher, missing images, and rates."""
         own, topic = Health(), self._node.resolve_topic_name(self._topic)
         silent_s = time.monotonic() - self._heard_at
         if self._node.count_publishers(topic) == 0:
@@ -161,19 +161,19 @@ class _Camera:
 
 
 class DetectorNode(ManagedNode[DetectorParameters]):
-    """Publishes what a YOLO network detects in the newest image of each camera."""
+    """Publishes the detections of a YOLO network in the newest image of each camera."""
 
     def __init__(self) -> None:
         super().__init__('detector', DetectorParameters, RelocalizerParameters)
         self._detector: ObjectDetector | None = None
-        # The node opens in one thread; subscribers match in another.
+        # The node is opened in one thread, subscribers are matched in another.
         self._lock = threading.Lock()
         self._open = False
         self._newest = NewestInstant(self.worker, self._detect)
         self._cameras = {name: _Camera(self, name, self._newest, self._update)
                          for name in self.settings.values.camera_names or ('',)}
         self._last_error = ''
-        # Since when boxes are awaited (monotonic clock) [s], and how long the first boxes took.
+        # When the first subscriber came (monotonic clock) [s], and the time until the first boxes.
         self._awaited_since = math.inf
         self._first_boxes_s: float | None = None
 
@@ -230,17 +230,17 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         with self._lock:
             for camera in self._cameras.values():
                 if self._open and camera.is_wanted:
-                    if not any(one.subscription for one in self._cameras.values()):
+                    if not any(other.subscription for other in self._cameras.values()):
                         self._awaited_since = time.monotonic()
                     camera.open()
                 else:
                     camera.close()
 
     def _detect(self, name: str, image: TimedImage) -> None:
-        """Detect objects in one image and publish them; in the worker's thread."""
+        """Publish the detections in an image; runs in the worker's thread."""
         camera = self._cameras[name]
         if not self.active or self._detector is None or not camera.subscription:
-            return  # deactivated, or the last subscriber left, while the image waited
+            return  # while the image waited, the node was deactivated or lost its subscribers
         times = StageTimes('waiting', image.received_at)
         times.begin('decoding')
         try:
@@ -270,7 +270,7 @@ def detector_options(parameters: DetectorParameters) -> DetectorOptions:
 
 
 def main() -> NoReturn:
-    """Run the node until it is told to stop."""
+    """Run the node until SIGINT or SIGTERM."""
     run_node('detector', DetectorNode, ABOUT)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The relocalizer node: from image and detections to the robot's pose, on request."""
+"""The relocalizer node: computes the robot's pose from image and detections, on request."""
 
 import importlib
 import math
@@ -36,7 +36,7 @@ from cliploc_ros.ros.watch import Watcher
 
 _LOG_PERIOD_S = 5.0
 ABOUT = """\
-Answers where the robot is in a map of objects: on request, or with every image.
+Localizes the robot in a map of objects, on request or with every image.
 
   in         image, image/compressed, camera_info, detections; optional: odom, imu, depth
   out        ~/pose, initialpose, ~/hypotheses, ~/landmarks, ~/matches, ~/debug_image, ~/answer,
@@ -44,14 +44,14 @@ Answers where the robot is in a map of objects: on request, or with every image.
   services   ~/relocalize, ~/relocalize_fields, ~/record, ~/reload_map,
              reinitialize_global_localization
 
-It needs a map: -p map_file:=MAP.yaml, made by build_map.
+It needs a map: -p map_file:=MAP.yaml, which build_map writes.
 """
-# Its diagnostics name them, and those of its cameras, for doctor.
+# Topics, besides those of its cameras, that the diagnostics list for the doctor.
 _OTHER_TOPICS = ('odom', 'imu', 'initialpose', '/tf', '/tf_static')
 
 
 class RelocalizerNode(ManagedNode[RelocalizerParameters]):
-    """Answers where the robot is: on request, or with every frame."""
+    """Localizes the robot on request, or with every frame."""
 
     def __init__(self) -> None:
         super().__init__('relocalizer', RelocalizerParameters, DetectorParameters)
@@ -65,7 +65,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._frames = CameraRig(self, parameters) if parameters.mode == 'on_request' else \
             CameraRig(self, parameters, math.inf, self._newest.offer)
         sources = self._frames.sources.values()
-        with suppress(CliplocError):  # a bad name: it will not be configured
+        with suppress(CliplocError):  # with a bad name, the node cannot be configured anyway
             self.settings.snapshot()
             self.facts['topics'] = ' '.join(
                 f'{name}:={self.resolve_topic_name(name)}' for name in (
@@ -82,7 +82,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._answers = self.create_publisher(DiagnosticArray, '~/answer', qos.LATCHED)
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
-        # Held from setting the map parameters until the map is read.
+        # Locked from the change of the map parameters until the map is loaded.
         self._map_lock = threading.Lock()
         services: list[tuple[Any, str, Callable[[Any, Any], Any]]] = [
             (Trigger, '~/relocalize', self._on_relocalize),
@@ -90,7 +90,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             (Trigger, '~/record', self._on_record),
             (Trigger, '~/reload_map', self._on_reload_map),
             (Empty, 'reinitialize_global_localization', self._on_reinitialize)]
-        with suppress(ImportError):  # map_file and reload_map do the same
+        with suppress(ImportError):  # without nav2_msgs, map_file and reload_map do the same
             load_map = importlib.import_module('nav2_msgs.srv').LoadMap
             services.append((load_map, '~/load_map', self._on_load_map))
         group = BoundedCallbackGroup(MAX_REQUESTS)
@@ -116,8 +116,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._frames.open()
         self._watcher.open()
         for source in self._frames.sources.values():
-            for doubt in faults_of_rectified(source.image_topic, parameters.rectified):
-                self.get_logger().warning(doubt.text)
+            for fault in faults_of_rectified(source.image_topic, parameters.rectified):
+                self.get_logger().warning(fault.text)
 
     def close(self) -> None:
         """Release the request that waits for frames, and unsubscribe."""
@@ -128,7 +128,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._robot.close()
 
     def release(self) -> None:
-        """Release the request that waits for frames: the process ends."""
+        """Release the request that waits for frames, because the process is ending."""
         self._watcher.release()
         self._handoff.stop()
         self._frames.close('the node is shutting down')
@@ -155,7 +155,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                           'time limit [s]': parameters.timeout_s,
                           'missing': '; '.join(missing)}
         self._watcher.examine(health)
-        localizer = self._pipeline.localizer  # once: a cleanup may drop it meanwhile
+        localizer = self._pipeline.localizer  # read once, because a cleanup may drop it
         if localizer is not None:
             for fault in localizer.instants.faults:
                 (health.fail if fault.is_certain else health.warn)(fault.text)
@@ -181,7 +181,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
     def _on_relocalize_fields(self, _: SelfTest.Request, response: SelfTest.Response
                               ) -> SelfTest.Response:
-        """Answer as ~/relocalize does, in fields."""
+        """Answer as ~/relocalize does, but as separate fields."""
         answer = self._answer()
         response.id = str(answer.number)
         response.passed = bytes([answer.verdict is Verdict.ACCEPTED])
@@ -193,20 +193,20 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         return response
 
     def _on_record(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Store the last request; localizing goes on meanwhile."""
+        """Store the last request. Localization continues meanwhile."""
         try:
             response.message = self._cases.store(self.settings.snapshot())
             response.success = True
         except CliplocError as error:
             response.message = f'not recorded: {error}'
-        except Exception as error:  # rclpy would never answer
+        except Exception as error:  # otherwise rclpy would never answer
             self.get_logger().error(traceback.format_exc())
             response.message = f'not recorded: internal error: {error}'
         self.get_logger().info(f'record: {response.message}')
         return response
 
     def _on_reload_map(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Read the map again, in the worker's thread, never in the middle of a search."""
+        """Read the map again in the worker's thread, and so never during a search."""
         try:
             with self._map_lock:
                 read = self.worker.run(self._pipeline.reload_map)
@@ -218,7 +218,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         return response
 
     def _on_load_map(self, request: Any, response: Any) -> Any:
-        """Search one map from now on; parameters and maps stay as they were if that fails."""
+        """Load another map. After a failure, parameters and maps are unchanged."""
         with self._map_lock:
             values = self.settings.values
             before = {'map_file': values.map_file, 'map_files': values.map_files}
@@ -263,7 +263,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self.get_logger().info(answer.message, throttle_duration_sec=_LOG_PERIOD_S)
 
     def _record(self, answer: Answer) -> None:
-        """Publish the answer, keep the verdict for the diagnostics, and publish them."""
+        """Publish the answer, and the diagnostics with its verdict."""
         self._answers.publish(answer_msg(answer, self.get_fully_qualified_name()))
         self._last_verdict = answer.message
         self._verdicts[answer.verdict] += 1
@@ -271,7 +271,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
 
 def main() -> NoReturn:
-    """Run the node until it is told to stop."""
+    """Run the node until SIGINT or SIGTERM."""
     run_node('relocalizer', RelocalizerNode, ABOUT)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The answer to a request, or to one frame in continuous mode; and its record as a case."""
+"""Answers to requests and to frames in continuous mode, and their recording as cases."""
 
 import math
 import threading
@@ -25,7 +25,7 @@ from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.files.storage import make_folder
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
-# As many frames as acceptance looks back to, see cliploc_ros.core.acceptance.looks.
+# Number of past frames that acceptance uses, see cliploc_ros.core.acceptance.looks.
 _MAX_FRAMES = 20
 _MAX_BYTES = 256 * 2**20
 _MIB = 2**20
@@ -35,42 +35,43 @@ _LIBRARIES = ('cliploc_ros', 'numpy', 'scipy', 'numba')
 class Verdict(StrEnum):
     """The outcome of a request."""
 
-    #: The pose is accepted and, for a request, delivered.
+    #: A pose is accepted and, for a request, delivered.
     ACCEPTED = 'accepted'
     #: No pose is certain enough.
     REFUSED = 'refused'
-    #: A pose is accepted but was not delivered: the robot moves, or nobody takes it.
+    #: A pose is accepted but was not delivered: the robot moves, or no localizer takes the pose.
     WITHHELD = 'withheld'
-    #: There was nothing to decide on: no frame, a bad message, a node that is not active.
+    #: No decision was possible: there is no frame, a message is bad, or the node is not active.
     FAILED = 'failed'
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A verdict, its reason and, where it is accepted, the pose."""
+    """A verdict, its reason and, if accepted, the pose."""
 
     verdict: Verdict
-    detail: str  #: The pose in words, or the reason for having none, in one line
+    detail: str  #: The pose in words, or why there is none, in one line
     pose: PoseWithCovarianceStamped | None = None  #: None unless accepted
-    #: When the image arrived (monotonic clock) [s]; -inf without one
+    #: When the image arrived (monotonic clock) [s]; -inf without an image
     received_at: float = -math.inf
-    query: Query | None = None  #: With it the same answer comes again; None without an image
-    #: Whether time was too short for all crops, which could have changed the verdict
+    query: Query | None = None  #: Reproduces the answer; None without an image
+    #: Whether the frame was refused before all crops were compared, so that a retry may succeed
     is_cut: bool = False
-    stages_ms: Mapping[str, float] = field(default_factory=dict)  #: How long each stage took [ms]
-    #: Hash of the searched map, see frame_localizer.load_hashed_map; empty without one
+    stages_ms: Mapping[str, float] = field(default_factory=dict)  #: Duration of each stage [ms]
+    #: Hash of the searched map, see frame_localizer.load_hashed_map; empty without a map
     map_hash: str = ''
     kind: RefusalKind | None = None  #: Kind of a refusal; None for other verdicts
     header: Header | None = None  #: Stamp of the image, frame of the map; None without an image
     #: The deciding figures, as doc/interface.md describes them
     figures: Mapping[str, object] = field(default_factory=dict)
-    #: Where the robot's x axis points, or the camera looks, from the map's x axis to its y axis
+    #: Direction of the robot's x axis, or of the camera's view without base_frame, from the map's
+    #: x axis towards its y axis
     heading_deg: float = 0.0
-    number: int = 0  #: From 1, in the order of the answers to requests; 0: to no request
+    number: int = 0  #: Answers to requests count from 1; 0: not the answer to a request
 
     @property
     def is_linked(self) -> bool:
-        """Return whether odometry links the frame with those before and after it."""
+        """Return whether odometry links the frame with earlier and later frames."""
         return self.query is not None and self.query.run is not None
 
     @property
@@ -83,7 +84,7 @@ class Answer:
 
 
 def answer_msg(answer: Answer, node: str) -> DiagnosticArray:
-    """Return an answer as fields: its message, and keys that doc/interface.md describes.
+    """Return an answer as a diagnostic message with the keys that doc/interface.md describes.
 
     `node` is the name of the relocalizer with its namespace.
     """
@@ -114,12 +115,12 @@ def answer_msg(answer: Answer, node: str) -> DiagnosticArray:
 
 
 def deviations(covariance: NDArray[np.float64]) -> tuple[float, float]:
-    """Return standard deviations by a pose's covariance (6, 6): position [m], heading [deg]."""
+    """Return the standard deviations of position [m] and heading [deg] of a covariance (6, 6)."""
     return math.sqrt(np.trace(covariance[:3, :3])), math.degrees(math.sqrt(covariance[5, 5]))
 
 
 class RequestCounters:
-    """Counts requests by their answers; written in several threads."""
+    """Counts requests by verdict and kind of refusal. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -128,7 +129,7 @@ class RequestCounters:
         self._total_s = self._longest_s = 0.0
 
     def add(self, answer: Answer, duration_s: float) -> None:
-        """Count a request that took so long [s]."""
+        """Count a request and add its duration [s]."""
         with self._lock:
             self._counts[answer.verdict] += 1
             if answer.kind is not None:
@@ -137,7 +138,7 @@ class RequestCounters:
             self._longest_s = max(self._longest_s, duration_s)
 
     def values(self) -> dict[str, object]:
-        """Return the counts; they only grow until the node is restarted."""
+        """Return the counts since the start of the node."""
         with self._lock:
             return {'requests': self._counts.total(),
                     **{f'requests {verdict}': self._counts[verdict] for verdict in Verdict},
@@ -147,7 +148,7 @@ class RequestCounters:
 
 
 class CaseRecorder:
-    """The last answers to frames of requests, if it keeps any; older answers are forgotten."""
+    """Keeps the latest answers to frames of requests, unless `keeps` is false."""
 
     def __init__(self, keeps: bool) -> None:
         self._keeps = keeps
@@ -162,12 +163,12 @@ class CaseRecorder:
         with self._lock:
             self._seen.append(answer)
             while len(self._seen) > 1 and sum(
-                    image.nbytes for one in self._seen if one.query
-                    for image in one.query.images) > _MAX_BYTES:
+                    image.nbytes for kept in self._seen if kept.query
+                    for image in kept.query.images) > _MAX_BYTES:
                 self._seen.popleft()
 
     def end(self, answer: Answer) -> None:
-        """Keep the answer of a request."""
+        """Keep the answer to a request."""
         with self._lock:
             self._last = answer
 
@@ -177,16 +178,16 @@ class CaseRecorder:
             self._seen.clear()
 
     def store(self, parameters: RelocalizerParameters) -> str:
-        """Store the last request in record_folder; return what was stored, in one line.
+        """Store the last request in record_folder; return a description of it in one line.
 
         Raises
         ------
         CliplocError
-            No request saw a frame, or the folder is not given, full, or cannot be written.
+            The last request had no frame, or the folder is not given, full, or not writable.
         """
         if not parameters.record_folder:
-            raise OptionsError('record_folder is empty: set it at the start, to a folder with '
-                               'room for record_limit_mb')
+            raise OptionsError('record_folder is not set: start the node with a folder that has '
+                               'space for record_limit_mb')
         queries, found, last = self._linked()
         try:
             folder = Path(parameters.record_folder).expanduser()
@@ -209,30 +210,30 @@ class CaseRecorder:
                 with suppress(FileNotFoundError):  # moved away meanwhile
                     used += (parent / name).stat().st_size
         if used + size > limit_mb * _MIB:
-            raise DatasetError(f'{folder} holds {used // _MIB} MiB, this case would take '
-                               f'{max(1, size // _MIB)} MiB more, record_limit_mb is {limit_mb}: '
-                               'move recordings away, or raise it')
+            raise DatasetError(f'{folder} holds {used // _MIB} MiB and this case needs '
+                               f'{max(1, size // _MIB)} MiB, but record_limit_mb is {limit_mb}: '
+                               'move recordings away, or raise record_limit_mb')
         now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]
         path = folder / f'case_{now}_{last.verdict}.npz'
         CASE.write(path, arrays, compress=True)
         return f'{path}: {len(queries)} frames; {last.message}'
 
     def _linked(self) -> tuple[tuple[Query, ...], Answer, Answer]:
-        """Return the queries that the last answer may rest on, the oldest first, and answers.
+        """Return the queries behind the last answer, the answer to its newest frame, and itself.
 
-        Odometry links a frame to those before it. Without it a frame stands alone. The answers
-        are that to the newest frame, and that to the request.
+        The queries are those that odometry links to the newest one, the oldest first. Without
+        odometry, only the newest query is returned.
         """
         with self._lock:
             seen, last = list(self._seen), self._last
         while seen and seen[-1].received_at != last.received_at:
             seen.pop()
         if not seen:
-            raise DatasetError(f'nothing to record: the last request saw no frame: {last.message}')
+            raise DatasetError(f'nothing to record: the last request had no frame: {last.message}')
         linked: list[Query] = []
-        for one in reversed(seen):
-            assert one.query is not None
-            if linked and (one.query.run is None or one.query.run != linked[0].run):
+        for answer in reversed(seen):
+            assert answer.query is not None
+            if linked and (answer.query.run is None or answer.query.run != linked[0].run):
                 break
-            linked.insert(0, one.query)
+            linked.insert(0, answer.query)
         return tuple(linked), seen[-1], last

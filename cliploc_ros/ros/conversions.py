@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion of messages to values and back. No field of a message is assumed valid."""
+"""Conversion between messages and values. All fields of messages are validated."""
 
 import importlib
 from collections.abc import Callable
@@ -34,7 +34,7 @@ def stamp_ns(stamp: Time) -> int:
 
 
 def of_camera(camera: str, topic: str) -> str:
-    """Return the topic of one of several cameras; that of the only one has no name."""
+    """Return the topic of a camera; a single camera has no name and its topic no prefix."""
     return f'{camera}/{topic}' if camera else topic
 
 
@@ -54,7 +54,7 @@ def detections_to_msg(detections: Detections, header: Header) -> Detection2DArra
 
 
 def pose_from_msg(msg: Pose) -> NDArray[np.float64] | None:
-    """Return a pose (4, 4); None for one with NaN, or a quaternion that is not of length 1."""
+    """Return a pose (4, 4); None if it has NaN or its quaternion is not of unit length."""
     p, q = msg.position, msg.orientation
     position, quat_xyzw = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
     if not np.isfinite(position).all() or not abs(
@@ -94,7 +94,7 @@ class DetectionType(NamedTuple):
 
 
 def detection_type(package: str) -> DetectionType:
-    """Return the message type of a package.
+    """Return the detection message of a package, `vision_msgs` or `yolo_msgs`.
 
     OptionsError: the package is not installed.
     """
@@ -109,14 +109,16 @@ def detection_type(package: str) -> DetectionType:
 
 
 def from_yolo_msg(msg: Any) -> Detection2DArray:
-    """Return a yolo_msgs/DetectionArray as the common type: boxes, class names and scores."""
+    """Convert a yolo_msgs/DetectionArray: boxes, class names and scores."""
     common = Detection2DArray(header=msg.header)
-    for one in msg.detections:
-        size, center = one.bbox.size, one.bbox.center
+    for detection in msg.detections:
+        size, center = detection.bbox.size, detection.bbox.center
         box = BoundingBox2D(size_x=size.x, size_y=size.y)
         box.center.position.x, box.center.position.y = center.position.x, center.position.y
         box.center.theta = center.theta
-        common.detections.append(Detection2D(header=msg.header, id=one.id, bbox=box, results=[
-            ObjectHypothesisWithPose(hypothesis=ObjectHypothesis(
-                class_id=one.class_name or str(one.class_id), score=one.score))]))
+        hypothesis = ObjectHypothesis(class_id=detection.class_name or str(detection.class_id),
+                                      score=detection.score)
+        common.detections.append(Detection2D(
+            header=msg.header, id=detection.id, bbox=box,
+            results=[ObjectHypothesisWithPose(hypothesis=hypothesis)]))
     return common

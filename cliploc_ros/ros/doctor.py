@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check everything that a request needs, one after another; say what fails and what to do.
+"""Check everything that a request needs, step by step; report failures and their remedies.
 
-It subscribes to the relocalizer's inputs and localizes once. It delivers no pose.
+The doctor subscribes to the relocalizer's inputs and localizes once. It delivers no pose.
 """
 
 import math
@@ -54,7 +54,7 @@ from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 from cliploc_ros.ros.request import time_is_up
 from cliploc_ros.ros.running import NotRunningError, ask, check_name, parameters_of_files
 
-# Images that come later after their stamps show clocks that differ (a guess).
+# A greater delay of images after their stamps means that the clocks differ. Not measured.
 _MOST_LAG_S = 1.0
 _SPIN_S = 0.05
 
@@ -69,7 +69,7 @@ class State(StrEnum):
 
 
 class Finding(NamedTuple):
-    """A check and its result; for a failure also the remedy."""
+    """A check, its result, and for a failure the remedy."""
 
     what: str
     state: State
@@ -77,7 +77,7 @@ class Finding(NamedTuple):
 
 
 class Report:
-    """Collects findings; `tell` gets each at once."""
+    """Collects findings, and calls `tell` with each one immediately."""
 
     def __init__(self, tell: Callable[[Finding], object]) -> None:
         self._tell = tell
@@ -89,7 +89,7 @@ class Report:
         self._tell(self.findings[-1])
 
     def judge(self, what: str, problem: str, text: str) -> None:
-        """Add a finding that fails with a problem, or passes with a text where there is none."""
+        """Add a failure with `problem`, or, if `problem` is empty, a pass with `text`."""
         self.add(what, State.FAIL if problem else State.PASS, problem or text)
 
     def skip(self, what: str, text: str) -> None:
@@ -98,7 +98,7 @@ class Report:
 
     @contextmanager
     def failing(self, what: str) -> Iterator[None]:
-        """Make a failure of each CliplocError within."""
+        """Report a CliplocError of the body as a failure."""
         try:
             yield
         except CliplocError as error:
@@ -106,7 +106,7 @@ class Report:
 
 
 class Doctor(ManagedNode[RelocalizerParameters]):
-    """Has the inputs of a relocalizer, and none of its outputs.
+    """A node with the inputs of a relocalizer, but without its outputs.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class Doctor(ManagedNode[RelocalizerParameters]):
     topics : sequence of str
         Remappings of the relocalizer, NAME:=TOPIC.
     wrong_cameras : str
-        Faults of the relocalizer's cameras, by its looks.
+        Cameras whose mount or calibration the relocalizer has found to be wrong.
     """
 
     def __init__(self, given: Sequence[Parameter], topics: Sequence[str], wrong_cameras: str = ''
@@ -123,7 +123,8 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         rules = [word for rule in ('/diagnostics:=~/diagnostics', *topics)
                  for word in ('-r', rule)]
         super().__init__('doctor', RelocalizerParameters, DetectorParameters,
-                         parameter_overrides=[one for one in given if one.name != 'autostart'],
+                         parameter_overrides=[parameter for parameter in given
+                                              if parameter.name != 'autostart'],
                          cli_args=['--ros-args', *rules])
         parameters, self.wrong_cameras = self.settings.values, wrong_cameras
         self.robot = RobotStateSource(self)
@@ -131,7 +132,7 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         self.handoff = HandOff(self, self.robot.odometry)
 
     def load(self) -> str:
-        """Load nothing: a bad map must not keep the inputs from being checked."""
+        """Load nothing: the inputs are checked even if the map is bad."""
         return 'doctor'
 
     def unload(self) -> None:
@@ -140,13 +141,13 @@ class Doctor(ManagedNode[RelocalizerParameters]):
     def open(self) -> None:
         """Listen to all inputs."""
         self.handoff.open(self.settings.values.localizer_pose)
-        with suppress(NoTransformError):  # tf2 is not installed; the check of tf says so
+        with suppress(NoTransformError):  # tf2 is not installed; the check of tf reports it
             self.robot.open()
         self.frames.open()
 
     def close(self) -> None:
-        """Listen to nothing more."""
-        self.frames.close('the doctor leaves')
+        """Unsubscribe from all inputs."""
+        self.frames.close('the doctor is ending')
         self.robot.close()
         self.handoff.close()
 
@@ -155,20 +156,20 @@ class Doctor(ManagedNode[RelocalizerParameters]):
 
 
 def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
-    """Check what a request needs; inputs may take `patience_s` to come."""
+    """Check what a request needs; wait up to `patience_s` for each input."""
     began_at, parameters = time.monotonic(), None
     with report.failing('parameters'):
         parameters = node.settings.snapshot()
         report.add('parameters', State.PASS, 'valid')
     if parameters is None:
-        return report.skip('all others', 'correct the parameters first')
+        return report.skip('all other checks', 'correct the parameters first')
     node.bring_up(began_at + patience_s)
     localizer = _check_map(node, parameters, report)
     after, frame, why = time.monotonic(), None, ''
     try:
         frame = node.frames.next_frame(after, after + patience_s)
         while parameters.depth_transport != 'none' and frame.depth is None:
-            # depth may be discovered later than the image
+            # discovery of the depth topic may take longer than that of the image
             frame = node.frames.next_frame(time.monotonic(), after + patience_s)
     except NoFrameError as error:
         why = str(error)
@@ -183,9 +184,9 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
         header = image.header if frame is None else frame.image.header
         _check_place(node, parameters.of_camera(name), header, patience_s, report)
     else:
-        report.skip('tf, odometry', 'need an image')
+        report.skip('tf, odometry', 'they need an image')
     if silent[name].keys() & {'image', 'camera_info'}:
-        report.skip('detector', 'needs an image with camera_info')
+        report.skip('detector', 'it needs an image with camera_info')
     else:
         _check_detections(parameters, localizer, frame, silent[name].get('detections', why),
                           report)
@@ -194,13 +195,14 @@ def diagnose(node: Doctor, patience_s: float, report: Report) -> None:
                      f'publishes {parameters.localizer_pose or "nothing that is checked"}')
     else:
         report.skip('localizer', 'require_localizer is false')
-    node.frames.close('all frames are checked')  # a detector at work would take time from this
+    # a running detector would compete for processor time with the request below
+    node.frames.close('all frames are checked')
     _check_request(node, parameters, localizer, frame, report)
 
 
 def _check_map(node: Doctor, parameters: RelocalizerParameters, report: Report
                ) -> FrameLocalizer | None:
-    """Load map, keyframes and CLIP; return them, None if that fails."""
+    """Load and return map, keyframes and CLIP; None if that fails."""
     began_at = time.monotonic()
     with report.failing('map'):
         localizer = node.worker.run(partial(load_localizer, node, parameters))
@@ -211,7 +213,7 @@ def _check_map(node: Doctor, parameters: RelocalizerParameters, report: Report
             report.skip('keyframes', 'none next to the map: build_map makes them from images')
         else:
             report.judge('keyframes', '' if keyframes is not None else
-                         f'{file} is not used, see the error above: make it again with build_map',
+                         f'{file} is not used, see the error above: rebuild it with build_map',
                          f'{len(keyframes.localizer.layer if keyframes else ())} of {file}')
         return localizer
     return None
@@ -222,20 +224,20 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
     """Check images, calibration and clock of a camera."""
     camera, calibration, clock = (of_camera(name, what) for what in (
         'camera', 'calibration', 'clock'))
-    (image, _), (info, _) = (source.heard.get(one, (None, 0.0)) for one in (
+    (image, _), (info, _) = (source.heard.get(topic, (None, 0.0)) for topic in (
         'image', 'camera_info'))
     size = None
     if image is None or 'image' in silent:
         report.add(camera, State.FAIL, silent.get('image', 'no image in time'))
-        report.skip(clock, 'needs an image')
+        report.skip(clock, 'it needs an image')
     else:
         with report.failing(camera):
             size = image_from_msg(image).shape[1::-1]
             report.add(camera, State.PASS, f'{size[0]} x {size[1]} px, frame '
                                            f"'{image.header.frame_id}'")
         why = stamp_problem(image.header.stamp)
-        report.judge(clock, f"the images' stamp {why}: their driver must stamp each"
-                     if why else _doubt_of_clock(node, source.nearest_lag_s),
+        report.judge(clock, f"the images' stamp {why}: the driver must stamp each image"
+                     if why else _clock_fault(node, source.nearest_lag_s),
                      f'images come {1e3 * source.nearest_lag_s:.0f} ms after their stamps')
     if info is None:
         return report.add(calibration, State.FAIL,
@@ -251,12 +253,12 @@ def _check_camera(node: Doctor, parameters: RelocalizerParameters, name: str,
                      f'{fields_of_view(found)[0]:.0f} degrees wide, {lens}')
 
 
-def _doubt_of_clock(node: Doctor, lag_s: float) -> str:
-    """Return the fault of the clocks of camera and node; empty without one."""
+def _clock_fault(node: Doctor, lag_s: float) -> str:
+    """Return how the clocks of camera and node disagree; empty if they agree."""
     uses_sim_time = node.get_parameter('use_sim_time').value
     if uses_sim_time and not node.get_clock().now().nanoseconds:
         return ('use_sim_time is true, but nobody publishes /clock: start the simulation, play '
-                'the bag with --clock, or set it to false')
+                'the bag with --clock, or set use_sim_time to false')
     if abs(lag_s) <= _MOST_LAG_S:
         return ''
     return (f'images come {lag_s:.1f} s after their stamps by '
@@ -266,7 +268,7 @@ def _doubt_of_clock(node: Doctor, lag_s: float) -> str:
 
 def _check_place(node: Doctor, parameters: RelocalizerParameters, image: Any, patience_s: float,
                  report: Report) -> None:
-    """Check tf, odometry and the vertical at the stamp of an image, given its header."""
+    """Check tf, odometry and the vertical at the stamp of an image with the header `image`."""
     robot, mount, base = node.robot, None, parameters.base_frame
     with report.failing('tf'):
         mount = robot.transforms.camera_from_base(
@@ -284,11 +286,12 @@ def _check_place(node: Doctor, parameters: RelocalizerParameters, image: Any, pa
             report.add('tf', State.FAIL, 'base_frame is empty: initialpose would carry the pose '
                        "of the camera: set it to AMCL's base_frame_id")
         else:
-            report.add('tf', State.PASS, 'base_frame is empty: the pose is that of the camera')
+            report.add('tf', State.PASS,
+                       'base_frame is empty: the pose of the camera is published')
     odometry = robot.odometry
     if not odometry.is_published:
-        report.skip('odometry', f'nobody publishes {odometry.topic}: the robot is taken to rest, '
-                                'and images are not joined')
+        report.skip('odometry', f'nobody publishes {odometry.topic}: the robot is assumed to be '
+                                'at rest, and frames are not fused')
     else:
         with report.failing('odometry'):
             node.handoff.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s,
@@ -297,26 +300,27 @@ def _check_place(node: Doctor, parameters: RelocalizerParameters, image: Any, pa
             if mount is not None and body.frame not in (image.frame_id, base):
                 robot.transforms.lookup(image.frame_id, body.frame, image.stamp,
                                         parameters.tf_timeout_s, 'correct its child_frame_id')
-            report.add('odometry', State.PASS, 'the robot rests, and poses cover the image')
+            report.add('odometry', State.PASS,
+                       'the robot is at rest, and the poses cover the stamp of the image')
     if parameters.gravity == 'none' or mount is None:
-        return report.skip('vertical', 'needs tf' if mount is None else 'gravity: none')
+        return report.skip('vertical', 'it needs tf' if mount is None else 'gravity: none')
     with report.failing('vertical'):
         robot.vertical.up_in_camera(parameters, mount, image.frame_id, image.stamp)
-        report.add('vertical', State.PASS, f'known by {parameters.gravity}')
+        report.add('vertical', State.PASS, f'known from {parameters.gravity}')
 
 
 def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocalizer | None,
                       frame: Frame | None, why: str, report: Report) -> None:
-    """Check that detections come with their images and have classes of the map."""
+    """Check that detections arrive with their images and have classes of the map."""
     if frame is None:
         return report.add('detector', State.FAIL, why)
     found = detections_from_msg(frame.detections, parse_class_map(parameters.class_map))
     if not len(found):
-        return report.skip('detector', 'it sees no object: turn the camera to some')
+        return report.skip('detector', 'it detects no object: turn the camera to objects')
     text = f'{len(found)} boxes, {frame.detected_at - frame.received_at:.2f} s after their image'
     if localizer is not None:
         own = sum(class_id in localizer.landmark_map.class_ids for class_id in found.class_ids)
-        text += f', {own} of them of the classes of the map'
+        text += f', {own} of them with classes of the map'
         check = DetectorCheck(localizer.landmark_map, parameters.matching != 'clip')
         with report.failing('detector'):
             height, width = image_from_msg(frame.image).shape[:2]
@@ -333,12 +337,12 @@ def _check_detections(parameters: RelocalizerParameters, localizer: FrameLocaliz
 
 def _check_depth(frame: Frame, state: RobotState, parameters: RelocalizerParameters,
                  report: Report) -> None:
-    """Check that depth comes with an image and belongs to it: localizing goes on without."""
+    """Check that depth arrives with an image and belongs to it. Localization works without it."""
     what = of_camera(frame.camera, 'depth')
     if frame.depth is None:
-        return report.add(what, State.FAIL, 'none within depth_tolerance_s of the image, '
-                          f'{parameters.depth_tolerance_s:g} s: remap depth, start its publisher, '
-                          'or set depth_transport to none')
+        return report.add(what, State.FAIL, 'no depth within depth_tolerance_s '
+                          f'({parameters.depth_tolerance_s:g} s) of the image: remap depth, start '
+                          'its publisher, or set depth_transport to none')
     with report.failing(what):
         _, camera, given = read_frame(frame, parameters)
         boxes = given.usable(camera.width, camera.height, parameters.max_detections)
@@ -346,22 +350,22 @@ def _check_depth(frame: Frame, state: RobotState, parameters: RelocalizerParamet
         assert depths_m is not None
         known_m = depths_m[np.isfinite(depths_m)]
         if not len(known_m):
-            return report.skip(what, f'none of {len(depths_m)} boxes has depth')
-        report.add(what, State.PASS, f'of {len(known_m)} of {len(depths_m)} boxes, '
+            return report.skip(what, f'none of the {len(depths_m)} boxes has depth')
+        report.add(what, State.PASS, f'known for {len(known_m)} of {len(depths_m)} boxes, '
                                      f'{known_m.min():.1f} to {known_m.max():.1f} m')
 
 
 def _check_request(node: Doctor, parameters: RelocalizerParameters,
                    localizer: FrameLocalizer | None, frame: Frame | None, report: Report) -> None:
-    """Localize with a frame as a request does: how long each stage takes, and the verdict."""
+    """Localize with a frame as a request does; report the time of each stage and the verdict."""
     if localizer is None or frame is None:
-        return report.skip('time, pose', 'need a map and an image with detections')
+        return report.skip('time, pose', 'they need a map and an image with detections')
     with report.failing('pose'):
         known = node.robot.at_instant(frame, parameters, localizer.frame_ids, localizer.map_hash,
                                       time.monotonic() + parameters.tf_timeout_s)
         if parameters.depth_transport != 'none':
-            for one, state in ((frame, known.state), *known.beside):
-                _check_depth(one, state, parameters, report)
+            for camera_frame, state in ((frame, known.state), *known.beside):
+                _check_depth(camera_frame, state, parameters, report)
         times = StageTimes('waiting', time.monotonic())
         localized = node.worker.run(partial(
             localizer.localize, frame, parameters, known, times))
@@ -374,15 +378,15 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
             report.add('pose', State.REFUSED, f'the relocalizer refuses it: {node.wrong_cameras}')
         elif found.accepted:
             report.add('pose', State.PASS,
-                       f'accepted with confidence {found.confidence:.3f}; not handed over')
+                       f'accepted with confidence {found.confidence:.3f}; not published')
         else:
             report.add('pose', State.REFUSED, found.reason)
 
 
 def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) -> None:
-    """Check the relocalizer of parameter files, or without any, the running one of a name.
+    """Check the relocalizer that parameter files describe, or without files, a running one.
 
-    CliplocError: a parameter file cannot be read, or no node can have this name.
+    CliplocError: a parameter file cannot be read, or the name is invalid.
     """
     check_name(name)
     asking, values = Node('doctor_asks', start_parameter_services=False), dict[str, str]()
@@ -393,10 +397,10 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
         else:
             status, given = ask(asking, name, patience_s)
             values = status.values
-            if any(values.get(one, '0') != '0' for one in (
+            if any(values.get(verdict, '0') != '0' for verdict in (
                     Verdict.ACCEPTED, Verdict.WITHHELD)):  # it no longer uses its last pose
-                given = [one for one in given if one.name != 'last_pose_file']
-            # what an active one lacks is reported by the checks below
+                given = [parameter for parameter in given if parameter.name != 'last_pose_file']
+            # missing inputs of an active relocalizer are reported by the checks below
             report.judge('relocalizer', '' if values['state'] == 'active' else status.problem(),
                          f'{name} is active')
     except NotRunningError as error:

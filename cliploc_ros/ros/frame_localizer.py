@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Relocalize a frame with the map and the networks that stay loaded between requests."""
+"""Relocalize frames with a map and networks that stay loaded between requests."""
 
 import hashlib
 import logging
@@ -41,15 +41,15 @@ if TYPE_CHECKING:  # loaded where crops are compared
 
 logger = logging.getLogger(__name__)
 
-#: Value of keyframes_file for the layer next to the map, if there is one.
+#: Value of keyframes_file that selects the layer next to the map, if it exists.
 NEXT_TO_MAP = 'auto'
 _DIGITS = 12
-# A file that is replaced while it is read is read again.
+# A map file that changes while it is read is read again.
 _ATTEMPTS = 3
 
 
 class Keyframes(NamedTuple):
-    """The keyframes of a map, and where they are from, for the diagnostics."""
+    """The keyframes of a map, and their file and its hash for the diagnostics."""
 
     localizer: KeyframeLocalizer
     file: str = ''
@@ -63,28 +63,31 @@ class Localized(NamedTuple):
     found: Relocalization
     #: With several maps, the map of the best pose.
     landmark_map: LandmarkMap
-    #: With the crops that were compared, and their similarities to this map.
+    #: The image, the compared crops and their similarities to this map.
     seen: SeenImage
     #: Number of crops that were compared with labels.
     compared: int
-    #: Whether there was no time for the other crops, which could have helped.
+    #: Whether the frame was refused before all crops were compared.
     is_cut: bool
-    #: Covariance (6, 6) for a filter that fuses all accepted poses: in continuous mode, that of
-    #: the new information, see cliploc_ros.core.localizer.
+    #: Covariance (6, 6) for a filter that fuses all accepted poses. In continuous mode it covers
+    #: only the new information, see cliploc_ros.core.localizer.
     for_filter: NDArray[np.float64] | None
-    left_out: tuple[str, ...]  #: Names of cameras without a frame, or of another run of odometry
-    query: Query  #: With it the same answer comes again
+    #: Names of cameras without a frame, or with a frame of another run of odometry.
+    left_out: tuple[str, ...]
+    query: Query  #: Reproduces the answer
 
 
 class FrameLocalizer:
-    """A map and, unless only classes are matched, an observer for its labels and images.
+    """Localizes frames in a map.
 
     Parameters
     ----------
+    observer : Observer, optional
+        Compares crops with the map's labels and images. None if only classes are matched.
     relocalizer : Relocalizer
         Relocalizer of the map, with these options.
     device : str
-        Where the observer's network runs.
+        Device of the observer's network.
     map_hash : str
         See load_hashed_map.
     keyframes : Keyframes, optional
@@ -95,7 +98,7 @@ class FrameLocalizer:
                  relocalizer: Relocalizer, options: RelocalizerOptions, device: str,
                  map_hash: str, keyframes: Keyframes | None = None) -> None:
         self.device, self.map_hash, self.keyframes = device, map_hash, keyframes
-        #: The map, or all maps as one, and the coordinate frames of the maps
+        #: The map, or all maps joined, and the coordinate frames of the maps
         self.landmark_map = landmark_map
         self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
         self.observer = observer
@@ -105,7 +108,7 @@ class FrameLocalizer:
 
     @property
     def description(self) -> str:
-        """Return the loaded parts, in a line."""
+        """Return map, keyframes, matching and algorithm in one line."""
         frames = ', '.join(f"'{frame_id}'" for frame_id in self.frame_ids)
         where = f'frame {frames}' if len(self.frame_ids) == 1 else \
             f'{len(self.frame_ids)} maps, frames {frames}'
@@ -116,15 +119,15 @@ class FrameLocalizer:
 
     def localize(self, frame: Frame, parameters: RelocalizerParameters, known: KnownBefore,
                  times: StageTimes, deadline: float = math.inf) -> Localized:
-        """Find where the camera was, with a frame and those that odometry links to it.
+        """Localize the camera with a frame and the earlier frames that odometry links to it.
 
-        `parameters` are as they are now, `known` is the prior knowledge. No crops are compared
+        `parameters` are the current ones, `known` is the prior knowledge. No crops are compared
         after `deadline` (monotonic clock) [s].
 
-        CliplocError: names what to fix in the frame or in the parameters.
+        CliplocError: the frame or the parameters are invalid.
         """
         times.begin('decoding')
-        # a frame without a deadline is one of many: the next one is its second look
+        # a frame without a deadline is one of a stream: no thorough search, the next one follows
         query = replace(self.instants.query(frame, parameters, known),
                         is_thorough=not math.isinf(deadline))
         found = self.answer(query, parameters.options(), times, deadline)
@@ -145,43 +148,44 @@ class FrameLocalizer:
                                                             for part in parts])
             which = [part.first for part in parts].index(own.first)
             seen = replace(seen, similarities=pieces[which])
-        names = [one.camera_name for one in query.frames]
+        names = [camera_frame.camera_name for camera_frame in query.frames]
         layer = None if self.keyframes is None else self.keyframes.localizer.layer
         return Localized(
             found, own.landmark_map, SeenImage(query.images[-1], seen, layer), compared, is_cut,
-            for_filter, (*frame.left_out, *(one.camera for one, _ in known.beside
-                                            if one.camera not in names)), query)
+            for_filter, (*frame.left_out, *(beside.camera for beside, _ in known.beside
+                                            if beside.camera not in names)), query)
 
     def answer(self, query: Query, options: RelocalizerOptions, times: StageTimes,
                deadline: float = math.inf) -> Relocalization:
-        """Answer a query with options as they are now; see localize."""
+        """Answer a query with the current options; see localize."""
         localizer = self._localizer_for(options)
         if self.keyframes is not None:
             self.instants.note(self.keyframes.localizer.layer.camera_note(query.newest.camera))
         times.begin('search')
         found = localizer.answer(query, self.observer, deadline, times.begin)
         for name in localizer.cameras.wrong_mounts:
-            self.instants.note(f'what {name} sees does not fit the other cameras: check its '
+            self.instants.note(f'detections of {name} contradict the other cameras: check its '
                                'mount, camera_info and image')
         if localizer.depth_scale.is_wrong:
             self.instants.note(
-                f'depth is {localizer.depth_scale.ratio:.2f} times what boxes and map say, and '
-                'is used no more: check its unit, calibration and registration')
+                f'depth is {localizer.depth_scale.ratio:.2f} times the depth by boxes and map, '
+                'and no longer used: check its unit, calibration and registration')
         return found
 
     def look(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
              frame_id: str, map_from_camera: NDArray[np.float64]) -> WatchReport:
-        """Compare a frame with the localizer's pose of its camera (4, 4) in the map `frame_id`.
+        """Check the localizer's camera pose (4, 4) in the map `frame_id` against a frame.
 
-        Crops are compared only where that costs nothing. Other arguments as for localize.
+        Only crops whose embeddings are already known are compared. Other arguments as for
+        localize.
 
-        CliplocError: names what to fix in the frame or in the parameters.
+        CliplocError: the frame or the parameters are invalid.
         """
         shift = next((part.shift for part in parts_of(self.landmark_map)
                       if part.landmark_map.frame_id == frame_id), None)
         if shift is None:
-            raise MapError(f"no map is in frame '{frame_id}', but in {', '.join(self.frame_ids)}: "
-                           "correct the map's frame_id")
+            raise MapError(f"no map is in frame '{frame_id}', only in "
+                           f"{', '.join(self.frame_ids)}: correct the map's frame_id")
         options = parameters.options()
         localizer = self._localizer_for(options)
         query = self.instants.query(frame, parameters, KnownBefore(state))
@@ -192,13 +196,13 @@ class FrameLocalizer:
         return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
 
     def _begin(self, relocalizer: Relocalizer, options: RelocalizerOptions) -> None:
-        """Answer and watch with a relocalizer of some options from now on."""
+        """Use a relocalizer and its options from now on, to answer and to watch."""
         self._options, self.watch = options, Watch(relocalizer)
         self.localizer = Localizer(
             relocalizer, None if self.keyframes is None else self.keyframes.localizer)
 
     def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
-        """Return the localizer; other options begin a new one, and a new watch."""
+        """Return the localizer. If the options changed, make a new one, and a new watch."""
         if options != self._options:
             self._begin(Relocalizer(self.landmark_map, options), options)
         return self.localizer
@@ -206,19 +210,19 @@ class FrameLocalizer:
 
 def load_localizer(node: Node, parameters: RelocalizerParameters,
                    former: FrameLocalizer | None = None) -> FrameLocalizer:
-    """Load map and, if the matching type asks for it, CLIP; that of a former one stays.
+    """Load the map and, if the matching type needs it, CLIP. Keep the CLIP of `former`.
 
-    CliplocError: names the file, parameter or download to mend.
+    CliplocError: a file or parameter is invalid, or a download failed.
     """
     if parameters.cache_dir:
         KERNEL_FOLDERS.prefer(resolve_cache_dir(parameters.cache_dir) / 'kernels')
     options = parameters.options()
     files = map_files(parameters)
     landmark_map, map_hash = load_hashed_map(node, files)
-    relocalizer = Relocalizer(landmark_map, options)  # before what takes long
+    relocalizer = Relocalizer(landmark_map, options)  # errors show before the slow steps
     keyframes = load_keyframes(parameters, landmark_map)
     if not len(landmark_map) and keyframes is None:
-        raise MapError('the map has no landmarks, and no keyframes lie next to it: build it again')
+        raise MapError('the map has neither landmarks nor keyframes next to it: rebuild it')
     observer, device = None, 'cpu'
     if options.needs_similarities and len(landmark_map):
         from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
@@ -235,7 +239,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
 
 
 def clip_options_of(parameters: RelocalizerParameters) -> 'ClipOptions':
-    """Return the CLIP that parameters name: that of the profile where they name none."""
+    """Return the CLIP that the parameters name, by default that of the profile."""
     from cliploc_ros.models.clip_weights import ClipOptions
     named = ClipOptions(
         model=parameters.clip_model, pretrained=parameters.clip_pretrained,
@@ -245,7 +249,7 @@ def clip_options_of(parameters: RelocalizerParameters) -> 'ClipOptions':
 
 
 def keyframes_path(parameters: RelocalizerParameters) -> Path | None:
-    """Return the layer that the parameters name, or the one next to the map; None without one."""
+    """Return the path of the layer in keyframes_file, or next to the map; None without a layer."""
     named, map_file = parameters.keyframes_file, parameters.map_file
     if named != NEXT_TO_MAP:
         return Path(named) if named else None
@@ -255,10 +259,10 @@ def keyframes_path(parameters: RelocalizerParameters) -> Path | None:
 
 def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
                    ) -> Keyframes | None:
-    """Return the layer that the parameters name; None without one, or where it is bad.
+    """Load the layer of keyframes_path; None if there is no layer or it is invalid.
 
-    A bad layer, or one whose features cannot be found here, is logged with what to do, and the
-    relocalizer goes on with the landmarks.
+    If the layer is invalid or its features cannot be computed here, the error is logged, and the
+    relocalizer uses the landmarks only.
     """
     path = keyframes_path(parameters)
     if path is None:
@@ -273,9 +277,9 @@ def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
 
 
 def load_map(node: Node, files: Sequence[str]) -> LandmarkMap:
-    """Return the map of files, or of the node's own parameters where no file is given.
+    """Load the map from files, or without files, from the node's parameters.
 
-    MapError: names the source, the landmark and the field to fix.
+    MapError: the map is invalid; the message names the source, the landmark and the field.
     """
     if files:
         return join_maps([LandmarkMap.from_file(file) for file in files], files)
@@ -300,12 +304,12 @@ def _insert(tree: dict[str, Any], path: list[str], value: Any) -> None:
 
 
 def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
-    """Load one map or several and return them with their hash.
+    """Load one map, or join several, and return it with its hash.
 
-    The hash is the beginning of what `cat FILE... | sha256sum` prints. A map in parameters has
-    the hash of its landmarks.
+    The hash is the beginning of the output of `cat FILE... | sha256sum`. For a map in parameters
+    it is the hash of its landmarks.
 
-    MapError: see load_map; or a file changes again and again.
+    MapError: see load_map; or a file changes repeatedly while it is read.
     """
     for _ in range(_ATTEMPTS):
         before = _hash_of(files)
@@ -319,12 +323,12 @@ def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]
             return landmark_map, _hash(content)
         if before == _hash_of(files):
             return landmark_map, before
-    raise MapError(f'{", ".join(files)}: changes while it is read: write another file and '
-                   'rename it')
+    raise MapError(f'{", ".join(files)}: changes while it is read; write a new file, then rename '
+                   'it')
 
 
 def _hash_of(files: Sequence[str]) -> str:
-    """Return the hash of files; empty where load_map says what is wrong."""
+    """Return the hash of files; empty if one cannot be read, which load_map reports."""
     try:
         return _hash(b''.join(map(read_file, files)))
     except OSError:

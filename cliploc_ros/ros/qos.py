@@ -26,29 +26,30 @@ IMAGE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
 CAMERA_INFO = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                          reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_IN = CAMERA_INFO
-# What the fastest usual IMU, or odometry, sends while another callback runs.
+# Buffers the messages of the fastest usual IMU or odometry while another callback runs.
 IMU = ODOM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                         reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_OUT = POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                                    reliability=ReliabilityPolicy.RELIABLE)
-# For late subscribers, too.
+# Late subscribers get the last message.
 LATCHED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
                      reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Requests are answered one after another; this many may wait.
+# Requests are answered one after another; up to 100 may wait.
 SERVICE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                      reliability=ReliabilityPolicy.RELIABLE)
 
 
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
                 QoSPolicyKind.DURABILITY)
-# Least time between two new subscriptions after empty messages [s]: some publishers send them.
+# Least time between two new subscriptions after empty messages [s]. Some publishers send empty
+# messages all the time.
 _RENEWAL_PERIOD_S = 1.0
 _LOG_PERIOD_S = 5.0
 
 
 def overridable(*but: QoSPolicyKind) -> QoSOverridingOptions:
-    """Return the options that let a user override all policies except some."""
+    """Return options that allow users to override all policies except `but`."""
     return QoSOverridingOptions(
         policy_kinds=[kind for kind in _OVERRIDABLE if kind not in but])
 
@@ -57,21 +58,21 @@ class AdaptiveSubscription:
     """Subscribes reliably while all publishers of the topic are reliable, else best effort.
 
     A best-effort subscription matches every camera, but loses large images even on one machine. A
-    reliable one does not match a best-effort camera. The choice is made again when publishers
-    come or go.
+    reliable subscription does not match a best-effort camera. The choice is repeated when
+    publishers appear or disappear.
 
     Messages are taken as bytes and deserialized here. A reliable subscription that joins a stream
-    of images may be left with a message that Fast DDS (2.14) has already freed: one join in fifty,
-    measured on busy cores. Where Fast DDS deserializes, it tries that message for ever and blocks
-    the whole process. As bytes, the message is merely empty and comes again and again; a new
-    subscription ends that.
+    of images may receive a message that Fast DDS (2.14) has already freed: one join in fifty,
+    measured on busy cores. If Fast DDS deserializes, it retries that message for ever and blocks
+    the whole process. Taken as bytes, the message is merely empty and is delivered repeatedly,
+    until a new subscription is made.
 
     Parameters
     ----------
     node : Node
         Made with automatically_declare_parameters_from_overrides=True.
     callback : callable
-        Takes each message, one at a time except during such a change.
+        Called with each message. Calls do not overlap, except while the subscription is replaced.
     profile : QoSProfile
         All policies except the reliability.
     """
@@ -83,12 +84,12 @@ class AdaptiveSubscription:
         self._topic = node.resolve_topic_name(topic)
         self._callback = callback
         self._profile = profile
-        # A reliability set by the user stays. The parameter is not declared otherwise: a declared
-        # one would stay, too.
+        # A reliability set by the user is kept. Otherwise the parameter is not declared, because
+        # its first value would be kept, too.
         self._overridden = node.has_parameter(
             f'qos_overrides.{self._topic}.subscription.reliability')
         self._renewed_at = -math.inf
-        # Publishers come in one thread, destroy is called in another.
+        # Events of publishers and destroy() come from different threads.
         self._lock = threading.RLock()
         self._subscription: Subscription | None = None
         with self._lock:
@@ -103,16 +104,16 @@ class AdaptiveSubscription:
                 self._subscription = None
 
     def _offered(self) -> ReliabilityPolicy:
-        """Return the most reliable policy that matches all present publishers."""
+        """Return the most reliable policy that matches all current publishers."""
         offered = [info.qos_profile.reliability
                    for info in self._node.get_publishers_info_by_topic(self._topic)]
         reliable = bool(offered) and all(r == ReliabilityPolicy.RELIABLE for r in offered)
         return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
 
     def _create(self) -> Subscription:
-        # A group of its own: if a subscription is destroyed before its event is taken, rclpy
-        # leaves the group busy for ever. A group also keeps a reference to each of its former
-        # members.
+        # Each subscription has its own group: if a subscription is destroyed before its event is
+        # taken, rclpy leaves the group busy for ever. A group also keeps references to all its
+        # former members.
         group = MutuallyExclusiveCallbackGroup()
         profile = QoSProfile(history=self._profile.history, depth=self._profile.depth,
                              durability=self._profile.durability, reliability=self._reliability)
@@ -124,7 +125,7 @@ class AdaptiveSubscription:
                 matched=self._adapt, incompatible_qos=self._adapt))
 
     def _adapt(self, _: Any) -> None:
-        """Subscribe again if the present publishers need another reliability."""
+        """Subscribe again if the current publishers need another reliability."""
         with self._lock:
             offered = self._offered()
             if self._overridden or self._subscription is None or offered == self._reliability:
@@ -162,7 +163,7 @@ class AdaptiveSubscription:
 
 
 class Listener(ABC):
-    """Remembers what it hears while its subscription is open, and nothing longer."""
+    """Stores messages while its subscription is open."""
 
     _subscription: AdaptiveSubscription | None = None
 
@@ -171,7 +172,7 @@ class Listener(ABC):
         """Forget all messages: later ones belong to another time or run."""
 
     def close(self) -> None:
-        """Unsubscribe, and forget what was heard."""
+        """Unsubscribe, and forget all messages."""
         if self._subscription is not None:
             self._subscription.destroy()
             self._subscription = None

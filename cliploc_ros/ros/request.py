@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A request: frame, robot state, localizer, publish, hand over, until accepted or time is up."""
+"""Answer requests: localize with frames, publish and deliver, until accepted or time is up."""
 
 import math
 import threading
@@ -35,16 +35,16 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.visualization import Visualization
 
 _LOG_PERIOD_S = 5.0
-# Every frame that odometry does not link is another chance of a false accept.
+# Each frame without odometry adds to the risk of a false accept.
 _MAX_UNLINKED = 3
-# An earlier request ends at its own deadline, shortly before those that wait for it.
+# The current request ends at its own deadline, shortly before that of the waiting requests.
 _GRACE_S = 0.2
 
 # Refusals of images without objects of the map.
 _WITHOUT_OBJECTS = (RefusalKind.TOO_FEW_OBJECTS, RefusalKind.WRONG_DETECTIONS)
 
 _SMALLER = 'choose a faster profile or a smaller'
-# For each stage: its name in a message, and how to make it faster.
+# The name of each stage in messages, and how to make it faster.
 _STAGES = {'image': 'waiting for an image with detections', 'detection': 'the detector',
            'waiting': 'waiting for earlier work or for /tf', 'decoding': 'reading the image',
            'CLIP': 'CLIP', 'search': 'the search', 'keyframes': 'matching keyframes'}
@@ -58,7 +58,7 @@ _REMEDIES = {'image': 'raise the rate of the camera or of the detector',
 class Pipeline:
     """Localizes with one frame at a time and publishes the result.
 
-    All methods run in the node's worker, one after another.
+    All methods run in the node's worker thread.
     """
 
     def __init__(self, node: ManagedNode[RelocalizerParameters], robot: RobotStateSource,
@@ -66,17 +66,17 @@ class Pipeline:
         self._node, self._robot, self._jumps = node, robot, jumps
         self._map_to_odom = map_to_odom
         self.localizer: FrameLocalizer | None = None
-        #: Called in the worker's thread after another map is searched.
+        #: Called in the worker's thread after a map was loaded.
         self.on_map: Callable[[], None] = lambda: None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._visualization = Visualization(node)
 
     def load(self) -> str:
-        """Load map and network; return what was loaded, in one line."""
+        """Load map and network; return a description of them in one line."""
         return self._use(load_localizer(self._node, self._node.settings.snapshot())).description
 
     def reload_map(self) -> FrameLocalizer:
-        """Read the map again; return what was loaded."""
+        """Read the map again; return the new localizer."""
         former = self.localizer
         if former is None:
             raise NotActiveError(f'the node is {self._node.state}')
@@ -91,16 +91,16 @@ class Pipeline:
                  deadline: float = math.inf) -> Answer:
         """Localize with one frame and publish the result.
 
-        `times` are new ones since the image arrived by default. No crops are compared after
-        `deadline` (monotonic clock) [s].
+        `times` start when the image arrived by default. No crops are compared after `deadline`
+        (monotonic clock) [s].
 
         Raises
         ------
         TimeJumpError
-            Time jumped back since the frame arrived, or odometry restarted where its frame is
-            broadcast; nothing was published.
+            Time jumped back since the frame arrived, or, with publish_tf, odometry restarted.
+            Nothing was published.
         CliplocError
-            Names what to fix in the frame or in the parameters.
+            The frame or the parameters are invalid.
         """
         if times is None:
             times = StageTimes('detection', frame.received_at)
@@ -108,7 +108,7 @@ class Pipeline:
         parameters = self._node.settings.snapshot()
         self._node.check_active()
         localizer = self.localizer
-        assert localizer is not None  # an active node has one
+        assert localizer is not None  # an active node has loaded it
         image = frame.image.header
         self._jumps.check(image.stamp, frame.received_at)
         known = self._robot.at_instant(frame, parameters, localizer.frame_ids, localizer.map_hash,
@@ -131,7 +131,7 @@ class Pipeline:
             answer = self._publish(header, localized, state, replace(
                 answer, verdict=Verdict.ACCEPTED, detail=_summary(localized, stages_ms)))
         self._visualization.show(header, localized.landmark_map, found, state.camera_from_base)
-        if self._visualization.wants_debug_image:  # behind the answer
+        if self._visualization.wants_debug_image:  # drawn later, so that it delays no answer
             self._node.worker.submit(partial(
                 self._visualization.show_debug_image, image, localized.seen,
                 localized.landmark_map, found, answer.message))
@@ -146,7 +146,7 @@ class Pipeline:
 
     def _publish(self, header: Header, localized: Localized, state: RobotState,
                  answer: Answer) -> Answer:
-        """Publish an accepted pose; return the answer with it, withheld without its tf."""
+        """Publish an accepted pose; return the answer with it, withheld if its tf is missing."""
         found = localized.found
         assert found.covariance is not None and found.map_from_camera is not None
         assert localized.for_filter is not None
@@ -156,7 +156,7 @@ class Pipeline:
             covariance, lever)) for covariance in (found.covariance, localized.for_filter))
         parameters = self._node.settings.snapshot()
         x, y, z = map_from_base[:3, 3]
-        # of a robot where its x axis points, of a camera where it looks
+        # the heading of a robot is its x axis, that of a camera its viewing direction (z axis)
         ahead = map_from_base[:2, 0 if parameters.base_frame else 2]
         heading_deg = math.degrees(math.atan2(ahead[1], ahead[0]))
         position_m, turn_deg = deviations(np.reshape(pose.pose.covariance, (6, 6)))
@@ -177,9 +177,9 @@ class Pipeline:
 class Requests:
     """Answers requests one at a time.
 
-    A request that had to wait shares the previous answer if the image of that answer arrived
-    after the request: clients that ask together cost one search and reset the localizer once.
-    Otherwise it looks at fresh frames itself.
+    A request that had to wait gets the previous answer if the image of that answer arrived after
+    the request. Thus simultaneous requests need one search and reset the localizer once.
+    Otherwise it is answered with new frames.
     """
 
     def __init__(self, node: ManagedNode[RelocalizerParameters], frames: CameraRig,
@@ -211,9 +211,9 @@ class Requests:
             self._turn.release()
 
     def _guarded(self, arrived_at: float, deadline: float) -> Answer:
-        """Return an answer whatever happens, and log it in one line."""
+        """Return an answer, also for errors of any kind, and log it in one line."""
         try:
-            # A map or weights that were missing may be there now.
+            # A map or weights that were missing may be available now.
             self._node.bring_up(deadline)
             answer = self._look_until(deadline, arrived_at)
         except CliplocError as error:
@@ -226,7 +226,7 @@ class Requests:
         return replace(answer, number=next(self._numbers))
 
     def _look_until(self, deadline: float, arrived_at: float) -> Answer:
-        """Look at one frame after another while another frame can change the answer."""
+        """Localize with one frame after another while a further frame can change the answer."""
         last: Answer | None = None
         problem: CliplocError | None = None
         stages_ms: Counter[str] = Counter()
@@ -240,7 +240,7 @@ class Requests:
                 answer = self._node.worker.run(
                     partial(self._look, frame, times, deadline), deadline)
                 answer, may_go_on = self._hand_over(answer, deadline)
-            except (TimeJumpError, NoTransformError) as error:  # a newer frame may do
+            except (TimeJumpError, NoTransformError) as error:  # a newer frame may work
                 problem, after = error, time.monotonic()
                 if after <= deadline - _GRACE_S:
                     continue
@@ -262,7 +262,7 @@ class Requests:
             unlinked += not answer.is_linked
             stages_ms.update(answer.stages_ms)
         assert last is not None
-        # more images of a place without objects are no remedy
+        # further images do not help if no objects of the map are visible
         if is_up and last.verdict is Verdict.REFUSED and (
                 last.is_cut or last.kind not in _WITHOUT_OBJECTS):
             last = replace(last, detail=f'{last.detail}; {time_is_up(stages_ms)}')
@@ -272,13 +272,13 @@ class Requests:
                                     f'{time.monotonic() - arrived_at:.1f} s]')
 
     def _look(self, frame: Frame, times: StageTimes, deadline: float) -> Answer:
-        """Localize with a frame and keep it, in the worker's thread."""
+        """Localize with a frame and record it; runs in the worker's thread."""
         answer = self._pipeline.localize(frame, times, deadline)
         self._cases.add(answer)
         return answer
 
     def _hand_over(self, answer: Answer, deadline: float) -> tuple[Answer, bool]:
-        """Hand an accepted pose to the localizer; return also whether another frame may help."""
+        """Deliver an accepted pose; return the answer, and whether another frame may help."""
         if answer.pose is None:
             return answer, True
         try:
@@ -303,7 +303,7 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
     count = len(localized.query.frames)
     cameras = f', {count} cameras' if count > 1 else ''
     if localized.left_out:
-        cameras += f', none of {", ".join(localized.left_out)}'
+        cameras += f', no image of {", ".join(localized.left_out)}'
     depth = ''
     if found.depth is not None:
         depth = f', depth of {found.depth.objects} objects' if found.depth.is_passed \
@@ -311,7 +311,7 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
     prior = ''
     if found.evidence is not None and found.evidence.prior:
         prior = f', prior {found.evidence.prior:.1f}'
-    # a refusal that compares a confidence with its limit is not contradicted by a rounded one
+    # do not repeat, with other rounding, a confidence that the reason of a refusal already states
     confidence = '' if 'confidence' in found.reason else f'confidence {found.confidence:.3f}, '
     frames = f' in {len(found.frame_matches)} frames' if len(found.frame_matches) > 1 else ''
     return (f'[{confidence}score {found.score:.2f}, '
@@ -323,7 +323,7 @@ def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
 
 
 def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[str, object]:
-    """Return the evidence that decided the answer to a frame."""
+    """Return the values that decided the answer to a frame, for its diagnostic message."""
     found = localized.found
     evidence, points = found.evidence, found.recognized
     needed = parameters.min_confidence if evidence is None else needed_confidence(
@@ -337,7 +337,7 @@ def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[st
 
 
 def time_is_up(stages_ms: Mapping[str, float]) -> str:
-    """Return the stage that used up the time of a request, and the remedy."""
+    """Return a message with the slowest stage of a request and its remedy."""
     stage = max(stages_ms, key=lambda name: stages_ms[name])
     total_s = sum(stages_ms.values()) / 1e3
     return (f'time is up: {_STAGES[stage]} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; '

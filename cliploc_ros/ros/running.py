@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A running relocalizer as other programs see it: diagnostics, parameters, topics."""
+"""Access to a running relocalizer from other programs: diagnostics and parameters."""
 
 import math
 import re
@@ -21,18 +21,18 @@ from rclpy.validate_topic_name import validate_topic_name
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, OptionsError
 
-#: The diagnostics come once a second; a relocalizer that is silent for longer counts as dead.
+#: Diagnostics are published once a second; a relocalizer that is silent for longer is dead.
 SILENT_S = 5.0
 _SPIN_S = 0.05
 
 
 class RelocalizerStatus:
-    """Listens to the diagnostics of one relocalizer.
+    """The state of one relocalizer by its diagnostics.
 
     Parameters
     ----------
     node : Node
-        Spun by the caller.
+        The subscribing node, which the caller spins.
     name : str
         The relocalizer's name with its namespace, as ``/robot/relocalizer``.
     """
@@ -40,35 +40,35 @@ class RelocalizerStatus:
     def __init__(self, node: Node, name: str) -> None:
         self._name = name
         self._begun_at = time.monotonic()
-        # When its last report came (monotonic clock) [s], and its problems or its state.
+        # Arrival of the last diagnostics (monotonic clock) [s], and their message.
         self._received_at, self._message = -math.inf, ''
-        #: The values of its last report
+        #: The values of the last diagnostics
         self.values: dict[str, str] = {}
         node.create_subscription(DiagnosticArray, '/diagnostics', self._take, 10)
 
     @property
     def silent_s(self) -> float:
-        """Return how long the relocalizer has been silent [s]."""
+        """Return the time since the last diagnostics [s]."""
         return time.monotonic() - max(self._received_at, self._begun_at)
 
     @property
     def time_limit_s(self) -> float:
-        """Return within which time it answers a request [s]; infinite if that is not known."""
+        """Return the time limit of a request [s]; infinite if unknown."""
         return float(self.values.get('time limit [s]', math.inf))
 
     def has_reported_since(self, moment: float) -> bool:
-        """Return whether it was active and reported since a moment (monotonic clock) [s]."""
+        """Return whether it is active and has reported since `moment` (monotonic clock) [s]."""
         return self._received_at > moment and self.values.get('state') == 'active'
 
     def problem(self) -> str:
-        """Return why the relocalizer cannot take a request, and what to do; empty if it can."""
+        """Return why the relocalizer cannot answer a request, and the remedy; empty if it can."""
         state, silent_s = self.values.get('state'), self.silent_s
         if state is None:
             return (f'{self._name} has sent no diagnostics yet: it is starting, or its '
                     '/diagnostics is remapped')
         if silent_s > SILENT_S:
-            return (f'{self._name} has been silent for {silent_s:.0f} s: it died, or its '
-                    'machine is overloaded; start it again if it died')
+            return (f'{self._name} has been silent for {silent_s:.0f} s: it has died, or its '
+                    'machine is overloaded; restart it if it has died')
         if state != 'active':
             reason = self._message if self._message != state else \
                 'it is loading, or its lifecycle manager must configure and activate it'
@@ -83,11 +83,11 @@ class RelocalizerStatus:
 
 
 class NotRunningError(CliplocError):
-    """The relocalizer does not run, or does not answer; the message says what to do."""
+    """The relocalizer is not running, or does not respond; the message says what to do."""
 
 
 def check_name(name: str) -> None:
-    """Raise OptionsError unless `--relocalizer` can be the name of a node."""
+    """Raise OptionsError unless the value of `--relocalizer` is a valid name of a node."""
     try:
         validate_topic_name(f'{name}/relocalize', is_service=True)
     except InvalidServiceNameException as error:
@@ -95,19 +95,21 @@ def check_name(name: str) -> None:
 
 
 def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, list[Parameter]]:
-    """Return state and parameters of a relocalizer; finding it may take `patience_s`.
+    """Return state and parameters of a running relocalizer.
 
     Parameters
     ----------
     node : Node
-        Used to ask; nobody else may spin it.
+        Makes the service calls. It must not be in another executor.
     name : str
         The relocalizer's name with its namespace.
+    patience_s : float
+        Time limit of discovery, and of each service call [s].
 
     Raises
     ------
     NotRunningError
-        It does not answer.
+        The relocalizer is not found, or does not respond.
     """
     executor = SingleThreadedExecutor()
     executor.add_node(node)
@@ -115,8 +117,8 @@ def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, li
     deadline = time.monotonic() + patience_s
     while not status.values or not client.services_are_ready():
         if time.monotonic() > deadline:
-            raise NotRunningError(f'{name} is not running: start it, name it with '
-                                  '--relocalizer, or give its --params-file')
+            raise NotRunningError(f'{name} is not running: start it, give its name with '
+                                  '--relocalizer, or its parameters with --params-file')
         executor.spin_once(timeout_sec=_SPIN_S)
     listed = client.list_parameters()
     executor.spin_until_future_complete(listed, patience_s)
@@ -124,26 +126,26 @@ def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, li
     got = client.get_parameters(names)
     executor.spin_until_future_complete(got, patience_s)
     if not names or not got.done():
-        raise NotRunningError(f'{name} does not answer: restart it')
-    return status, [Parameter.from_parameter_msg(ParameterMsg(name=one, value=value))
-                    for one, value in zip(names, got.result().values, strict=True)]
+        raise NotRunningError(f'{name} does not respond: restart it')
+    return status, [Parameter.from_parameter_msg(ParameterMsg(name=parameter, value=value))
+                    for parameter, value in zip(names, got.result().values, strict=True)]
 
 
 def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
-    """Return the parameters in files that ROS gives to a node; later files count more.
+    """Return the parameters that ROS reads from files for a node; later files take precedence.
 
     Parameters
     ----------
     name : str
         Name of the node, with its namespace.
 
-    CliplocError: names the file and what is wrong with it.
+    CliplocError: a file is invalid, or no file has parameters of the node.
     """
     found: dict[str, Any] = {}
     others: list[str] = []
     for file in files:
         for pattern, values in _nodes_of(read_parameter_file(file)):
-            # of the whole name, ** is any number of words, and * is one
+            # ** matches any number of words of the name, * matches one
             words = ['(/[^/]+)*' if word == '**' else '/[^/]+' if word == '*' else
                      f'/{re.escape(word)}' for word in pattern.split('/') if word]
             if re.fullmatch(''.join(words), name):
@@ -151,13 +153,13 @@ def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
             else:
                 others.append(pattern)
     if not found:
-        raise OptionsError(f'{", ".join(map(str, files))}: no parameters of {name}, but of '
+        raise OptionsError(f'{", ".join(map(str, files))}: no parameters of {name}, only of '
                            f'{", ".join(others) or "no node"}; name the node with --relocalizer')
     return [Parameter(name, value=value) for name, value in found.items() if value is not None]
 
 
 def _nodes_of(tree: dict[str, Any], prefix: str = '') -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the nodes of a file, whose namespaces may be nested, and their parameters."""
+    """Yield the name and parameters of each node in a file, including nested namespaces."""
     for key, content in tree.items():
         if key == 'ros__parameters':
             yield prefix, content if isinstance(content, dict) else {}

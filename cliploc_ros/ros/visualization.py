@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Markers for RViz and the debug image, published while something subscribes."""
+"""Markers for RViz and the debug image, published while they have subscribers."""
 
 import array
 import colorsys
@@ -33,7 +33,7 @@ from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg
 
-#: The most landmarks that are shown: with more, RViz draws slowly.
+#: Greatest number of landmarks shown: RViz is slow with more.
 MAX_SHOWN = 5000
 _TEXT_HEIGHT_M = 0.08
 _LINE_WIDTH_M = 0.01
@@ -43,30 +43,31 @@ _KEYFRAMES = ColorRGBA(r=0.0, g=0.59, b=0.53, a=0.9)
 _FRUSTUM_M = 0.12
 _TEXT = (255, 255, 255)
 _RADIUS_PX = 3
-# Lines between more points hide the images.
+# Greatest number of lines between matched points: more would hide the images.
 _MOST_LINES = 20
 _UNMATCHED, _BOX, _ELLIPSE = (255, 255, 255), (86, 180, 233), (230, 159, 0)
-# White text on them has a contrast of 5 and more.
+# White text on these colours has a contrast of 5 or more.
 _ACCEPTED_BAR, _REFUSED_BAR = (0, 114, 178), (176, 70, 0)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _LABEL_CHARS = 40
-# The scale of text, by the width of the image [1/px], and the height of a line of scale 1 [px].
+# Least scale of text, scale per image width [1/px], and height of a line at scale 1 [px].
 _LEAST_SCALE, _SCALE_PER_PX, _LINE_PX = 0.45, 1 / 1400, 44
-# The text of the bar, beside other text, and its lines, at most: a longer verdict is cut.
+# Scale of the bar's text relative to other text, and its greatest number of lines. A longer
+# verdict is cut.
 _BAR_SCALE, _BAR_LINES = 0.8, 2
 
 
 def landmark_markers(landmark_map: LandmarkMap, layer: KeyframeLayer | None = None) -> MarkerArray:
-    """Return an ellipsoid and a text for each landmark, one colour for each class.
+    """Return an ellipsoid and a text for each landmark, coloured by class.
 
-    Several maps get markers in their own coordinate frames. The cameras of keyframes are in the
-    namespace `keyframes`.
+    With several maps, the markers are in the coordinate frame of their map. The cameras of
+    keyframes are in the namespace `keyframes`.
     """
     markers = [Marker(header=Header(frame_id=landmark_map.frame_id), action=Marker.DELETEALL)]
     for part in parts_of(landmark_map):
         markers += _markers_of(part.landmark_map, part.first)
     if layer is not None:
-        shown = range(0, len(layer), -(-len(layer) // MAX_SHOWN))  # of more, every n-th
+        shown = range(0, len(layer), -(-len(layer) // MAX_SHOWN))  # every n-th of a large layer
         markers.append(_line_marker(Header(frame_id=layer.frame_id), 'keyframes', _KEYFRAMES, [
             end for edge in frusta([layer.camera_of(row) for row in shown],
                                    layer.map_from_camera[shown], _FRUSTUM_M) for end in edge]))
@@ -74,7 +75,7 @@ def landmark_markers(landmark_map: LandmarkMap, layer: KeyframeLayer | None = No
 
 
 def _markers_of(landmark_map: LandmarkMap, first: int) -> list[Marker]:
-    """Return the markers of one map, whose numbers begin with the first; at most MAX_SHOWN."""
+    """Return the markers of one map. Their ids start at `first`, and end below MAX_SHOWN."""
     header, markers = Header(frame_id=landmark_map.frame_id), []
     shown = max(0, MAX_SHOWN - first)
     rows = zip(landmark_map.centers[:shown], landmark_map.semi_axes, landmark_map.quats_xyzw,
@@ -97,18 +98,18 @@ def _markers_of(landmark_map: LandmarkMap, first: int) -> list[Marker]:
 
 def match_markers(header: Header, camera_position: NDArray[np.float64],
                   centers: Sequence[NDArray[np.float64]], accepted: bool) -> MarkerArray:
-    """Return lines from a camera to the landmarks matched.
+    """Return lines from a camera to the matched landmarks.
 
     Parameters
     ----------
     header : Header
         Stamp of the image, coordinate frame of the map.
     camera_position : ndarray (3,)
-        [m].
+        Position of the camera in the map [m].
     centers : sequence of ndarray (3,)
         Centres of the landmarks [m].
     accepted : bool
-        Green if so, else red.
+        Draw the lines in green, else in red.
     """
     lines = _line_marker(header, 'matches', _ACCEPTED if accepted else _REFUSED, [
         end for center in centers for end in (camera_position, center)])
@@ -119,7 +120,7 @@ def match_markers(header: Header, camera_position: NDArray[np.float64],
 
 def _line_marker(header: Header, name: str, color: ColorRGBA,
                  ends: Sequence[NDArray[np.float64]]) -> Marker:
-    """Return lines, each between two of the ends (3,)."""
+    """Return lines between successive pairs of end points (3,)."""
     lines = Marker(header=header, ns=name, type=Marker.LINE_LIST, color=color,
                    points=[_point(end) for end in ends])
     lines.pose.orientation.w = 1.0
@@ -128,7 +129,7 @@ def _line_marker(header: Header, name: str, color: ColorRGBA,
 
 
 def class_color(class_id: str) -> ColorRGBA:
-    """Return the colour of a class: always the same, and mostly a different one for each class."""
+    """Return the colour of a class, by a hash: constant, and usually different between classes."""
     hue = zlib.crc32(class_id.encode()) / 2**32
     r, g, b = colorsys.hsv_to_rgb(hue, 0.7, 0.95)
     return ColorRGBA(r=r, g=g, b=b, a=0.6)
@@ -146,19 +147,19 @@ def _point(position: NDArray[np.float64]) -> Point:
 
 def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: KeyframeLayer
                     ) -> NDArray[np.uint8]:
-    """Return the image (h, w, 3) with the keyframe that fits it best to the right of it.
+    """Return the image (h, w, 3) with its best keyframe to the right.
 
-    Points that agree have the same colour in both, and some are joined by lines. If the layer
-    stores no images, only the points in the localized image are drawn.
+    Matched points have the same colour in both, and some are joined by lines. If the layer stores
+    no images, only the points in the localized image are drawn.
 
     Parameters
     ----------
     canvas : ndarray (h, w, 3) uint8
-        The localized image. It is not changed.
+        The localized image. It is not modified.
     seen : RecognizedPlace
-        With one keyframe at least.
+        A place with at least one keyframe.
     layer : KeyframeLayer
-        Layer of the keyframe.
+        The layer that contains the keyframe.
     """
     keyframe = seen.keyframes[0]
     height, width = canvas.shape[:2]
@@ -173,9 +174,9 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
         both = np.concatenate([canvas, cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)],
                               axis=1)
     pixels = np.asarray(layer.pixels[rows]) / PIXEL_SCALE * scale + np.array([width, 0])
-    ours, theirs = (_pixels(some).tolist() for some in (
+    ours, theirs = (_pixels(points).tolist() for points in (
         seen.pixels[own], pixels[seen.rows[own] - rows.start]))
-    # neighbours in a row have similar colours
+    # colour by column: neighbouring points have similar colours
     order = np.argsort(np.argsort(seen.pixels[own, 0], kind='stable'), kind='stable')
     colors = np.full((len(own), 1, 3), 255, dtype=np.uint8)
     colors[:, 0, 0] = 170.0 * order / max(1, len(order))
@@ -194,9 +195,9 @@ def beside_keyframe(canvas: NDArray[np.uint8], seen: RecognizedPlace, layer: Key
 
 def _above_bar(canvas: NDArray[np.uint8], verdict: str, color: tuple[int, int, int]
                ) -> NDArray[np.uint8]:
-    """Return an image (h, w, 3) above a bar with the verdict, which covers none of it."""
+    """Return the image (h, w, 3) with the verdict in a bar below it."""
     scale = _BAR_SCALE * _scale(canvas)
-    verdict = verdict.encode('ascii', 'replace').decode()  # OpenCV has no other characters
+    verdict = verdict.encode('ascii', 'replace').decode()  # OpenCV draws only ASCII
     (width, _), _ = cv2.getTextSize(verdict, _FONT, scale, 1)
     lines = textwrap.wrap(verdict, max(8, len(verdict) * (canvas.shape[1] - 24) // max(1, width)),
                           max_lines=_BAR_LINES, placeholder=' ...', break_long_words=False,
@@ -211,7 +212,7 @@ def _above_bar(canvas: NDArray[np.uint8], verdict: str, color: tuple[int, int, i
 
 @dataclass(frozen=True)
 class SeenImage:
-    """An image (h, w, 3) uint8, red first, its observation, and the map's keyframes."""
+    """An image (h, w, 3) uint8, RGB, its observation, and the map's keyframes."""
 
     image_rgb: NDArray[np.uint8]
     observation: Observation
@@ -220,17 +221,17 @@ class SeenImage:
 
 def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: LandmarkMap,
                      verdict: str) -> NDArray[np.uint8]:
-    """Return the image with every usable box, its depth, and the outlines of matched landmarks.
+    """Return the image with all usable boxes, their depths, and outlines of matched landmarks.
 
-    The best keyframe is to the right of it, if its image is stored. The upper left (h, w) are the
-    image, so boxes and points keep their pixels.
+    The best keyframe is on the right, if its image is stored. The image fills the upper left
+    (h, w), so boxes and points keep their pixel coordinates.
 
     Parameters
     ----------
     found : Relocalization
         Its matches refer to the detections of the image.
     verdict : str
-        Written on a bar below the image; an empty one has no bar.
+        Written on a bar below the image; empty: no bar.
     """
     canvas = np.ascontiguousarray(seen.image_rgb).copy()
     boxes = seen.observation.detections.bboxes_xyxy
@@ -276,17 +277,17 @@ def _similarity(observation: Observation, detection: int, landmark: int) -> str:
 
 
 def _pixels(points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return whole pixels, within the range that OpenCV can draw."""
+    """Round to whole pixels, within the range that OpenCV can draw."""
     return np.clip(np.rint(points), -30_000, 30_000).astype(np.int32)
 
 
 def _write(canvas: NDArray[np.uint8], text: str, at: NDArray[np.int32],
            color: tuple[int, int, int]) -> None:
-    """Write a line with a shadow, inside the image, larger on a larger one."""
+    """Write a line of text with a shadow inside the image, scaled with the image."""
     height, width = canvas.shape[:2]
     place = (int(np.clip(at[0], 0, max(0, width - 10))), int(np.clip(at[1], 12, height)))
-    text = text.encode('ascii', 'replace').decode()  # OpenCV has no other characters
-    # As thick as the text: OpenCV 5 writes thicker text wider.
+    text = text.encode('ascii', 'replace').decode()  # OpenCV draws only ASCII
+    # The shadow is as thick as the text: OpenCV 5 draws thicker text wider.
     shadow, scale = (place[0] + 1, place[1] + 1), _scale(canvas)
     thickness = max(1, round(2 * scale))
     cv2.putText(canvas, text, shadow, _FONT, scale, (0, 0, 0), thickness, cv2.LINE_AA)
@@ -295,12 +296,13 @@ def _write(canvas: NDArray[np.uint8], text: str, at: NDArray[np.int32],
 
 def _write_near(canvas: NDArray[np.uint8], text: str, box: NDArray[np.float64],
                 taken: list[NDArray[np.int32]]) -> None:
-    """Write a line above a box or below it, where it covers no other line; else leave it out."""
+    """Write a line above or below a box, unless it would overlap another line."""
     (width, height), _ = cv2.getTextSize(text, _FONT, _scale(canvas), 1)
     for corner in (box[:2] - (0, 4), box[[0, 3]] + (0, height + 4)):
         left, bottom = _pixels(corner).tolist()
         place = np.array([left, bottom - height, left + width, bottom], dtype=np.int32)
-        if not any((place[:2] < one[2:]).all() and (one[:2] < place[2:]).all() for one in taken):
+        if not any((place[:2] < other[2:]).all() and (other[:2] < place[2:]).all()
+                   for other in taken):
             taken.append(place)
             _write(canvas, text, _pixels(corner), _BOX)
             return
@@ -311,7 +313,7 @@ def _scale(canvas: NDArray[np.uint8]) -> float:
 
 
 def image_to_msg(image_rgb: NDArray[np.uint8], header: Header) -> Image:
-    """Return an image (h, w, 3), red first, as a message."""
+    """Return an RGB image (h, w, 3) as a message."""
     height, width = image_rgb.shape[:2]
     return Image(header=header, height=height, width=width, encoding='rgb8', step=3 * width,
                  data=array.array('B', image_rgb.tobytes()))
@@ -321,7 +323,7 @@ class Visualization:
     """Publishes `~/landmarks`, `~/matches`, `~/hypotheses` and `~/debug_image`."""
 
     def __init__(self, node: Node) -> None:
-        # Subscribers match in one thread, a map is loaded in another.
+        # Subscribers are matched in one thread, maps are loaded in another.
         self._lock = threading.Lock()
         self._map: LandmarkMap | None = None
         self._shown: LandmarkMap | None = None
@@ -340,7 +342,7 @@ class Visualization:
 
     def set_map(self, landmark_map: LandmarkMap | None, layer: KeyframeLayer | None = None
                 ) -> None:
-        """Show another map with its keyframes from now on, or none."""
+        """Show a map with its keyframes from now on, or no map."""
         with self._lock:
             self._map, self._layer = landmark_map, layer
         self._show_map()
@@ -364,12 +366,12 @@ class Visualization:
 
     def show_debug_image(self, header: Header, seen: SeenImage, landmark_map: LandmarkMap,
                          found: Relocalization, verdict: str) -> None:
-        """Publish the image, which has this header, with the matches and the verdict."""
+        """Publish the image with the matches and the verdict. `header` is that of the image."""
         self._debug_image.publish(image_to_msg(
             draw_debug_image(seen, found, landmark_map, verdict), header))
 
     def _show_map(self) -> None:
-        """Publish the map if it is new and has subscribers; it is kept for later subscribers."""
+        """Publish the map if it is new and has subscribers; later subscribers get it, too."""
         with self._lock:
             if self._map is self._shown or self._landmarks.get_subscription_count() == 0:
                 return

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Wake a robot up: request its pose, turning between looks, until it is accepted or time is up.
+"""Wake up a robot: request its pose, turning between requests, until accepted or time is up.
 
-With --watch, do so again whenever the relocalizer finds the robot lost.
+With --watch, repeat this whenever the relocalizer finds the robot lost.
 
-It turns with Nav2's action `spin`, the only part that needs nav2_msgs.
+The robot turns by Nav2's action `spin`, the only part that needs nav2_msgs.
 """
 
 import importlib
@@ -28,13 +28,13 @@ from cliploc_ros.command import Interruption
 from cliploc_ros.ros.answer import Verdict
 from cliploc_ros.ros.running import SILENT_S, RelocalizerStatus
 
-# Nav2's default time limit of a turn, and the further time for its answer [s].
+# Nav2's default time limit of a turn, and the additional time for its result [s].
 _ALLOWANCE_S = 10.0
 _GRACE_S = 3.0
 _STOP_S = 4.0
 _ENDS = {GoalStatus.STATUS_ABORTED: 'aborted', GoalStatus.STATUS_CANCELED: 'cancelled'}
 
-#: Spins the node until a condition holds or a number of seconds is over; returns whether it holds.
+#: Spins the node until a condition holds, or for a number of seconds; returns whether it holds.
 Wait = Callable[[Callable[[], bool], float], bool]
 _SPIN_S = 0.05
 _SERVICE = 'relocalize_fields'
@@ -42,21 +42,21 @@ _SERVICE = 'relocalize_fields'
 _DISCOVERY_S = 2.0
 # The diagnostics report a change within this time.
 _ON_DIAGNOSTICS_S = 1.5
-# A person who waits is told so again after this time.
+# The reason for waiting is printed again after this time.
 _AGAIN_S = 5.0
-# Between looks of a robot that does not turn.
+# Pause between requests if the robot does not turn.
 _PAUSE_S = 1.0
-# Time for an answer to arrive, after the relocalizer's own limit.
+# Additional time for an answer to arrive after the relocalizer's time limit.
 _ON_ITS_WAY_S = 5.0
 
 
 class Turning:
-    """Turns a robot one step at a time, and to the other side after a turn that failed.
+    """Turns a robot step by step; reverses the direction after a failed turn.
 
     Parameters
     ----------
     step_rad : float
-        Positive: counterclockwise. 0: never turn.
+        Angle of a step [rad]. Positive: counterclockwise. 0: never turn.
     """
 
     def __init__(self, node: Node, wait: Wait, step_rad: float) -> None:
@@ -81,21 +81,21 @@ class Turning:
         return ''
 
     def turn(self) -> str:
-        """Turn by a step; return what was done, in words."""
+        """Turn by a step; return a description of the result."""
         step = f'turned by {math.degrees(self._step_rad):.0f} deg'
         problem = self._problem_of(self._action.Goal(
             target_yaw=self._step_rad, time_allowance=Duration(sec=int(_ALLOWANCE_S))))
         if not problem:
             return step
         self._step_rad = -self._step_rad
-        self._wait(lambda: False, _PAUSE_S)  # the next turn would fail as well, at once
+        self._wait(lambda: False, _PAUSE_S)  # an immediate next turn would fail as well
         return f'not {step} ({problem})'
 
     def stop(self) -> None:
-        """Cancel the turn under way, and wait a moment until the server has taken that."""
+        """Cancel the current turn, and wait until the server has accepted that."""
         if self._goal is None:
             return
-        if not self._goal.done():  # not accepted yet, but it may be in a moment
+        if not self._goal.done():  # the server may still accept the goal
             self._wait(self._goal.done, _STOP_S)
         handle = self._goal.result() if self._goal.done() else None
         self._goal = None
@@ -103,7 +103,7 @@ class Turning:
             self._wait(handle.cancel_goal_async().done, _STOP_S)
 
     def _problem_of(self, goal: Any) -> str:
-        """Turn; return why that failed, empty if it did not."""
+        """Turn; return why that failed, empty after success."""
         assert self._client is not None
         end = time.monotonic() + _ALLOWANCE_S + _GRACE_S
         self._goal = self._client.send_goal_async(goal)
@@ -125,13 +125,13 @@ class Turning:
         found, code = outcome.result, int(outcome.result.error_code)
         names = {getattr(type(found), name): name.lower().replace('_', ' ')
                  for name in ('TIMEOUT', 'TF_ERROR', 'COLLISION_AHEAD')}
-        # the field error_msg came with Jazzy
+        # Nav2 before Jazzy has no field error_msg
         words = [*filter(None, [names.get(code), getattr(found, 'error_msg', '')]), f'code {code}']
         return f'{_ENDS.get(outcome.status, "failed")}: {", ".join(words)}'
 
 
 class Outcome(IntEnum):
-    """The end of a wake-up: its exit code."""
+    """The result of a wake-up, as an exit code."""
 
     ACCEPTED = 0
     REFUSED = 1
@@ -139,21 +139,21 @@ class Outcome(IntEnum):
 
 
 class WakeUp(Node):
-    """Requests poses of one relocalizer and prints one line for each look.
+    """Requests poses from one relocalizer and prints one line for each answer.
 
     Parameters
     ----------
     interrupted : Interruption
-        Set by a signal. Python's own KeyboardInterrupt could come right after a goal was sent,
-        and nothing would cancel it.
+        Set by a signal. Python's KeyboardInterrupt could be raised just after a goal was sent, and
+        the goal would not be cancelled.
     relocalizer : str
         Its name, relative to the namespace or absolute.
     timeout_s : float
-        No turn begins later; a look does only after a turn.
+        No turn begins after this time. The request after the last turn may.
     turn_deg : float
-        Turn by this much between looks; 0: do not turn.
+        Angle of the turn between requests; 0: do not turn.
     watch : bool
-        Whether to wait, after an accepted pose, until the robot is lost and stands, and go on.
+        After an accepted pose, wait until the robot is lost and at rest, then start again.
     """
 
     def __init__(self, interrupted: Interruption, relocalizer: str, timeout_s: float,
@@ -171,11 +171,11 @@ class WakeUp(Node):
         self._said: dict[str, tuple[str, float]] = {}
 
     def run(self) -> Outcome:
-        """Look until a pose is accepted or time is up; end a turn under way in any case.
+        """Request until a pose is accepted or time is up, then cancel any turn.
 
-        To watch is to do so again and again, until one of them fails.
+        With `watch`, repeat this until a wake-up fails.
 
-        KeyboardInterrupt: the event is set; no turn is under way.
+        KeyboardInterrupt: the flag was set; the turn was cancelled.
         """
         try:
             while (outcome := self._look_about()) is Outcome.ACCEPTED and self._watches:
@@ -184,7 +184,7 @@ class WakeUp(Node):
                 self._began_at = time.monotonic()
             return outcome
         finally:
-            self._interrupted = Interruption()  # this one is handled
+            self._interrupted = Interruption()  # the first interruption is handled
             self._turning.stop()
 
     def _look_about(self) -> Outcome:
@@ -207,11 +207,11 @@ class WakeUp(Node):
         return _end(Outcome.NOT_READY, f'not ready: {problem}')
 
     def _until_ready(self) -> str:
-        """Wait until the relocalizer can take a request; return what it lacks when time is up."""
+        """Wait until the relocalizer can answer; return its problem if time is up before."""
         while True:
             problem = self._status.problem() if self._client.service_is_ready() else (
-                f'nothing serves {self._service}: start the relocalizer, or name it with '
-                '--relocalizer or a namespace')
+                f'nothing serves {self._service}: start the relocalizer, or give its name with '
+                '--relocalizer or its namespace')
             if self._elapsed_s > _DISCOVERY_S:
                 self._say('waiting', problem, _AGAIN_S)
             if not problem or self._is_time_up:
@@ -219,8 +219,8 @@ class WakeUp(Node):
             self._spin()
 
     def _until_lost(self) -> str:
-        """Wait until the robot is lost and stands; return why that cannot be known."""
-        accepted_at = time.monotonic() + _ON_DIAGNOSTICS_S  # what comes earlier may be older
+        """Wait until the robot is lost and at rest; return the reason if this cannot be known."""
+        accepted_at = time.monotonic() + _ON_DIAGNOSTICS_S  # earlier reports may be outdated
         while True:
             self._spin()
             self._say('waiting', self._status.problem())
@@ -250,10 +250,10 @@ class WakeUp(Node):
         self._client.remove_pending_request(future)
         return Verdict.FAILED, '', self._status.problem() or (
             f'no answer within {time.monotonic() - begun_at:.0f} s: the relocalizer was '
-            'restarted, or the network lost it')
+            'restarted, or the network lost the answer')
 
     def _turn(self) -> str:
-        """Turn before the next look, where that is possible; return what was done."""
+        """Turn before the next request, if possible; return a description of the result."""
         obstacle = self._turning.obstacle()
         self._say('not turning', obstacle)
         return self._rest() if obstacle else f', {self._turning.turn()}'
@@ -271,7 +271,7 @@ class WakeUp(Node):
         return self._elapsed_s > self._timeout_s
 
     def _say(self, topic: str, text: str, again_s: float = math.inf) -> None:
-        """Print a text when it changes, and again after some time."""
+        """Print a text when it changes, and again after `again_s`."""
         said, said_at = self._said.get(topic, ('', -math.inf))
         elapsed_s = self._elapsed_s
         if text == said and elapsed_s - said_at < again_s:
@@ -282,7 +282,7 @@ class WakeUp(Node):
         self._said[topic] = text, elapsed_s
 
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        """Process callbacks until a condition holds, for some time at most."""
+        """Process callbacks until a condition holds, at most for `patience_s`; see Wait."""
         end = time.monotonic() + patience_s
         while not condition():
             if time.monotonic() > end:

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The watch of a running localizer: looks, verdicts and reactions.
+"""The watch of a running localizer: checks of its pose, verdicts and reactions.
 
-A thread of its own waits for frames and transforms; only the look itself runs in the node's
-worker, and none begins while a request is under way. So a watch never delays a request.
+A separate thread waits for frames and transforms. Only the check itself runs in the node's worker,
+and no check begins while a request is being answered. Thus the watch never delays a request.
 """
 
 import threading
@@ -43,22 +43,23 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.units import NS_PER_S
 
-# Looks follow each other at least this far apart [s], and take this share of a core at most.
+# Least time between two checks [s], and greatest share of a core that they may use.
 _LEAST_S, _DUTY = 1.0, 0.1
-# A robot that drove or turned so far since its last look sees something else.
+# After a move [m] or a turn [deg] of this size the camera sees other objects.
 _WAY_M, _TURN_DEG = 1.0, 90.0
 _POLL_S = 0.1
-# A camera at 1 Hz and a detector of a second complete a frame within this time.
+# A camera at 1 Hz and a detector that takes one second complete a frame within this time.
 _FRAME_PATIENCE_S = 5.0
-# A verdict without a look since says no more than that nothing is known.
+# Without a check for this long, the verdict is no longer valid.
 _STALE_S = 10.0
-# Whether a robot rests shows within this time.
+# Longest wait for odometry that shows whether the robot is at rest.
 _REST_PATIENCE_S = 3.0
-# Between requests of a robot that stays lost; the pause doubles each time.
+# Pauses between requests of a robot that stays lost. The pause doubles each time.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 5.0, 160.0
-# Without odometry, a shown pose holds for this long (a guess): a robot drives half a metre in it.
+# Without odometry, the localizer's pose is valid for this time, in which a robot drives half a
+# metre. Not measured.
 _UNLINKED_NS = NS_PER_S // 2
-# A localizer that hears scans shows its pose more often than this (AMCL: each .25 m).
+# A localizer that receives scans publishes its pose at shorter distances (AMCL: every 0.25 m).
 _SILENT_WAY_M = 2.0
 
 
@@ -68,18 +69,18 @@ class _Known:
 
     state: WatchState = WatchState.UNCERTAIN
     reason: str = 'no look yet'
-    report: WatchReport | None = None  #: Report of the last look, while it holds
-    looked_at: float = 0.0  #: When that was (monotonic clock) [s]
-    problem: str = ''  #: The cause that prevents looks, and what to do
+    report: WatchReport | None = None  #: Report of the last check, while it is valid
+    looked_at: float = 0.0  #: Time of that check (monotonic clock) [s]
+    problem: str = ''  #: Why no check is possible, and what to do
 
 
 class Watcher:
-    """Looks whether the localizer's pose is right, while the node is active and `watch` is on.
+    """Checks the localizer's pose periodically while the node is active and `watch` is on.
 
     Parameters
     ----------
     frames : CameraRig
-        It looks with the first camera.
+        Only the first camera is used.
     relocalize : callable
         Requests a relocalization as a client does, and returns the answer.
     """
@@ -96,13 +97,13 @@ class Watcher:
         self._known = _Known()
         self._stopped = threading.Event()
         self._stopped.set()
-        # Looks at a pose from before this number changed do not count.
+        # Checks that began before this number changed are discarded.
         self._age = 0
         self._cost_s = 0.0
-        # State of a robot that is lost, and whether it stands.
+        # Reaction to a lost robot, and whether it is at rest.
         self._reaction, self._is_at_rest = '', False
         self._rest_stamp: Time | None = None
-        # The image of the look that began last, and whether the localizer had a pose at one.
+        # Stamp of the newest checked image, and whether the localizer ever had a pose.
         self._image_stamp, self._had_pose = Time(), False
         self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if self.is_on:
@@ -113,7 +114,7 @@ class Watcher:
             self._state = node.create_publisher(String, '~/localization_state', qos.LATCHED)
 
     def open(self) -> None:
-        """Begin to watch."""
+        """Start the watch."""
         if self.is_on:
             self._stopped = threading.Event()
             self._say(_Known())
@@ -121,29 +122,29 @@ class Watcher:
                              daemon=True).start()
 
     def close(self) -> None:
-        """Watch no longer; a look under way has no effect."""
+        """Stop the watch; the result of a running check is discarded."""
         if self.is_on and not self._stopped.is_set():
             self.release()
             self._drop('the node was deactivated')
             self._pose.forget()
 
     def release(self) -> None:
-        """End the thread: the process ends."""
+        """Let the thread end, because the process is ending."""
         self._stopped.set()
 
     def forget(self) -> None:
-        """Forget all looks and poses: time jumped."""
+        """Forget all checks and poses: time jumped."""
         if self.is_on:
             self._pose.forget()
             self._drop('time jumped')
 
     def start_over(self) -> None:
-        """Forget all looks: the localizer was given another pose."""
+        """Forget all checks: the localizer was given another pose."""
         if self.is_on:
             self._drop('the localizer was given another pose')
 
     def examine(self, health: Health) -> None:
-        """Report the verdict and the cause that prevents looks."""
+        """Report the verdict, and why checks are not possible."""
         if not self.is_on:
             return
         known = self._known
@@ -169,7 +170,7 @@ class Watcher:
     # ---- the thread -----------------------------------------------------------------------------
 
     def _run(self, stopped: threading.Event) -> None:
-        """Look again and again until the event is set."""
+        """Check periodically until the event is set."""
         while not stopped.is_set():
             begun_at, stamp = time.monotonic(), None
             try:
@@ -183,7 +184,7 @@ class Watcher:
             except StoppedError:
                 return
             except (NoFrameError, NoTransformError, LaterError, TimeJumpError, TimeUpError
-                    ) as error:  # the next look may do
+                    ) as error:  # the next check may succeed
                 self._miss(stopped, str(error), time.monotonic() - _STALE_S)
             except CliplocError as error:
                 self._miss(stopped, str(error))
@@ -193,7 +194,7 @@ class Watcher:
             self._rest(stopped, begun_at, stamp)
 
     def _rest(self, stopped: threading.Event, begun_at: float, stamp: Time | None) -> None:
-        """Wait until the next look is due."""
+        """Wait until the next check is due."""
         earliest = begun_at + max(_LEAST_S, self._cost_s / _DUTY)
         latest = max(earliest, begun_at + self._node.settings.values.watch_period_s)
         while (now := time.monotonic()) < latest and not stopped.wait(min(_POLL_S, latest - now)):
@@ -203,7 +204,7 @@ class Watcher:
                 return
 
     def _look(self, stopped: threading.Event) -> Time | None:
-        """Compare one frame with the localizer's pose; return its stamp, None without a look."""
+        """Check the localizer's pose with one frame; return its stamp, None without a check."""
         begun_at, age = time.monotonic(), self._age
         frame = self._frames.next_frame(begun_at, begun_at + _FRAME_PATIENCE_S, 0.0,
                                         cameras=1)
@@ -215,7 +216,7 @@ class Watcher:
         image = frame.image.header
         self._image_stamp = image.stamp
         self._jumps.check(image.stamp, frame.received_at)
-        # Odometry tells looks apart, whether or not requests fuse frames by it.
+        # The watch needs odometry even if fuse_frames is 1.
         parameters = replace(self._node.settings.snapshot().of_camera(frame.camera),
                              fuse_frames=MAX_FRAMES)
         state = self._robot.at(image, parameters, depth_frame=frame.depth_frame)
@@ -230,8 +231,8 @@ class Watcher:
 
     def _score(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                pose: tuple[str, NDArray[np.float64]], age: int) -> WatchReport | None:
-        """Look, in the worker's thread; None if the pose does not count any more."""
-        localizer = self._pipeline.localizer  # that of now: the map may be another one
+        """Check a pose, in the worker's thread; None if it is outdated meanwhile."""
+        localizer = self._pipeline.localizer  # a map may have been loaded meanwhile
         if localizer is None or age != self._age:
             return None
         begun_s = time.thread_time()
@@ -244,7 +245,7 @@ class Watcher:
 
     def _say(self, known: _Known, stopped: threading.Event | None = None, age: int | None = None
              ) -> None:
-        """Publish a verdict, unless the watch ended or the pose changed meanwhile."""
+        """Publish a verdict, unless the watch was stopped or the pose changed meanwhile."""
         with self._lock:
             if (stopped is not None and stopped.is_set()) or age not in (None, self._age):
                 return
@@ -264,16 +265,16 @@ class Watcher:
             self._node.diagnostics.publish()
 
     def _miss(self, stopped: threading.Event, problem: str, since: float = float('inf')) -> None:
-        """Report a problem that prevents looks, unless there was a look after `since`."""
+        """Report why no check is possible, unless there was a check after `since`."""
         known = self._known
         if known.report is None or known.looked_at < since:
             self._say(_Known(reason=problem, problem=problem), stopped)
 
     def _drop(self, why: str) -> None:
-        """Forget all looks."""
+        """Forget all checks."""
         with self._lock:
             self._age += 1
-        self._say(_Known(reason=f'{why}: no look since'))
+        self._say(_Known(reason=f'{why}: no check since'))
 
         def forget() -> None:
             if (localizer := self._pipeline.localizer) is not None:
@@ -284,14 +285,14 @@ class Watcher:
     # ---- what follows ---------------------------------------------------------------------------
 
     def _react(self, stopped: threading.Event, stamp: Time | None) -> None:
-        """Relocalize a lost robot that stands, where that is wanted, and not again and again."""
+        """Relocalize a lost robot at rest if on_lost asks for it, at increasing intervals."""
         if self._known.state is not WatchState.LOST or stamp is None:
             self._rest_stamp = None
             return
         self._relocalize_at_rest(stopped, stamp, 'lost')
 
     def _wake_up(self, stopped: threading.Event) -> None:
-        """Relocalize for a localizer that started again: it has no pose, and had one before."""
+        """Relocalize after a restart of the localizer: it has no pose, but had one before."""
         is_wanted = self._node.settings.values.on_lost != 'report' and self._had_pose
         if is_wanted and not self._handoff.missing():
             self._relocalize_at_rest(stopped, self._image_stamp, 'the localizer has no pose')
@@ -304,9 +305,9 @@ class Watcher:
             return
         left_s = self._next_request_at - time.monotonic()
         if parameters.on_lost == 'report' or stopped.is_set():
-            self._reaction = 'the robot stands'
+            self._reaction = 'the robot is at rest'
         elif left_s > 0.0:
-            self._reaction = f'the robot stands; next request in {left_s:.0f} s'
+            self._reaction = f'the robot is at rest; next request in {left_s:.0f} s'
         else:
             self._node.get_logger().warning(f'watch: {why}, and at rest: relocalizing')
             answer = self._relocalize()
@@ -315,15 +316,16 @@ class Watcher:
             self._reaction = answer.message
 
     def _why_not_at_rest(self, parameters: RelocalizerParameters, stamp: Time) -> str:
-        """Return why the robot may be moving; empty if odometry shows that it stands.
+        """Return why the robot may be moving; empty if odometry shows that it is at rest.
 
-        It stands at two looks, and has not moved between: one that turns round seems to stand for
-        a moment.
+        It must be at rest at two checks, and not have moved in between: a robot that reverses
+        stops for a moment.
         """
         since, self._rest_stamp = self._rest_stamp, None
         odometry = self._robot.odometry
         if not odometry.is_published:
-            return f'nobody publishes {odometry.topic}: nothing tells whether the robot stands'
+            return (f'nobody publishes {odometry.topic}: it is unknown whether the robot is at '
+                    'rest; publish odom')
         try:
             self._handoff.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s,
                                      time.monotonic() + _REST_PATIENCE_S)
@@ -341,15 +343,15 @@ class NoLocalizerPoseError(CliplocError):
 
 
 class LaterError(NoLocalizerPoseError):
-    """The next pose of the localizer may do."""
+    """The localizer's pose cannot be used for this image; its next pose may be usable."""
 
 
 class PoselessError(NoLocalizerPoseError):
-    """The localizer shows no pose, as one that has just started."""
+    """The localizer publishes no pose, as after its start."""
 
 
 class _Anchor(NamedTuple):
-    """Odometry's coordinate frame in the map (4, 4), by the pose that was shown at a stamp."""
+    """Pose (4, 4) of odometry's coordinate frame in the map, from one pose of the localizer."""
 
     shown_ns: int
     run: int
@@ -358,9 +360,11 @@ class _Anchor(NamedTuple):
 
 
 class LocalizerPose:
-    """Knows the localizer's pose by tf2, or by the topic localizer_pose and odometry since.
+    """The localizer's pose at the stamp of an image.
 
-    All methods but `hear` and `forget` run in one thread.
+    It comes from tf2, or from the topic localizer_pose and the odometry since.
+
+    All methods except `hear` and `forget` run in one thread.
     """
 
     def __init__(self, node: Node, robot: RobotStateSource) -> None:
@@ -370,24 +374,24 @@ class LocalizerPose:
         self.forget()
 
     def forget(self) -> None:
-        """Forget what was heard: time jumped, or the node is inactive."""
+        """Forget all poses: time jumped, or the node is inactive."""
         self._shown: PoseWithCovarianceStamped | None = None
-        self._shown_by: bytes | None = None  # what identifies the publisher; None: until a look
+        self._shown_by: bytes | None = None  # GID of the publisher; None: unknown
         self._anchor: _Anchor | None = None
 
     def hear(self, shown: PoseWithCovarianceStamped) -> None:
-        """Take in a pose that the localizer shows."""
+        """Store a pose that the localizer published."""
         publishers = self._node.get_publishers_info_by_topic(self._topic) if self._topic else []
         self._shown_by = bytes(publishers[0].endpoint_gid) if len(publishers) == 1 else None
         self._shown = shown
 
     def at(self, image: Header, state: RobotState, parameters: RelocalizerParameters,
            frame_ids: Sequence[str]) -> tuple[str, NDArray[np.float64]]:
-        """Return the camera's pose (4, 4) at the stamp of an image, and the map it is in.
+        """Return the frame_id of a map, and the camera's pose (4, 4) in it, for an image.
 
-        `state` is the robot's at that stamp, `frame_ids` are those of the maps.
+        `state` is the robot's state at the image's stamp, `frame_ids` are those of the maps.
 
-        NoLocalizerPoseError: there is none, or it is invalid. LaterError: it is too old.
+        NoLocalizerPoseError: there is no pose, or it is invalid. LaterError: it is too old.
         """
         frame_id, pose = self._by_tf(image, state, parameters, frame_ids) \
             if parameters.watch == 'tf' else self._by_topic(image, state, parameters)
@@ -419,19 +423,19 @@ class LocalizerPose:
         publishers = self._node.get_publishers_info_by_topic(topic)
         if not publishers:
             raise NoLocalizerPoseError(f'nobody publishes {topic}: start the localizer (AMCL), or '
-                                       'name the topic of its pose by localizer_pose')
+                                       'set localizer_pose to the topic of its pose')
         if len(publishers) > 1:
-            names = ', '.join(sorted(one.node_name for one in publishers))
+            names = ', '.join(sorted(publisher.node_name for publisher in publishers))
             raise NoLocalizerPoseError(f'{len(publishers)} publishers of {topic} ({names}): stop '
                                        'all but one')
         publisher = bytes(publishers[0].endpoint_gid)
         self._shown_by = self._shown_by or publisher
         if self._shown_by != publisher:
-            self.forget()  # another process showed it; this one has no pose until it shows one
+            self.forget()  # the localizer was restarted and has not published a pose yet
         shown = self._shown
         if shown is None:
-            raise PoselessError(f'no pose heard on {topic} yet: AMCL shows one once the robot '
-                                'drives; watch: tf need not wait')
+            raise PoselessError(f'no pose on {topic} yet: AMCL publishes one when the robot '
+                                'drives; with watch: tf it is not needed')
         pose, place = _pose_of(shown, topic), state.place
         shown_ns, frame_id = stamp_ns(shown.header.stamp), shown.header.frame_id.lstrip('/')
         if place is None:
@@ -439,25 +443,25 @@ class LocalizerPose:
             if abs(since_ns) > _UNLINKED_NS:
                 raise NoLocalizerPoseError(
                     f'{topic} is {since_ns / NS_PER_S:.1f} s older than the image, and odom does '
-                    'not tell the way since: publish odom')
+                    'not cover the time since: publish odom')
             return frame_id, pose @ invert_transform(state.camera_from_base)
         anchor = self._anchored(shown, pose, image, place, parameters, topic)
         if place.way_m - anchor.way_m > _SILENT_WAY_M:
             raise NoLocalizerPoseError(
-                f'{topic} is silent for {place.way_m - anchor.way_m:.1f} m of way: see whether '
-                'the localizer is active and hears scans')
+                f'no message on {topic} for {place.way_m - anchor.way_m:.1f} m of driving: check '
+                'that the localizer is active and receives scans')
         return frame_id, anchor.map_from_odom @ place.odom_from_frame
 
     def _anchored(self, shown: PoseWithCovarianceStamped, pose: NDArray[np.float64],
                   image: Header, place: OdometryPlace, parameters: RelocalizerParameters,
                   topic: str) -> _Anchor:
-        """Return odometry's coordinate frame in the map, by the newest pose that was shown."""
+        """Return the pose of odometry's frame in the map, by the localizer's newest pose."""
         shown_ns, anchor = stamp_ns(shown.header.stamp), self._anchor
         if anchor is None or (anchor.shown_ns, anchor.run) != (shown_ns, place.run):
             then = self._robot.at(Header(stamp=shown.header.stamp, frame_id=image.frame_id),
                                   parameters)
             if then.place is None or then.place.run != place.run:
-                raise LaterError(f'odom does not tell the way since {topic} was published: wait '
+                raise LaterError(f'odom does not cover the time since {topic} was published: wait '
                                  'for the next pose')
             map_from_camera = pose @ invert_transform(then.camera_from_base)
             anchor = self._anchor = _Anchor(
@@ -467,12 +471,12 @@ class LocalizerPose:
 
 
 def _pose_of(shown: PoseWithCovarianceStamped, topic: str) -> NDArray[np.float64]:
-    """Return a shown pose (4, 4). NoLocalizerPoseError: it is invalid."""
+    """Return a pose of the localizer (4, 4). NoLocalizerPoseError: it is invalid."""
     if why := stamp_problem(shown.header.stamp):
         raise NoLocalizerPoseError(f'the stamp of {topic} {why}: the localizer '
                                    'must stamp its pose')
     pose = pose_from_msg(shown.pose.pose)
     if pose is None:
-        raise NoLocalizerPoseError(f'{topic} shows a pose with NaN or a quaternion that is not '
-                                   "of length 1: see the localizer's log")
+        raise NoLocalizerPoseError(f'the pose on {topic} has NaN or a quaternion that is not of '
+                                   "unit length: see the localizer's log")
     return pose

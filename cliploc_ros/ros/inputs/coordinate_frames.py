@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Transforms between coordinate frames: the camera's mount by parameter, the others by tf2."""
+"""Transforms: the camera's mount from parameters or tf2, all others from tf2."""
 
 from typing import TYPE_CHECKING
 
@@ -23,10 +23,10 @@ class NoTransformError(CliplocError):
 
 
 class CoordinateFrames:
-    """Knows how coordinate frames lie to each other at the stamp of an image.
+    """Looks up transforms between coordinate frames at the stamp of an image.
 
-    tf2_ros is imported when the first transform is needed: a mount given as a parameter works
-    without it.
+    tf2_ros is imported when the first transform is needed. It is not needed if the mount is given
+    as a parameter.
     """
 
     def __init__(self, node: Node) -> None:
@@ -34,7 +34,7 @@ class CoordinateFrames:
         self._buffer: TransformBuffer | None = None
 
     def open(self) -> 'TransformBuffer':
-        """Listen to transforms from now on, so that those of the first image are known.
+        """Subscribe to transforms, so that they are known when the first image arrives.
 
         NoTransformError: tf2_ros is not installed.
         """
@@ -49,31 +49,31 @@ class CoordinateFrames:
         return buffer
 
     def close(self) -> None:
-        """Stop listening, and forget all transforms."""
+        """Unsubscribe, and forget all transforms."""
         buffer, self._buffer = self._buffer, None
         if buffer is not None:
             buffer.close()
 
     def forget(self) -> None:
-        """Forget all transforms but the static ones: time jumped."""
+        """Forget all transforms except static ones: time jumped."""
         buffer = self._buffer
         if buffer is not None:
             buffer.clear()
 
     def camera_from_base(self, base_frame: str, mount: list[float], camera_frame: str,
                          stamp: Time, timeout_s: float) -> NDArray[np.float64]:
-        """Return the pose (4, 4) of the coordinate frame to publish, seen from the camera.
+        """Return camera_from_base (4, 4).
 
         Parameters
         ----------
         base_frame : str
-            Empty: the camera itself.
+            Empty: the camera's own frame, for which the result is the identity.
         mount : list of float
-            base_from_camera as x, y, z [m] and quaternion x, y, z, w; all zeros: ask tf2.
+            base_from_camera as x, y, z [m] and quaternion x, y, z, w; all zeros: use tf2.
         camera_frame, stamp
-            Of the image: the mount may move.
+            Coordinate frame and stamp of the image. The mount may move.
         timeout_s : float
-            How long to wait for tf2 [s].
+            Longest wait for tf2 [s].
 
         Raises
         ------
@@ -89,9 +89,9 @@ class CoordinateFrames:
 
     def lookup(self, target_frame: str, source_frame: str, stamp: Time, timeout_s: float,
                remedy: str = 'set base_from_camera') -> NDArray[np.float64]:
-        """Return target_from_source (4, 4) by tf2 at a stamp, which may take `timeout_s`.
+        """Return target_from_source (4, 4) at a stamp from tf2; wait for it up to `timeout_s`.
 
-        The error says to publish it, or `remedy`.
+        The error message proposes to publish the transform, or `remedy`.
 
         NoTransformError: tf2 is not installed or has no such transform in time.
         """
@@ -99,7 +99,7 @@ class CoordinateFrames:
         try:
             found = buffer.lookup_transform(target_frame, source_frame, RclTime.from_msg(stamp),
                                             Duration(seconds=timeout_s)).transform
-        except Exception as error:  # tf2 has a type for each cause
+        except Exception as error:  # tf2 raises a different type for each cause
             raise NoTransformError(
                 f"no transform from '{source_frame}' to '{target_frame}': {error}; publish it, or "
                 f'{remedy}') from error

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of one camera from the wire: image, camera_info and detections of one stamp."""
+"""Frames of one camera: image, camera_info and detections with the same stamp."""
 
 import math
 import threading
@@ -25,20 +25,20 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
 # Messages that may wait for their counterparts: ten seconds of 30 Hz VGA images for a slow
-# detector, and every n-th of larger ones.
+# detector. Of larger images, every n-th is kept.
 _MAX_WAITING = 2000
 _MAX_IMAGE_BYTES = 256 * 2**20
 _MAX_DETECTIONS_BYTES = 16 * 2**20
 # Four seconds of 30 Hz VGA depth.
 _MAX_DEPTH_BYTES = 72 * 2**20
-# Topics that a frame may lack.
+# Optional topics of a frame.
 _OF_DEPTH = ('depth', 'depth_camera_info')
-# A guess at the memory of one detection in Python.
+# Memory of one detection in Python, estimated.
 _DETECTION_BYTES = 2000
-# Advice about stamps.
-_STAMPING = {'image': 'the driver of the camera must stamp each when it is taken',
+# Remedies for invalid stamps.
+_STAMPING = {'image': 'the driver of the camera must stamp each image when it is taken',
              'detections': "the detector must copy the image's header"}
-# Bytes of an image that tell it from others.
+# Number of bytes of an image that identify it.
 _SAMPLE = 4096
 
 
@@ -53,44 +53,44 @@ class Frame:
     image: Image | CompressedImage
     camera_info: CameraInfo
     detections: Detection2DArray
-    #: When the image arrived, and when its detections did (monotonic clock) [s].
+    #: When the image arrived, and when its detections arrived (monotonic clock) [s].
     received_at: float
     detected_at: float
-    #: Depth of about the same time; None if there is none
+    #: Depth within depth_tolerance_s of the image; None without depth
     depth: Image | CompressedImage | None = None
     depth_camera_info: CameraInfo | None = None  #: For unregistered depth
-    camera: str = ''  #: Name of its camera; empty for the only one
-    beside: tuple['Frame', ...] = ()  #: Those of other cameras at this instant
-    left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame of this instant
-    image_topic: str = ''  #: Resolved name of the topic of the image
+    camera: str = ''  #: Name of the camera; empty for a single camera
+    beside: tuple['Frame', ...] = ()  #: Frames of other cameras at this instant
+    left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame at this instant
+    image_topic: str = ''  #: Resolved name of the image topic
 
     @property
     def stamp_ns(self) -> int:
-        """Return the stamp of its image [ns]."""
+        """Return the stamp of the image [ns]."""
         return stamp_ns(self.image.header.stamp)
 
     @property
     def depth_frame(self) -> str:
-        """Return the coordinate frame of its depth; empty without depth."""
+        """Return the coordinate frame of the depth image; empty without depth."""
         return '' if self.depth is None else str(self.depth.header.frame_id)
 
 
 class FrameSource:
-    """Subscribes while a frame is wanted and a moment longer, and to nothing in between.
+    """Subscribes to the topics of a camera only while a frame is wanted.
 
-    Images are expensive, and the detector rests while nobody subscribes to its detections.
+    Images are expensive, and the detector is idle while nobody subscribes to its detections.
 
     Parameters
     ----------
     linger_s : float
-        How long to stay subscribed after the last frame was wanted [s]; inf: for as long as the
+        How long to stay subscribed after the last request for a frame [s]; inf: as long as the
         source is open.
     on_frame : callable
         Called with each complete frame in the executor's thread.
     camera : str
-        Name of the camera, and the namespace of its topics.
+        Name of the camera, which is the namespace of its topics.
     changed : Condition, optional
-        Notified when the source is closed; several sources may share it.
+        Notified when the source is closed. Several sources may share it.
     """
 
     def __init__(self, node: Node, parameters: RelocalizerParameters, linger_s: float,
@@ -111,7 +111,7 @@ class FrameSource:
         self.topics = {name: of_camera(camera, topic) for name, topic in topics.items()}
         #: The newest message of each topic and its arrival (monotonic clock) [s]
         self.heard: dict[str, tuple[Any, float]] = {}
-        #: Delay of the newest image after its stamp, and the delay nearest to 0 so far [s]
+        #: Delay of the newest image after its stamp, and the delay closest to 0 of all images [s]
         self.lag_s, self.nearest_lag_s = math.nan, math.inf
         self._depth_tolerance_ns = round(parameters.depth_tolerance_s * NS_PER_S)
         self._depths: deque[Image | CompressedImage] = deque()
@@ -126,7 +126,8 @@ class FrameSource:
         self._changed = changed or threading.Condition()
         self._subscriptions: list[qos.AdaptiveSubscription] = []
         self._subscribed_at = 0.0
-        # Until when it is wanted (monotonic clock) [s]: by those who wait, and after them.
+        # How long to stay subscribed (monotonic clock) [s]: deadlines of waiting callers, and the
+        # end of the time after the last caller.
         self._deadlines: list[float] = []
         self._wanted_until = 0.0
         self._rates = Rates()
@@ -138,9 +139,9 @@ class FrameSource:
         return self._resolved('image')
 
     def open(self) -> None:
-        """Accept calls of `want`.
+        """Allow calls of `want`.
 
-        OptionsError: the type of the detections is not installed.
+        OptionsError: the message type of the detections is not installed.
         """
         with self._changed:
             self._detections = detection_type(self._package)
@@ -150,7 +151,7 @@ class FrameSource:
                 self._subscribe()
 
     def close(self, reason: str) -> None:
-        """Unsubscribe; from now on `want` raises StoppedError with this reason."""
+        """Unsubscribe. From now on `want` raises StoppedError with this reason."""
         with self._changed:
             self._closed = reason
             self._deadlines.clear()
@@ -158,14 +159,14 @@ class FrameSource:
             self._changed.notify_all()
 
     def forget(self) -> None:
-        """Drop the messages received so far."""
+        """Drop all received messages."""
         with self._changed:
             self._drop()
             for stamps in self._stamps.values():
                 stamps.clear()
 
     def want(self, deadline: float) -> None:
-        """Subscribe until a deadline (monotonic clock) [s]; want_no_more ends it.
+        """Subscribe until a deadline (monotonic clock) [s], or until want_no_more.
 
         The caller holds the condition. StoppedError: the source was closed.
         """
@@ -175,10 +176,13 @@ class FrameSource:
         self._subscribe()
 
     def want_no_more(self, deadline: float, linger_s: float | None = None) -> None:
-        """Unsubscribe in a moment, unless others wait. StoppedError: the source was closed."""
+        """Unsubscribe after `linger_s`, by default that of the source, unless others wait.
+
+        StoppedError: the source was closed.
+        """
         if self._closed:
             raise StoppedError(self._closed)
-        if deadline in self._deadlines:  # not from before it was closed
+        if deadline in self._deadlines:  # it is missing if the source was reopened meanwhile
             self._deadlines.remove(deadline)
         linger_s = self._linger_s if linger_s is None else linger_s
         self._wanted_until = max(self._wanted_until, time.monotonic() + linger_s)
@@ -186,7 +190,7 @@ class FrameSource:
             self.rest()
 
     def rest(self) -> bool:
-        """Unsubscribe if no frame has been wanted for a while; return whether it subscribes.
+        """Unsubscribe if no frame is wanted any more; return whether the source is subscribed.
 
         The caller holds the condition.
         """
@@ -197,23 +201,23 @@ class FrameSource:
 
     @property
     def is_closed(self) -> bool:
-        """Return whether nobody may wait for a frame."""
+        """Return whether the source is closed."""
         return bool(self._closed)
 
     def missing(self) -> list[str]:
-        """Return for each input that nothing publishes a line that says what to do."""
+        """Return a message with the remedy for each input without a publisher."""
         return [self._silence(name) for name in self.topics if name not in _OF_DEPTH
                 and not self._node.count_publishers(self._resolved(name))]
 
     def examine(self, health: Health, stale_after_s: float) -> None:
-        """Report missing inputs, rates, and waiting or dropped messages."""
+        """Report missing inputs, rates, and numbers of waiting and dropped messages."""
         now = time.monotonic()
         with self._changed:
             for name in self.topics.keys() - {'depth_camera_info'}:
                 silent_s = now - max(self._heard_at(name), self._subscribed_at)
                 nobody = not self._node.count_publishers(self._resolved(name))
                 if nobody or (self._subscriptions and silent_s > stale_after_s):
-                    # Without intrinsics there is never a pose; images and detections may pause.
+                    # Without camera_info no pose is possible; images and detections may pause.
                     report = health.fail if name == 'camera_info' else health.warn
                     report(self._silence(name) if nobody else
                            f'no {name} on {self._resolved(name)} for {silent_s:.1f} s')
@@ -228,13 +232,16 @@ class FrameSource:
                 'queue age [s]': f'{now - oldest[1] if oldest else 0.0:.2f}'}
 
     def awaits_detections(self, stamp_ns: int, tolerance_s: float) -> bool:
-        """Return whether an image near a stamp waits for its detections; holds the condition."""
+        """Return whether an image near a stamp waits for its detections.
+
+        The caller holds the condition.
+        """
         return self._pairing.waits_near('image', stamp_ns, tolerance_s * NS_PER_S)
 
     def _subscribe(self) -> None:
         if len(self._subscriptions) == len(self.topics):
             return
-        self._unsubscribe()  # what a failed attempt left behind
+        self._unsubscribe()  # remove subscriptions of a failed attempt
         self._subscribed_at = time.monotonic()
         of_topics = {'image': (self._image_type, qos.IMAGE),
                      'camera_info': (CameraInfo, qos.CAMERA_INFO),
@@ -253,7 +260,7 @@ class FrameSource:
         self._drop()
 
     def _drop(self) -> None:
-        """Drop the messages received so far."""
+        """Drop all received messages."""
         self._pairing.clear()
         self._depths.clear()
         self._unsure = self._static_info = None
@@ -262,7 +269,7 @@ class FrameSource:
                        for name in self.heard.keys() & {'image', 'depth'}}
 
     def _receive(self, name: str, msg: Any) -> None:
-        """Take one message, and pass on the frame that it completes."""
+        """Store a message, and call on_frame with the frame that it completes."""
         with self._changed:
             if not self._subscriptions:
                 return
@@ -278,10 +285,10 @@ class FrameSource:
             self._on_frame(frame)
 
     def _keep_depth(self, msg: Image | CompressedImage) -> None:
-        """Keep depth images as long as images wait; of those that do not fit, each n-th."""
+        """Keep depth images as long as images wait; if memory is short, every n-th."""
         self._depths.append(msg)
         oldest = self._pairing.oldest('image')
-        # with no image that waits, the next one is about as new as this
+        # if no image waits, the next image will have about the stamp of this depth image
         useful_ns = (stamp_ns(msg.header.stamp) if oldest is None
                      else stamp_ns(oldest[0].header.stamp)) - self._depth_tolerance_ns
         while len(self._depths) > 1 and sum(
@@ -291,12 +298,12 @@ class FrameSource:
                 range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
 
     def _completed(self, name: str, msg: Any, received_at: float) -> Frame | None:
-        """Return the frame that a message completes, once its stamps are sure; None before."""
+        """Return the frame that a message completes, once its stamps are reliable; else None."""
         at_ns = stamp_ns(msg.header.stamp)
         size = {'image': lambda: len(msg.data), 'camera_info': lambda: 1000,
                 'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
         if name == 'camera_info':
-            # without a stamp it holds for all images
+            # camera_info without a stamp is valid for all images
             self._static_info = msg if stamp_problem(msg.header.stamp) else None
             if self._static_info is not None:
                 return None
@@ -314,11 +321,11 @@ class FrameSource:
                 max(image_at, detected_at), min(
                     (depth for depth in self._depths
                      if abs(stamp_ns(depth.header.stamp) - at_ns) <= self._depth_tolerance_ns),
-                    key=lambda one: abs(stamp_ns(one.header.stamp) - at_ns), default=None),
+                    key=lambda depth: abs(stamp_ns(depth.header.stamp) - at_ns), default=None),
                 self.heard.get('depth_camera_info', (None, 0.0))[0], self._camera,
                 image_topic=self.image_topic)
         frame = self._unsure
-        # a single stamp may be that of the next images, too
+        # the next images may have the same stamp; wait until stamps are known to differ
         if frame is None or not (self._stamps['image'].are_own or all(
                 stamp.is_repeated(frame.stamp_ns) for stamp in self._stamps.values())):
             return None
@@ -326,7 +333,7 @@ class FrameSource:
         return frame
 
     def _is_named(self, name: str, msg: Any, received_at: float) -> bool:
-        """Return whether an image or detections have a stamp of their own."""
+        """Return whether the stamp of an image, or of detections, is unique."""
         if name == 'image':
             self.lag_s = (self._node.get_clock().now().nanoseconds
                           - stamp_ns(msg.header.stamp)) / NS_PER_S
@@ -340,48 +347,48 @@ class FrameSource:
              for box in boxes]).tobytes(), received_at)
 
     def _stamp_problems(self) -> list[str]:
-        """Return the fault of the stamps of images and detections, and the remedy."""
+        """Return the faults of the stamps of images and detections, with remedies."""
         return [f'the stamp of the {"images" if name == "image" else name} on '
                 f'{self._resolved(name)} {stamps.problem}: {_STAMPING[name]}'
                 for name, stamps in self._stamps.items() if stamps.problem]
 
     def unheard(self, since: float) -> dict[str, str]:
-        """Return the inputs that were silent since a moment of the monotonic clock, and why."""
+        """Return the inputs without a message since a time (monotonic clock), and why."""
         return {name: self._silence(name) for name in self.topics
                 if name not in _OF_DEPTH and self._heard_at(name) < since}
 
     def why_none(self, since: float) -> str:
-        """Return in words the inputs that were missing since a moment of the monotonic clock."""
+        """Return why no frame was completed since a time (monotonic clock)."""
         if missing := self.unheard(since):
             return '; '.join(missing.values())
         if problems := self._stamp_problems():
             return '; '.join(problems)
         if self._unsure is not None:
-            return (f'too few images on {self.image_topic} to see whether each has its own stamp: '
+            return (f'too few images on {self.image_topic} to check that their stamps differ: '
                     'raise its rate, or timeout_s')
         if self._pairing.outrun:
-            return (f'detections come {self._pairing.outrun} images late, and memory holds '
-                    f'{_MAX_IMAGE_BYTES // 2**20} MiB of images: use smaller images, '
+            return (f'detections arrive {self._pairing.outrun} images late, more than fit in '
+                    f'{_MAX_IMAGE_BYTES // 2**20} MiB of memory: use smaller images, '
                     'image_transport compressed, or a faster detector')
         received_at, detected_at = self._arrived_at
         if detected_at >= since:
-            return (f'detections come {detected_at - received_at:.1f} s after their image: choose '
-                    'a faster profile or a smaller detector, or raise timeout_s')
+            return (f'detections arrive {detected_at - received_at:.1f} s after their image: '
+                    'choose a faster profile or a smaller detector, or raise timeout_s')
         stamps = ', '.join(f'{self._resolved(name)} {stamp / NS_PER_S:.6f}'
                            for name, stamp in self._pairing.last_stamp_ns.items())
-        return (f'stamps never match (last: {stamps}): camera_info and detections must carry '
-                "their image's header, and within timeout_s")
+        return (f'stamps never match (last: {stamps}): camera_info and detections must have '
+                "their image's header, and arrive within timeout_s")
 
     def _silence(self, name: str) -> str:
         topic = self._resolved(name)
         publishers = self._node.count_publishers(topic)
         if publishers and name == 'detections':
             return (f'no detections on {topic} from its {publishers} publisher(s): the detector '
-                    'used up the time, or it stands still; choose a faster profile or a smaller '
-                    'detector, raise timeout_s, or look at its log')
+                    'is too slow or has stopped; choose a faster profile or a smaller detector, '
+                    'raise timeout_s, or see its log')
         if publishers:
-            return (f'no {name} on {topic} from its {publishers} publisher(s): is it sending, and '
-                    'is its QoS compatible?')
+            return (f'no {name} on {topic} from its {publishers} publisher(s): check that it '
+                    'publishes, and that its QoS is compatible')
         return f'no {name}: nobody publishes {topic}; remap it, or start its publisher'
 
     def _resolved(self, name: str) -> str:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of an instant as a query, and the contradictions between them."""
+"""Convert the messages of an instant to a query, and check their consistency."""
 
 import logging
 import math
@@ -36,17 +36,17 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 
 logger = logging.getLogger(__name__)
 # The vertical in the frame of a body that is tilted by less than 45 degrees and rolled by less
-# than 17: no optical frame has it, but that of a camera which looks up by more than 72 degrees.
+# than 17. In an optical frame, only a camera that looks up by more than 72 degrees has it there.
 _LEAST_Z, _MOST_Y = 0.7, 0.3
 
 
 class Instants:
-    """Makes queries of frames, and checks cameras and detector.
+    """Converts frames to queries, and checks cameras and detector.
 
     Parameters
     ----------
     by_class : bool
-        Whether the classes of detections are compared with those of the map.
+        Whether the classes of detections are compared with the classes of the map.
     """
 
     def __init__(self, landmark_map: LandmarkMap, by_class: bool) -> None:
@@ -63,30 +63,32 @@ class Instants:
                   for fault in self._detector.faults)]
 
     def query(self, frame: Frame, parameters: RelocalizerParameters, known: KnownBefore) -> Query:
-        """Return the query of an instant, without cameras of another run of odometry.
+        """Return the query of an instant, without cameras whose odometry is of another run.
 
-        CliplocError: names what to fix in the frame or in the parameters.
+        CliplocError: the frame or the parameters are invalid.
         """
         state, beside, region = known
-        # without odometry the robot itself is what links its cameras
+        # without odometry, the cameras of one instant are linked by their mounts
         run = _run_of(state)
         by_odometry = run is not None or not (frame.camera and beside)
-        images, frames = zip(*(self._observed(one, parameters, its, by_odometry)
-                               for one, its in (*beside, (frame, state))
-                               if run == _run_of(its)), strict=True)
-        newest = replace(frames[-1], region=region)
-        return Query((*(replace(one, stamp_ns=newest.stamp_ns) for one in frames[:-1]), newest),
-                     images, run, parameters.fuse_frames, parameters.fuse_window_s)
+        images, observations = zip(*(
+            self._observed(camera_frame, parameters, camera_state, by_odometry)
+            for camera_frame, camera_state in (*beside, (frame, state))
+            if run == _run_of(camera_state)), strict=True)
+        newest = replace(observations[-1], region=region)
+        others = (replace(other, stamp_ns=newest.stamp_ns) for other in observations[:-1])
+        return Query((*others, newest), images, run, parameters.fuse_frames,
+                     parameters.fuse_window_s)
 
     def check_axes(self, frame: Frame, state: RobotState, map_from_camera: NDArray[np.float64]
                    ) -> None:
-        """Raise CameraError where an accepted pose (4, 4) shows that a mount is a body's."""
+        """Raise CameraError if an accepted pose (4, 4) shows that the mount has a body's axes."""
         with self._keeping(frame.camera):
             check_faults(faults_of_axes(frame.image.header.frame_id, state.camera_from_base,
                                         map_from_camera))
 
     def explained(self, found: Relocalization) -> Relocalization:
-        """Return a result whose refusal also names what is wrong with the newest frames."""
+        """Return a result; a refusal gets the faults of the newest frames as further reasons."""
         if found.accepted:
             return found
         found = self._detector.explain(found)
@@ -126,7 +128,7 @@ class Instants:
 
     @contextmanager
     def _keeping(self, camera: str) -> Iterator[None]:
-        """Keep a CliplocError as a fault of a camera."""
+        """Store a CliplocError of the body as a fault of a camera."""
         try:
             yield
         except CliplocError as error:
@@ -146,7 +148,10 @@ def read_frame(frame: Frame, parameters: RelocalizerParameters
 
 def frame_depths(frame: Frame, camera: Camera, detections: Detections, state: RobotState
                  ) -> NDArray[np.float64] | None:
-    """Return the depth of each box (n,) [m]; None without depth. CliplocError: it is invalid."""
+    """Return the depth of each box (n,) [m]; None without depth.
+
+    CliplocError: the depth image is invalid.
+    """
     return None if frame.depth is None else depths_from_msg(
         frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
         frame.depth_camera_info, state.camera_from_depth)
@@ -158,7 +163,7 @@ def _run_of(state: RobotState) -> int | None:
 
 def faults_of_frame(frame: Frame, camera: Camera, parameters: RelocalizerParameters,
                     state: RobotState) -> list[Fault]:
-    """Return contradictions in a frame, given its camera and the robot's state."""
+    """Return the contradictions in a frame, given its camera and the robot's state."""
     image, info = frame.image.header.frame_id, frame.camera_info
     return [*faults_of_headers(image, info.header.frame_id, frame.detections.header.frame_id),
             *faults_of_camera_info(info, camera, parameters.rectified),
@@ -169,17 +174,17 @@ def faults_of_frame(frame: Frame, camera: Camera, parameters: RelocalizerParamet
 
 def faults_of_axes(frame_id: str, camera_from_base: NDArray[np.float64],
                    map_from_camera: NDArray[np.float64] | None = None) -> list[Fault]:
-    """Return whether the coordinate frame of an image is that of a body, by its mount (4, 4).
+    """Return a fault if the mount (4, 4) shows that images are in a frame with a body's axes.
 
     The axes of a body are x ahead, y left, z up (REP 103), those of a camera x right, y down, z
-    ahead. A camera may look at the ceiling. It does not where its pose (4, 4) in the map, which
-    objects show, would have the robot lie on its side.
+    ahead. A camera that looks at the ceiling has a similar mount, so the fault is a suspicion. It
+    is certain if the camera's pose (4, 4) in the map implies that the robot lies on its side.
     """
     _, y, z = up_in_camera = camera_from_base[:3, 2]
     if z < _LEAST_Z or abs(y) > _MOST_Y:
         return []
     return [Fault(
-        f"'{frame_id}' has the axes of a body, x ahead and z up, by its mount: the camera would "
-        f'look up by {math.degrees(math.asin(min(1.0, z))):.0f} degrees; publish images in its '
+        f"by its mount, '{frame_id}' has the axes of a body, x ahead and z up: the camera would "
+        f'look up by {math.degrees(math.asin(min(1.0, z))):.0f} degrees; publish images in the '
         'optical frame, or correct tf or base_from_camera',
         map_from_camera is not None and float(map_from_camera[2, :3] @ up_in_camera) < _LEAST_Z)]

@@ -29,45 +29,46 @@ from cliploc_ros.ros.inputs.stamps import stamp_problem
 from cliploc_ros.units import NS_PER_S
 
 _UNIT_TOLERANCE = 0.01
-# No robot drives this far from its start; beyond, sums lose millimetres.
+# Greatest distance from the start [m]; beyond it, sums lose millimetres.
 _FARTHEST_M = 1e7
-# Poses further apart are not interpolated: wheels send every 20 ms, visual odometry every 100.
+# Poses further apart are not interpolated. Wheel odometry publishes every 20 ms, visual odometry
+# every 100 ms.
 _MAX_GAP_NS = NS_PER_S // 2
-# A message this late, or this many late ones in a row, means that time was set back.
+# A message this late, or more late messages in a row than this, means that time was set back.
 _MAX_LATE_NS, _MOST_LATE = NS_PER_S, 5
-# For moves [m] and turns [rad]. Wheels that slip, poses that tremble and stamps are off by less.
+# Tolerance of moves [m] and turns [rad]: slipping wheels, pose noise and stamps cause less.
 _SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
-# A robot of unknown speed is not faster than this [1/s]. It changes its speed by less
-# than this [1/s^2], and between two twists by less than this; a change lasts no longer [s].
-# Guesses: no run of a Husky ends at 5 Hz or more, see python -m studies.sensors.
+# Greatest speeds of a robot of unknown speed [m/s], [rad/s]; greatest accelerations by poses and
+# between two twists [m/s^2], [rad/s^2]; longest time of an acceleration [s]. Not measured. With
+# these values no run of a Husky is cut at 5 Hz or more, see python -m studies.sensors.
 _FASTEST, _CHANGE = np.array([3.0, 3.0]), np.array([3.0, 8.0])
 _TWIST_CHANGE, _CHANGE_S = np.array([3.0, 4.0]), 0.5
-# Twists fit that miss at most this share of a motion, at least this much; what happened long ago
-# counts less.
+# Twists are used if they miss at most this share of the motion, after at least this much motion
+# [m], [rad]. Sums are limited to the greatest motion, so that old motion loses weight.
 _MISSED_SHARE, _LEAST_MOTION, _MOST_MOTION = 0.25, np.array([0.3, 0.5]), np.array([4.0, 6.0])
 _NO_TWIST, _MOST_TWIST = np.zeros((2, 3)), 1e3
-# Odometry is silent after this many of its usual periods, or of a slow source's where it has just
-# begun (guesses).
+# A gap of more than this many usual periods is a silence. The period of odometry that has just
+# begun is unknown, and taken to be that of a slow source. Not measured.
 _MOST_PERIODS, _SLOW_NS = 3.25, NS_PER_S
-#: Over a shorter time the noise of the poses would look like a speed.
+#: Least time between the poses of a speed: over less, their noise looks like motion.
 MOMENT_NS = 300_000_000
-#: Over a longer time a speed says little (a guess): slow sources send at 1 Hz.
+#: Greatest time between the poses of a speed: slow sources publish at 1 Hz. Not measured.
 LONG_NS = 3 * NS_PER_S
-# A robot that stands seems to move by less: its way counts in longer steps.
+# Least step of the driven distance, above the apparent motion of a robot at rest.
 _STEP_M = 0.02
-# The boxes of a slow detector arrive long after their image was taken.
+# Length of the window: boxes of a slow detector arrive long after their image was taken.
 _LENGTH_S = 30.0
-# The message that follows an image arrives within this time: wheels publish faster.
+# Longest wait for the message that follows an image: wheel odometry publishes faster.
 _PATIENCE_S = 0.2
 # Odometry that ends or begins this close to an image may cover the next image.
 _NEARLY_NS = 2_000_000_000
-#: How long odometry that has just begun may take to show a speed [s]: a late answer is better than
-#: taking a moving robot on a busy machine for one at rest.
+#: Longest wait for odometry that has just begun to show a speed [s]. On a busy machine, a late
+#: answer is better than to assume that a moving robot is at rest.
 MOMENT_PATIENCE_S = 2.0
 
 
 class NoOdometryError(CliplocError):
-    """Odometry has no pose at that time; the message says why."""
+    """Odometry has no pose at the given time; the message says why."""
 
 
 class _Pose(NamedTuple):
@@ -78,27 +79,27 @@ class _Pose(NamedTuple):
 
 
 class OdometryWindow:
-    """Poses of odometry over some seconds, in the order of their stamps.
+    """Poses of odometry over some seconds, ordered by stamp.
 
     Parameters
     ----------
     length_s : float
         Poses that are older than the newest by more than this are dropped [s].
     max_poses : int
-        No more poses are kept, whatever their stamps.
+        Greatest number of poses, regardless of their stamps.
     """
 
     def __init__(self, length_s: float, max_poses: int = 5000) -> None:
         self._length_ns = round(length_s * NS_PER_S)
         self._max_poses = max_poses
         self._poses: list[_Pose] = []
-        # The way until the last step ended, and where.
+        # Driven distance [m], and the position where its last step ended.
         self._way_m, self._step_end = 0.0, np.zeros(3)
-        # Messages in a row that are older than the newest.
+        # Number of successive messages that are older than the newest.
         self._late = 0
         # Sums over this run: moves and turns by the poses, and errors of the twists.
         self._motion, self._missed = np.zeros(2), np.zeros(2)
-        #: The number of the present run of odometry: poses of two runs are not related.
+        #: Number of the current run of odometry. Poses of different runs are not related.
         self.run = 0
 
     def __len__(self) -> int:
@@ -106,38 +107,39 @@ class OdometryWindow:
         return len(self._poses)
 
     def clear(self) -> None:
-        """Forget all poses, and begin another run."""
+        """Forget all poses, and begin a new run."""
         self._poses.clear()
         self._way_m, self._late = 0.0, 0
         self._motion, self._missed = np.zeros(2), np.zeros(2)
         self.run += 1
 
     def is_ahead(self, stamp_ns: int) -> bool:
-        """Return whether an instant is after all poses, but the next may cover it."""
+        """Return whether an instant is after all poses, but the next pose may cover it."""
         return bool(self._poses) and 0 < stamp_ns - self._poses[-1].stamp_ns <= _MAX_GAP_NS
 
     def spans(self, stamp_ns: int, slack_ns: int) -> bool:
-        """Return whether an instant is between the first and the last pose, or so near to them."""
+        """Return whether an instant is in the window, extended by `slack_ns` at both ends."""
         return bool(self._poses) and (self._poses[0].stamp_ns - slack_ns <= stamp_ns
                                       <= self._poses[-1].stamp_ns + slack_ns)
 
     def since_previous_ns(self, stamp_ns: int) -> int:
-        """Return how long before an instant the newest pose before it is; 0 if there is none."""
-        row = bisect_left(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
+        """Return the time from the last pose before an instant to it [ns]; 0 without a pose."""
+        row = bisect_left(self._poses, stamp_ns, key=_stamp_of)
         return stamp_ns - self._poses[row - 1].stamp_ns if row else 0
 
     def add(self, stamp_ns: int, position: NDArray[np.float64], quat_xyzw: NDArray[np.float64],
             twist: NDArray[np.float64] = _NO_TWIST) -> bool:
-        """Take in a pose; return whether it is valid.
+        """Add a pose; return whether it is valid.
 
-        If time or place jumps, all former poses are forgotten: the clock was set back, or
-        odometry was reset, which a gap may hide.
+        If the stamp or the position jumps, all earlier poses are forgotten: the clock was set
+        back, or odometry was reset, possibly during a gap.
 
         Parameters
         ----------
         position : ndarray (3,)
             Position of the robot in odometry's coordinate frame [m].
         quat_xyzw : ndarray (4,)
+            Its orientation, as odom_from_robot.
         twist : ndarray (2, 3)
             Twist in the robot's coordinate frame [m/s], [rad/s]. Many drivers leave it at 0.
         """
@@ -150,7 +152,7 @@ class OdometryWindow:
                      twist if (np.abs(twist) < _MOST_TWIST).all() else _NO_TWIST)
         poses = self._poses
         self._late = self._late + 1 if poses and stamp_ns < poses[-1].stamp_ns else 0
-        row = bisect_left(poses, stamp_ns, key=lambda one: one.stamp_ns)
+        row = bisect_left(poses, stamp_ns, key=_stamp_of)
         if poses and (self._late > _MOST_LATE or stamp_ns < poses[-1].stamp_ns - _MAX_LATE_NS
                       or not self._fits(pose, row)):
             self.clear()
@@ -162,39 +164,40 @@ class OdometryWindow:
         poses.insert(row, pose._replace(way_m=self._way_to(position) if row == len(poses)
                                         else poses[max(row - 1, 0)].way_m))
         oldest = poses[-1].stamp_ns - self._length_ns
-        first = bisect_left(poses, oldest, key=lambda one: one.stamp_ns)
+        first = bisect_left(poses, oldest, key=_stamp_of)
         del poses[:max(first, len(poses) - self._max_poses)]
         return True
 
     def moved_since(self, stamp_ns: int) -> tuple[float, float] | None:
-        """Return how far the newest pose is from the two about an instant, at most [m], [degrees].
+        """Return the motion since an instant, as upper bounds [m], [degrees].
 
-        None if the instant is outside of all poses, or in a gap of more than 3 s.
+        The bounds are the greater distances of the newest pose to the two poses around the
+        instant. None if the instant is before or after all poses, or in a gap of more than 3 s.
         """
         if not self.spans(stamp_ns, 0):
             return None
-        row = bisect_left(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
+        row = bisect_left(self._poses, stamp_ns, key=_stamp_of)
         after, newest = self._poses[row], self._poses[-1]
         before = after if after.stamp_ns == stamp_ns else self._poses[row - 1]
         if after.stamp_ns - before.stamp_ns > LONG_NS:
             return None
-        ways = [_lengths(_step(newest, one)) for one in (before, after)]
+        ways = [_lengths(_step(newest, pose)) for pose in (before, after)]
         return float(max(way[0] for way in ways)), math.degrees(max(way[1] for way in ways))
 
     def way_at(self, stamp_ns: int) -> float:
-        """Return the length of the way from the start of this run to an instant [m].
+        """Return the distance driven from the start of this run to an instant [m].
 
-        It is right to a few centimetres. Driving in a circle counts.
+        It is the length of the path, exact to a few centimetres.
         """
-        row = bisect_right(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
+        row = bisect_right(self._poses, stamp_ns, key=_stamp_of)
         return self._poses[row - 1].way_m if row else 0.0
 
     def pose_at(self, stamp_ns: int) -> NDArray[np.float64]:
-        """Return odom_from_robot (4, 4) at an instant, between two messages by interpolation.
+        """Return odom_from_robot (4, 4) at an instant, interpolated between messages.
 
         NoOdometryError: the instant is before or after all poses, or in a gap between them.
         """
-        row = bisect_left(self._poses, stamp_ns, key=lambda one: one.stamp_ns)
+        row = bisect_left(self._poses, stamp_ns, key=_stamp_of)
         if row < len(self._poses) and self._poses[row].stamp_ns == stamp_ns:
             return self._poses[row].odom_from_body
         if not self._poses:
@@ -202,15 +205,15 @@ class OdometryWindow:
         if row == len(self._poses):
             late_s = (stamp_ns - self._poses[-1].stamp_ns) / NS_PER_S
             raise NoOdometryError(f'the newest odometry is {late_s:.3f} s older than the image: '
-                                  'stamp both by one clock')
+                                  'stamp both by the same clock')
         if row == 0:
             early_s = (self._poses[0].stamp_ns - stamp_ns) / NS_PER_S
             raise NoOdometryError(f'the oldest odometry is {early_s:.3f} s newer than the image: '
-                                  'stamp both by one clock')
+                                  'stamp both by the same clock')
         before, after = self._poses[row - 1], self._poses[row]
         gap_ns = after.stamp_ns - before.stamp_ns
         if gap_ns > _MAX_GAP_NS:
-            raise NoOdometryError(f'odometry paused for {gap_ns / NS_PER_S:.3f} s about the image')
+            raise NoOdometryError(f'odometry has a gap of {gap_ns / NS_PER_S:.3f} s at the image')
         share = (stamp_ns - before.stamp_ns) / gap_ns
         first, last = before.odom_from_body, after.odom_from_body
         turn = share * _step(before, after)[1]
@@ -218,7 +221,7 @@ class OdometryWindow:
                               first[:3, 3] + share * (last[:3, 3] - first[:3, 3]))
 
     def _way_to(self, position: NDArray[np.float64]) -> float:
-        """Return the way until the newest pose."""
+        """Return the distance driven to a new position [m]."""
         if not self._poses:
             self._step_end = position
         step_m = float(np.linalg.norm(position - self._step_end))
@@ -227,7 +230,7 @@ class OdometryWindow:
         return self._way_m
 
     def _fits(self, pose: _Pose, row: int) -> bool:
-        """Return whether the robot can have been at a pose before that of a row."""
+        """Return whether a robot could move through a pose that is inserted at a row."""
         poses = self._poses
         if row < len(poses) and poses[row].stamp_ns == pose.stamp_ns:
             return bool((_lengths(_step(poses[row], pose)) <= _SLACK).all())
@@ -240,7 +243,7 @@ class OdometryWindow:
                 and _is_explained([*before, pose], poses[row], twists_fit))
 
     def _learn(self, pose: _Pose) -> None:
-        """Take in how well the twists explain the way to the next pose."""
+        """Update the sums that show how well the twists predict the poses."""
         if self._poses:
             newest = self._poses[-1]
             step, seconds = _step(newest, pose), (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
@@ -250,8 +253,12 @@ class OdometryWindow:
             self._motion, self._missed = share * self._motion, share * self._missed
 
 
+def _stamp_of(pose: _Pose) -> int:
+    return pose.stamp_ns
+
+
 def _step(before: _Pose, after: _Pose) -> NDArray[np.float64]:
-    """Return move and turn (2, 3) from a pose to another, in the robot's frame at the first."""
+    """Return move and turn (2, 3) between two poses, in the robot's frame at the first pose."""
     first, last = before.odom_from_body, after.odom_from_body
     back = first[:3, :3].T
     return np.array([back @ (last[:3, 3] - first[:3, 3]),
@@ -260,26 +267,26 @@ def _step(before: _Pose, after: _Pose) -> NDArray[np.float64]:
 
 def _driven(speed: NDArray[np.float64], seconds: float, since_s: float = 0.0
             ) -> NDArray[np.float64]:
-    """Return move and turn (2, 3) at a speed, the mean since `since_s` ago."""
+    """Return move and turn (2, 3) in `seconds` at a speed, the mean since `since_s` ago."""
     move, turn = seconds * speed
     heading = cv2.Rodrigues((since_s + seconds) / 2 * speed[1])[0]
     return np.array([heading @ move, turn])
 
 
 def _lengths(step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far and how much (2,) a move and a turn (2, 3) lead."""
+    """Return the lengths (2,) of a move and a turn (2, 3)."""
     return np.array([math.hypot(*step[0]), math.hypot(*step[1])])
 
 
 def _is_explained(poses: Sequence[_Pose], pose: _Pose, twists_fit: NDArray[np.bool_]) -> bool:
-    """Return whether a robot can have moved from the newest of some poses to a later one.
+    """Return whether a robot can have moved from the newest of `poses` to a later pose.
 
-    Many drivers leave the twist empty, or fill it with something else. Where it fits the poses of
-    this run, which `twists_fit` (2,) says of moves and turns, the robot moved by it; else it went
-    on as its poses did, or stopped.
+    The motion is predicted by the twists if they match the poses of this run; `twists_fit` (2,)
+    tells this for moves and turns. Many drivers leave the twist empty or fill it with other
+    values. Then the robot is expected to continue at the speed of its poses, or to stop.
 
-    After a silence nothing but the latter counts, for a driver may have restarted at another
-    origin, which a robot could have reached by driving.
+    After a silence only this second prediction is used: the driver may have restarted at another
+    origin that the robot could also have reached by driving.
     """
     is_silence = _is_silence(poses, pose.stamp_ns - poses[-1].stamp_ns)
     return bool(np.where(twists_fit & (not is_silence), _explained_by_twists(poses[-1], pose),
@@ -287,10 +294,10 @@ def _is_explained(poses: Sequence[_Pose], pose: _Pose, twists_fit: NDArray[np.bo
 
 
 def _explained_by_twists(newest: _Pose, pose: _Pose) -> NDArray[np.bool_]:
-    """Return whether a move and a turn (2,) are those of a speed between two twists."""
+    """Return whether move and turn (2,) match a speed between the two twists."""
     gap_s = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
     change, most = pose.twist - newest.twist, _TWIST_CHANGE * gap_s
-    # a driver that restarts may take its jump for a speed
+    # limit the change: a restarted driver may compute a wrong twist from its jump
     change *= (most / np.maximum(_lengths(change), most))[:, None]
     first, last = _driven(newest.twist, gap_s), _driven(newest.twist + change, gap_s)
     return _lies_between(_step(newest, pose), first, last,
@@ -300,20 +307,20 @@ def _explained_by_twists(newest: _Pose, pose: _Pose) -> NDArray[np.bool_]:
 
 def _explained_by_poses(poses: Sequence[_Pose], pose: _Pose, is_silence: bool
                         ) -> NDArray[np.bool_]:
-    """Return whether a move and a turn (2,) are those of a robot that goes on or stops.
+    """Return whether move and turn (2,) match a robot that continues or stops.
 
-    After a long silence, the robot has to stand where it was.
+    After a long silence, the robot must not have moved.
     """
     newest = poses[-1]
     gap_s = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
-    row = bisect_right(poses, newest.stamp_ns - MOMENT_NS, key=lambda one: one.stamp_ns)
+    row = bisect_right(poses, newest.stamp_ns - MOMENT_NS, key=_stamp_of)
     before = poses[max(row - 1, 0)]
     moment_s = (newest.stamp_ns - before.stamp_ns) / NS_PER_S
     speed = -_step(newest, before) / moment_s if moment_s else _NO_TWIST
     slack = _CHANGE * gap_s * min((moment_s + gap_s) / 2, _CHANGE_S)
     if is_silence:
         slack, speed = np.zeros(2), speed if gap_s <= LONG_NS / NS_PER_S else _NO_TWIST
-    elif not row:  # the run has just begun: two poses at hand tell no speed
+    elif not row:  # the run has just begun: its poses are too close in time for a speed
         slack, speed = _FASTEST * gap_s, _NO_TWIST
     return _lies_between(_step(newest, pose), _driven(speed, gap_s, moment_s), _NO_TWIST,
                          _SLACK + slack)
@@ -321,12 +328,15 @@ def _explained_by_poses(poses: Sequence[_Pose], pose: _Pose, is_silence: bool
 
 def _lies_between(step: NDArray[np.float64], one: NDArray[np.float64],
                   other: NDArray[np.float64], slack: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of move and turn (2,) lie about two others, which end a ball's diameter."""
+    """Return which of move and turn (2,) lie in a ball around two others, with some slack.
+
+    The two others are the ends of the ball's diameter.
+    """
     return np.asarray(_lengths(step - (one + other) / 2) <= _lengths(one - other) / 2 + slack)
 
 
 def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
-    """Return whether the next pose comes later than some lost messages explain."""
+    """Return whether the gap before the next pose is longer than a few lost messages."""
     if gap_ns <= _MAX_GAP_NS:
         return False
     period_ns = float(np.median(np.diff([pose.stamp_ns for pose in poses]))) \
@@ -335,17 +345,17 @@ def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
 
 
 class OdometryPlace(NamedTuple):
-    """Pose of the robot, or its camera, in odometry at the stamp of an image."""
+    """Pose of the robot, or its camera, by odometry at the stamp of an image."""
 
     odom_from_frame: NDArray[np.float64]  #: (4, 4)
-    #: Places of one run share their odometry frame; places of different runs are not comparable.
+    #: Number of the run of odometry. Poses of different runs are not comparable.
     run: int
-    way_m: float  #: Driven since the run began
+    way_m: float  #: Distance driven since the run began
     frame: str = ''  #: The coordinate frame whose pose this is
 
 
 class OdometrySource(qos.Listener):
-    """Subscribes to odometry while the node is active: it costs little, and links frames."""
+    """Subscribes to odometry while the node is active. Odometry is cheap, and links frames."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -354,7 +364,7 @@ class OdometrySource(qos.Listener):
         self._newest: Odometry | None = None
         self._newest_at = 0.0
         self._frames = ('', '')
-        #: What is wrong with the stamp of the newest message, and what to do; empty if nothing is.
+        #: Fault of the newest message's stamp, and the remedy; empty if the stamp is valid.
         self.problem = ''
         self._on_restart: list[Callable[[int], None]] = []
 
@@ -369,10 +379,10 @@ class OdometrySource(qos.Listener):
         return bool(self._node.count_publishers(self.topic))
 
     def on_restart(self, callback: Callable[[int], None]) -> None:
-        """Have each restart of odometry reported: its poses are not related to those before.
+        """Register a callback for restarts of odometry, after which poses are not comparable.
 
-        The callback takes the stamp of the first message after the restart [ns], in the thread
-        that takes odometry; it must not block. What this node itself forgets is not reported.
+        It is called with the stamp of the first message after the restart [ns], in the thread
+        that receives odometry. It must not block. It is not called for forget() and close().
         """
         self._on_restart.append(callback)
 
@@ -382,13 +392,13 @@ class OdometrySource(qos.Listener):
                                                   qos.ODOM)
 
     def forget(self) -> None:
-        """Forget what was heard: poses that follow belong to another run."""
+        """Forget all messages; later poses belong to a new run."""
         with self._heard:
             self._newest, self.problem = None, ''
             self._window.clear()
 
     def take(self, msg: Odometry) -> None:
-        """Take one message."""
+        """Process a message."""
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
         v, w = msg.twist.twist.linear, msg.twist.twist.angular
         at_ns = stamp_ns(msg.header.stamp)
@@ -410,16 +420,16 @@ class OdometrySource(qos.Listener):
             self._heard.notify_all()
         if has_restarted:
             self._node.get_logger().warning(
-                f'{self.topic} restarted, for its time, place or frames jumped: all poses from '
-                'before are forgotten', throttle_duration_sec=5.0)
+                f'{self.topic} restarted: its stamp, position or frames jumped; all earlier poses '
+                'are forgotten', throttle_duration_sec=5.0)
             for callback in self._on_restart:
                 callback(at_ns)
 
     def recent(self, max_age_s: float, patience_s: float) -> Odometry | None:
-        """Return the newest message, if it is not older than `max_age_s` by its arrival.
+        """Return the newest message if it arrived at most `max_age_s` ago.
 
-        Else the next one if that arrives within `patience_s`, else None; at once where nobody
-        publishes odometry.
+        Otherwise wait up to `patience_s` for the next message; None if there is none. Does not
+        wait if odometry has no publisher.
         """
         def is_recent() -> bool:
             return (self._newest is not None
@@ -432,10 +442,10 @@ class OdometrySource(qos.Listener):
     def speeds_by_poses(self, patience_s: float) -> tuple[float, float] | None:
         """Return speed [m/s] and turn rate [rad/s] over the last 0.3 s of poses.
 
-        Many sources of poses leave the twist empty. Where the last two poses are further apart,
-        up to 3 s, it is the mean speed between them. Odometry that has just begun may take
-        `patience_s`, at most 2 s, to cover that time; None if it does not, or where the
-        stamps stand still.
+        Many sources of poses leave the twist empty. If the last two poses are further apart, up
+        to 3 s, the result is the mean speed between them. Waits up to `patience_s`, at most 2 s,
+        for odometry that has just begun. None if odometry does not cover the time, or if the
+        stamps do not advance.
         """
         with self._heard:
             self._heard.wait_for(lambda: self._last_moment() is not None,
@@ -464,7 +474,7 @@ class OdometrySource(qos.Listener):
             return None
 
     def moved_since(self, stamp: Time, patience_s: float) -> tuple[float, float] | None:
-        """Return how far the robot is from where it was at an image, at most [m], [degrees].
+        """Return the motion since the stamp of an image, as upper bounds [m], [degrees].
 
         Waits for the message that follows the image. None if odometry does not cover that
         time, or has a gap of more than 3 s there.
@@ -475,9 +485,9 @@ class OdometrySource(qos.Listener):
             return self._window.moved_since(at_ns)
 
     def covers_soon(self, stamp: Time, patience_s: float) -> bool:
-        """Return whether odometry covers about the time of an image, and so of the next.
+        """Return whether odometry covers roughly the stamp of an image, and so the next image.
 
-        A publisher that has just been discovered may take `patience_s` for its first message.
+        Waits up to `patience_s` for the first message of a publisher.
         """
         at_ns = stamp_ns(stamp)
         with self._heard:
@@ -486,7 +496,7 @@ class OdometrySource(qos.Listener):
             return self._window.spans(at_ns, _NEARLY_NS)
 
     def pose_at(self, stamp: Time) -> OdometryPlace:
-        """Return where odometry had the robot at the stamp of an image.
+        """Return the robot's pose by odometry at the stamp of an image.
 
         NoOdometryError: odometry does not cover that time.
         """

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The prior: where the robot probably is, before an image.
+"""The prior: the probable pose of the robot before an image.
 
-A message on `~/prior` says where the robot is, until the next message. Without one it is where
-it was last: the pose of the last accepted request, and what the localizer showed after it, are
-kept in a file. That holds until the first accepted pose; from then on the robot is awake.
+A message on `~/prior` is used until the next one. Without a message, the prior is the last pose of
+the previous run: accepted poses, and later poses of the localizer, are stored in a file. This
+prior is used until the first pose is accepted.
 """
 
 import json
@@ -33,23 +33,24 @@ from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 _LOG_PERIOD_S = 5.0
-# Between two poses of a localizer that are written [s].
+# Least time between two stored poses of a localizer [s].
 _WRITE_PERIOD_S = 1.0
 _PLANAR = np.array([0, 1, 5])  # x, y and yaw in a covariance of ROS
 _LEVEL_COSINE = 0.7
 
 
 class PriorSource:
-    """Hears where the robot is, and keeps its last pose."""
+    """Receives priors, and stores the robot's last pose."""
 
     def __init__(self, node: ManagedNode[RelocalizerParameters], transforms: CoordinateFrames
                  ) -> None:
         self._node, self._transforms = node, transforms
-        self._heard: PoseWithCovarianceStamped | None = None  # also an invalid one
+        # The last message, and the same if it is valid.
+        self._heard: PoseWithCovarianceStamped | None = None
         self._told: PoseWithCovarianceStamped | None = None
         # The last pose of the previous run and the hash of its map, until a pose is accepted.
         self._last: tuple[PoseWithCovarianceStamped, str] | None = None
-        # After that: the pose that was written last, its time, and the hash of the map.
+        # The pose that was stored last, its time, and the hash of the current map.
         self._written: NDArray[np.float64] | None = None
         self._written_at, self._map_hash = 0.0, ''
         self._subscriptions: list[Subscription] = []
@@ -73,8 +74,8 @@ class PriorSource:
         self._subscriptions = []
 
     def hear(self, msg: PoseWithCovarianceStamped) -> None:
-        """Take in where the robot is; an empty frame_id withdraws what was told before."""
-        if msg == self._heard:  # by the other subscription
+        """Use a message as prior. An empty frame_id withdraws the prior."""
+        if msg == self._heard:  # the other subscription delivered it already
             return
         self._heard, self._told = msg, None
         if not msg.header.frame_id:
@@ -88,7 +89,10 @@ class PriorSource:
     def region(self, stamp: Time, parameters: RelocalizerParameters,
                camera_from_base: NDArray[np.float64], frame_ids: Sequence[str], map_hash: str
                ) -> Region | None:
-        """Return where the robot is at a stamp, in maps of some frames; None if unknown."""
+        """Return the prior at a stamp in one of the maps with these frames; None without a prior.
+
+        `map_hash` is that of the loaded map: a stored pose of another map is not used.
+        """
         told, probability = self._told, parameters.prior_probability
         if told is None and self._last is not None and self._last[1] == map_hash:
             told, probability = self._last[0], parameters.last_pose_probability
@@ -102,23 +106,23 @@ class PriorSource:
 
     def keep(self, accepted: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
              map_hash: str) -> None:
-        """Keep an accepted pose for the next start; the pose of the last start is used up."""
+        """Store an accepted pose for the next run, and stop using the pose of the last run."""
         self._last, self._map_hash = None, map_hash
         self._store(accepted, parameters)
 
     def follow(self, shown: PoseWithCovarianceStamped) -> None:
-        """Keep where the localizer has the robot, once a pose was accepted."""
+        """Store a pose of the localizer, if a pose was accepted before."""
         if self._map_hash and time.monotonic() - self._written_at >= _WRITE_PERIOD_S:
             self._store(shown, self._node.settings.snapshot())
 
     def _store(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters) -> None:
-        """Write a pose behind what the worker does, if the robot has moved."""
+        """Store a pose if the robot has moved. The worker writes it after its other tasks."""
         if not parameters.last_pose_file:
             return
         try:
             at, _ = planar_of(pose)
         except CliplocError:
-            return  # of a foreign localizer
+            return  # an invalid pose of the localizer
         if self._written is None or not SAME_SPOT.agree(at, self._written):
             self._written, self._written_at = at, time.monotonic()
             fields = {'map_hash': self._map_hash, 'frame_id': pose.header.frame_id,
@@ -155,13 +159,13 @@ class PriorSource:
     def _region(self, told: PoseWithCovarianceStamped, probability: float, stamp: Time,
                 parameters: RelocalizerParameters, camera_from_base: NDArray[np.float64],
                 frame_ids: Sequence[str]) -> Region:
-        """Return a pose as a region of a map. NoTransformError: tf2 does not know its frame."""
+        """Convert a pose to a region of a map. NoTransformError: its frame is unknown to tf2."""
         pose, covariance = planar_of(told)
         frame_id = told.header.frame_id.lstrip('/')
         if frame_id not in frame_ids:
             map_from_frame = self._transforms.lookup(
                 frame_ids[0], frame_id, stamp, parameters.tf_timeout_s,
-                'give the prior in the frame of the map')
+                'publish the prior in the frame of the map')
             if not is_rigid(map_from_frame):
                 raise NoTransformError(f"the transform of '{frame_id}' is not a pose: correct it")
             pose, turn = map_from_frame @ pose, np.eye(3)
@@ -170,7 +174,7 @@ class PriorSource:
         camera_from_body = camera_from_base
         if not parameters.base_frame:
             camera_from_body = OPTICAL_FROM_BODY
-            if pose[2, 2] < _LEVEL_COSINE:  # a camera with optical axes; RViz gives a level body
+            if pose[2, 2] < _LEVEL_COSINE:  # axes of a camera; poses from RViz are level bodies
                 pose = pose @ OPTICAL_FROM_BODY
         mean = np.array([*pose[:2, 3], np.arctan2(pose[1, 0], pose[0, 0])])
         return Region(frame_id, mean, covariance, probability, camera_from_body)
@@ -183,12 +187,12 @@ def planar_of(msg: PoseWithCovarianceStamped
               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a pose (4, 4) and the covariance (3, 3) of x, y and yaw.
 
-    The covariances of yaw with x and y count as 0. CliplocError: one of both is invalid.
+    The covariances of yaw with x and y are set to 0. CliplocError: pose or covariance is invalid.
     """
     pose = pose_from_msg(msg.pose.pose)
     covariance = np.reshape(msg.pose.covariance, (6, 6))[np.ix_(_PLANAR, _PLANAR)]
     if pose is None:
-        raise OptionsError('a pose with NaN or a quaternion that is not of length 1')
+        raise OptionsError('the pose has NaN or a quaternion that is not of unit length')
     covariance = 0.5 * (covariance + covariance.T)
     covariance[2, :2] = covariance[:2, 2] = 0.0
     check_planar(covariance)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Mount, vertical, odometry and last pose of the robot: everything but its image."""
+"""All inputs except the frames: mount, vertical, odometry and prior of the robot."""
 
 import math
 import threading
@@ -39,45 +39,46 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STANDARD_GRAVITY = 9.80665
-# An acceleration further from gravity than this is one of a moving IMU (a guess) [m/s^2].
+# Greatest difference of the acceleration of an IMU at rest from gravity [m/s^2]. Not measured.
 _MAX_ACCELERATION = 0.5
-# An orientation that changes faster than this within the window below is of no use (a guess).
+# Least length of the mean vertical: it is shorter if the IMU turns within the window below. Not
+# measured.
 _MIN_MEAN_LENGTH = 0.95
-# An orientation is refused where gravity contradicts it by more than this (a guess): a cheap
-# accelerometer at rest is off by up to 3 degrees, a wrong or missing orientation mostly by more.
+# Greatest angle between the vertical by orientation and by gravity. A cheap accelerometer at rest
+# is off by up to 3 degrees, a wrong or missing orientation usually by more. Not measured.
 _MAX_CONTRADICTION_DEG = 5.0
-#: Samples so near an image are averaged [ns]: vibration is faster, and robots turn slowly.
+#: Samples within this time of an image are averaged [ns]: vibration is faster, robots turn slower.
 WINDOW_NS = 100_000_000
-# Messages of the fastest usual IMU in a second.
+# Number of messages of the fastest usual IMU in one second.
 _MAX_SAMPLES = 1000
 # sensor_msgs/Imu: the first element of the covariance of a field that is not measured.
 _NOT_MEASURED = -1.0
 _LOG_PERIOD_S = 5.0
 _RETRY_S = 0.02
-# Time for a publisher of odometry that has just been discovered to deliver its first message.
+# Longest wait for the first message of a publisher of odometry that was just discovered.
 _DISCOVERY_S = 1.0
 
 
 class NoVerticalError(CliplocError):
-    """The vertical is not known now; the message says why."""
+    """The vertical at the stamp of the image is unknown; the message says why."""
 
 
 class Sample(NamedTuple):
-    """Measurements of an IMU at one instant, in its own coordinate frame; at least one of two."""
+    """A sample of an IMU in its own coordinate frame; at least one of its two fields is known."""
 
     stamp_ns: int
-    #: A unit vector (3,), by the orientation.
+    #: Vertical by the orientation, a unit vector (3,).
     up: NDArray[np.float64] | None
     #: (3,) [m/s^2]; at rest it points up (REP 145).
     acceleration: NDArray[np.float64] | None
 
 
 def sample_from_msg(msg: Imu) -> Sample | None:
-    """Return the vertical by a message; None if it has none.
+    """Return the sample in a message; None if it has neither orientation nor acceleration.
 
-    A field is missing if its covariance begins with -1, or if it has its default value: no
-    acceleration at all, or no rotation with a covariance of zeros. The latter may be a
-    measurement, but then the acceleration says the same.
+    A field is missing if its covariance begins with -1, or if it has its default value: zero
+    acceleration, or identity rotation with a covariance of zeros. An identity rotation may also be
+    measured, but then the acceleration gives the same vertical.
     """
     q, a = msg.orientation, msg.linear_acceleration
     quat_xyzw, acceleration = np.array([q.x, q.y, q.z, q.w]), np.array([a.x, a.y, a.z])
@@ -98,10 +99,10 @@ class VerticalSource(qos.Listener):
     """The vertical in the camera's coordinate frame.
 
     An IMU's orientation is preferred to its acceleration, because its filter removes the robot's
-    motion. But many drivers leave the orientation at its default or fill it wrongly. It has to
-    agree with the acceleration at rest, where the IMU measures both.
+    motion. But many drivers leave the orientation at its default or fill it wrongly. If the IMU
+    measures both, the orientation must agree with the acceleration at rest.
 
-    `transforms` has the mounts of the camera and the IMU.
+    `transforms` looks up the mount of the IMU.
     """
 
     def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
@@ -112,11 +113,11 @@ class VerticalSource(qos.Listener):
         self._stamps = StampOrder()
         self._imu_frame = ''
         self._newest_is_empty = False
-        #: What is wrong with the stamp of the newest message, and what to do; empty if nothing is.
+        #: Fault of the newest message's stamp, and the remedy; empty if the stamp is valid.
         self.problem = ''
 
     def open(self, source: str) -> None:
-        """Listen to the IMU, if the source is 'imu'; does nothing if it already does."""
+        """Subscribe to the IMU if the source is 'imu' and it is not yet subscribed."""
         if source == 'imu' and self._subscription is None:
             self._subscription = qos.AdaptiveSubscription(
                 self._node, Imu, 'imu', self.take, qos.IMU)
@@ -129,7 +130,7 @@ class VerticalSource(qos.Listener):
             self.problem = ''
 
     def take(self, msg: Imu) -> None:
-        """Take in a message of the IMU."""
+        """Process a message of the IMU."""
         sample = sample_from_msg(msg)
         with self._lock:
             self._newest_is_empty = sample is None
@@ -147,12 +148,12 @@ class VerticalSource(qos.Listener):
                      ) -> NDArray[np.float64] | None:
         """Return the vertical (3,), a unit vector in the camera's optical coordinate frame.
 
-        None where gravity is 'none'. `camera_frame` and `stamp` are those of the image.
+        None if gravity is 'none'. `camera_frame` and `stamp` are those of the image.
 
         Raises
         ------
         NoVerticalError
-            The IMU measured nothing at that time, was moving, or contradicts itself.
+            The IMU has no sample at that time, was moving, or contradicts itself.
         NoTransformError
             The IMU's mount is unknown.
         """
@@ -169,7 +170,7 @@ class VerticalSource(qos.Listener):
         return np.asarray(camera_from_imu[:3, :3] @ up_in_imu)
 
     def _up_in_imu(self, at_ns: int) -> tuple[NDArray[np.float64], str]:
-        """Return the mean vertical about an instant, and the coordinate frame it is in."""
+        """Return the mean vertical around an instant, and its coordinate frame."""
         with self._lock:
             frame, samples = self._imu_frame, list(self._samples)
             newest_is_empty = self._newest_is_empty
@@ -178,31 +179,32 @@ class VerticalSource(qos.Listener):
         if not near and self.problem:
             raise NoVerticalError(self.problem)
         if not near and newest_is_empty:
-            raise NoVerticalError(f'{topic} has neither an orientation nor an acceleration: fill '
-                                  'at least one')
+            raise NoVerticalError(f'{topic} has neither an orientation nor an acceleration: '
+                                  'publish at least one of them')
         if not near:
-            raise NoVerticalError(f'no message of {topic} is within {WINDOW_NS // 1_000_000} ms '
-                                  'of the image')
+            raise NoVerticalError(f'no message on {topic} within {WINDOW_NS // 1_000_000} ms of '
+                                  'the image')
         if not frame:
-            raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: fill it')
+            raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: set it')
         return mean_up(near, samples, topic), frame
 
 
 def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
             ) -> NDArray[np.float64]:
-    """Return the mean vertical (3,) of the samples about an image, a unit vector in the IMU.
+    """Return the mean vertical (3,), a unit vector in the IMU's frame, of samples near an image.
 
-    By their orientations, if all recent samples of the topic do not contradict them; else by
-    their accelerations. NoVerticalError: see VerticalSource.up_in_camera.
+    It is the mean of their orientations, or without orientations, of their accelerations. The
+    orientations must agree with gravity in all recent `samples` of the topic. NoVerticalError:
+    see VerticalSource.up_in_camera.
     """
-    ups = [one.up for one in near if one.up is not None]
+    ups = [sample.up for sample in near if sample.up is not None]
     if not ups:
-        mean = np.mean([one.acceleration for one in near if one.acceleration is not None],
-                       axis=0)
+        mean = np.mean([sample.acceleration for sample in near
+                        if sample.acceleration is not None], axis=0)
         if not _is_gravity(mean):
             raise NoVerticalError(
-                f'the IMU is moving: it measures {np.linalg.norm(mean):.2f} m/s^2, at rest it '
-                f'measures {_STANDARD_GRAVITY:.2f}')
+                f'the IMU is moving: it measures {np.linalg.norm(mean):.2f} m/s^2, at rest '
+                f'{_STANDARD_GRAVITY:.2f}')
         return np.asarray(mean / np.linalg.norm(mean))
     contradiction_deg = _contradiction_deg(samples)
     if contradiction_deg > _MAX_CONTRADICTION_DEG:
@@ -214,7 +216,7 @@ def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
     length = float(np.linalg.norm(mean))
     if not length > _MIN_MEAN_LENGTH:
         raise NoVerticalError(
-            'the IMU turns too fast: its orientations about the image differ')
+            'the IMU turns too fast: its orientations around the image differ')
     return np.asarray(mean / length)
 
 
@@ -223,10 +225,10 @@ def _is_gravity(acceleration: NDArray[np.float64]) -> bool:
 
 
 def _contradiction_deg(samples: Sequence[Sample]) -> float:
-    """Return the median angle between up by orientation and by acceleration at rest [deg].
+    """Return the median angle between orientation and acceleration at rest [deg].
 
-    The median over all samples, not those about the image alone: a robot that starts or brakes
-    deflects its accelerometer for a moment. 0 where no sample measures both at rest.
+    The median includes all samples, not only those around the image, because acceleration and
+    braking of the robot deflect the vertical briefly. 0 if no sample measures both at rest.
     """
     cosines = [float(sample.up @ sample.acceleration) / float(np.linalg.norm(sample.acceleration))
                for sample in samples if sample.up is not None and sample.acceleration is not None
@@ -239,23 +241,23 @@ def _contradiction_deg(samples: Sequence[Sample]) -> float:
 class RobotState:
     """The robot at the stamp of one image."""
 
-    #: The mount (4, 4); identity where the camera's own pose is wanted.
+    #: The mount (4, 4); identity without base_frame.
     camera_from_base: NDArray[np.float64]
-    #: The vertical, a unit vector (3,) in the camera's optical frame; None if it is not known.
+    #: The vertical, a unit vector (3,) in the camera's optical frame; None if unknown.
     up_in_camera: NDArray[np.float64] | None = None
-    #: Place of the camera; None if odometry does not cover the image.
+    #: Pose of the camera by odometry; None if odometry does not cover the image.
     place: OdometryPlace | None = None
-    #: (4, 4): the pose of a depth camera that is not registered; None if tf2 lacks it
+    #: Pose (4, 4) of a depth camera that is not registered; None if unknown to tf2
     camera_from_depth: NDArray[np.float64] | None = None
 
 
 class KnownBefore(NamedTuple):
-    """Knowledge about an instant that its messages do not hold."""
+    """Prior knowledge about the instant of a frame."""
 
-    state: RobotState  #: At the stamp of the frame to localize
-    #: The frames of other cameras whose mounts are known, with the robot's state at each
+    state: RobotState  #: The robot at the stamp of the frame to localize
+    #: The frames of other cameras with known mounts, and the robot's state at their stamps
     beside: Sequence[tuple[Frame, RobotState]] = ()
-    region: Region | None = None  #: Where the robot probably is
+    region: Region | None = None  #: The prior of the robot's pose
 
 
 class RobotStateSource:
@@ -277,7 +279,7 @@ class RobotStateSource:
         self.odometry.open()
         if parameters.publish_tf or parameters.watch == 'tf' or (
                 parameters.base_frame and not any(parameters.base_from_camera)):
-            # in the worker, for importing tf2 takes a while
+            # in the worker, because importing tf2 takes long
             self._node.worker.run(self.transforms.open)
 
     def close(self) -> None:
@@ -285,10 +287,10 @@ class RobotStateSource:
         self.odometry.close()
         self.vertical.close()
         self.prior.close()
-        self._node.worker.submit(self.transforms.close)  # after a search that may be under way
+        self._node.worker.submit(self.transforms.close)  # after a search that may be running
 
     def forget(self) -> None:
-        """Forget what was heard: time jumped."""
+        """Forget all messages: time jumped."""
         self.transforms.forget()
         self.vertical.forget()
         self.odometry.forget()
@@ -300,7 +302,7 @@ class RobotStateSource:
                 health.warn(problem)
 
     def is_linked_soon(self, stamp: Time, deadline: float) -> bool:
-        """Return whether odometry can link the frame that follows an image.
+        """Return whether odometry can link the next frame after an image.
 
         Waits for odometry that has just begun, until `deadline` (monotonic clock) [s].
         """
@@ -311,17 +313,21 @@ class RobotStateSource:
     def at_instant(self, frame: Frame, parameters: RelocalizerParameters,
                    frame_ids: Sequence[str], map_hash: str, deadline: float = math.inf
                    ) -> KnownBefore:
-        """Return the knowledge at the instant of a frame, given the maps; see at."""
+        """Return the prior knowledge at the instant of a frame; see `at`.
+
+        `frame_ids` and `map_hash` are those of the loaded maps.
+        """
         header = frame.image.header
         state = self.at(header, parameters.of_camera(frame.camera), deadline, frame.depth_frame)
         beside = []
-        for one in frame.beside:
+        for other in frame.beside:
             soon = min(deadline, time.monotonic() + parameters.tf_timeout_s)
             try:
-                beside.append((one, self.at(one.image.header, parameters.of_camera(one.camera),
-                                            soon, one.depth_frame)))
+                beside.append((other, self.at(other.image.header,
+                                              parameters.of_camera(other.camera), soon,
+                                              other.depth_frame)))
             except NoTransformError as error:
-                self._warn(f'localizing without {one.camera}: {error}')
+                self._warn(f'localizing without {other.camera}: {error}')
         return KnownBefore(state, beside, self.prior.region(
             header.stamp, parameters, state.camera_from_base, frame_ids, map_hash))
 
@@ -329,13 +335,12 @@ class RobotStateSource:
            depth_frame: str = '') -> RobotState:
         """Return the robot's state at the stamp of an image.
 
-        Without a vertical, odometry, or the pose of depth in another coordinate frame, the search
-        does without.
+        Vertical, odometry, and the pose of unregistered depth are optional.
 
-        While the mount is not known, half of the time until `deadline` (monotonic clock) [s] may
-        pass, and half remains for a newer image.
+        The wait for the mount takes at most half of the time until `deadline` (monotonic clock)
+        [s], so that half remains for a newer image.
 
-        NoTransformError: the mount is not known.
+        NoTransformError: the mount is unknown.
         """
         camera_from_base = self._mount(image, parameters, deadline)
         up_in_camera = None
@@ -346,7 +351,7 @@ class RobotStateSource:
             self._warn(f'localizing without the vertical: {error}')
         camera_from_depth = None
         if depth_frame not in ('', image.frame_id):
-            with suppress(NoTransformError):  # what becomes of the depth is said there
+            with suppress(NoTransformError):  # frame_depths reports it
                 camera_from_depth = self._lookup(image, depth_frame, parameters)
         return RobotState(camera_from_base, up_in_camera,
                           self._place(image, parameters, camera_from_base), camera_from_depth)
@@ -379,10 +384,10 @@ class RobotStateSource:
             camera_from_body = camera_from_base if body.frame == parameters.base_frame else \
                 self._lookup(image, body.frame, parameters)
         except NoOdometryError as error:
-            self._node.get_logger().debug(f'one frame alone: {error}')
+            self._node.get_logger().debug(f'localizing without odometry: {error}')
             return None
         except NoTransformError as error:
-            self._warn(f'one frame alone: {error}')
+            self._warn(f'localizing without odometry: {error}')
             return None
         return body._replace(
             odom_from_frame=body.odom_from_frame @ invert_transform(camera_from_body),
@@ -390,7 +395,7 @@ class RobotStateSource:
 
     def _lookup(self, image: Header, frame: str, parameters: RelocalizerParameters
                 ) -> NDArray[np.float64]:
-        """Return camera_from_frame; do not wait again for one that tf2 did not know."""
+        """Return camera_from_frame; wait for a frame only if it was known the last time."""
         timeout_s = 0.0 if frame in self._unknown else parameters.tf_timeout_s
         self._unknown.add(frame)
         found = self.transforms.lookup(image.frame_id, frame, image.stamp, timeout_s)

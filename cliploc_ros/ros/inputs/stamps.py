@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps of messages: invalid stamps, messages that belong together, time that goes back."""
+"""Stamps of messages: validation, pairing of messages by stamp, and time jumps."""
 
 import math
 import time
@@ -17,42 +17,44 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.units import NS_PER_S
 
-# Stamps may be this far ahead of /clock, which comes at 10 Hz or more (a guess).
+# Stamps may be this far ahead of /clock, which is published at 10 Hz or more. Not measured.
 _MAX_AHEAD_NS = NS_PER_S // 5
-# DDS keeps the order of a publisher: a stamp that is older by more than this is a jump (a guess).
+# DDS keeps the order of a publisher's messages: if a stamp is older than the newest by more than
+# this, time has jumped. Not measured.
 _MAX_DISORDER_NS = NS_PER_S
-# Images that are expected at a time: two for each of the last two detections.
+# Number of images that are expected by the detector: two for each of the last two detections.
 _EXPECTED = 4
-# Detections may come this much later than the previous detections.
+# Greatest delay of detections, relative to the delay of the previous detections.
 _SPARE = 1.5
-# This many messages in a row with a stamp of their own show that each has its own: stamps in whole
-# seconds differ at times, too. A message that a relay repeats comes at least this often.
+# After this many successive messages with different stamps, stamps are taken to be unique; fewer
+# do not suffice, because stamps in whole seconds also differ at times. A relay that repeats
+# messages sends each at least this often.
 _SHOWN, _REPEATED = 3, 2
-# Images of a camera at 30 Hz in ten seconds.
+# Number of images of a camera at 30 Hz in ten seconds.
 _REMEMBERED = 300
-# Spread of the delay of messages after their stamps, also of a simulation or a bag at another
-# rate; a greater spread shows another clock (a guess).
+# Spread of the delays of messages after their stamps, also for a simulation or a bag at another
+# rate. A greater spread means that the clock changed. Not measured.
 _UNEVEN_S = 5.0
 
 
 class TimeJumpError(CliplocError):
-    """Time jumped back while a frame was in work; the message says by how much."""
+    """Time jumped back while a frame was processed; the message says by how much."""
 
 
 class _Jump(NamedTuple):
-    """The last jump: when it was seen (monotonic clock) [s], and how it is named."""
+    """The last jump: when it was detected (monotonic clock) [s], and its description."""
 
     seen_at: float
     name: str
 
 
 class TimeJumps:
-    """Watches a node's clock, and has the node forget its input when time goes back.
+    """Monitors a node's clock, and calls `forget` when time jumps back.
 
-    A change of `use_sim_time` counts as a jump, too. Without simulated time the clock does not
-    report jumps: what listens to stamped messages also has to watch their stamps.
+    A change of `use_sim_time` is a jump, too. Without simulated time the clock reports no jumps,
+    so that subscribers of stamped messages must also check their stamps.
 
-    `forget` is called after each jump, in the thread that takes `/clock`. It must not block.
+    `forget` is called after each jump, in the thread that receives `/clock`. It must not block.
     """
 
     def __init__(self, node: Node, forget: Callable[[], None]) -> None:
@@ -60,7 +62,7 @@ class TimeJumps:
         self._clock = node.get_clock()
         self._forget = forget
         self._last = _Jump(-math.inf, '')
-        # rcl keeps a bare pointer to the handle
+        # keep a reference, because rcl stores only a raw pointer to the handle
         self._handle = self._clock.create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=True), post_callback=self._on_jump)
@@ -68,8 +70,8 @@ class TimeJumps:
     def check(self, stamp: Time, received_at: float) -> None:
         """Raise TimeJumpError if a message is from before the last jump.
 
-        It may arrive, at `received_at` (monotonic clock) [s], after the clock's: then its stamp is
-        in the future.
+        `received_at` is when it arrived (monotonic clock) [s]. A message from before the jump may
+        arrive after the clock has jumped; then its stamp is in the future.
         """
         jump = self._last
         if not jump.name:
@@ -77,10 +79,10 @@ class TimeJumps:
         ahead_ns = stamp_ns(stamp) - self._clock.now().nanoseconds
         if received_at <= jump.seen_at or (self._clock.ros_time_is_active
                                            and ahead_ns > _MAX_AHEAD_NS):
-            raise TimeJumpError(f'{jump.name}: the frame is from before')
+            raise TimeJumpError(f'{jump.name}: the frame is from before the jump')
 
     def close(self) -> None:
-        """Watch the clock no longer."""
+        """Stop monitoring the clock."""
         self._handle.unregister()
 
     def _on_jump(self, jump: TimeJump) -> None:
@@ -90,13 +92,13 @@ class TimeJumps:
             name = f'time jumped back by {-jump.delta.nanoseconds / NS_PER_S:.3f} s'
         self._last = _Jump(time.monotonic(), name)
         self._forget()
-        self._node.get_logger().warning(f'{name}: all input from before is forgotten',
+        self._node.get_logger().warning(f'{name}: all earlier input is forgotten',
                                         throttle_duration_sec=1.0)
 
 
 def stamp_problem(stamp: Time) -> str:
-    """Return why a stamp is invalid, as in "the stamp is 0"; empty if it may be valid."""
-    if stamp.nanosec > NS_PER_S:  # some drivers round up to a second
+    """Return why a stamp is invalid, to follow "the stamp", as in "is 0"; empty if it is valid."""
+    if stamp.nanosec > NS_PER_S:  # some drivers round up to a full second
         return f'has {stamp.nanosec} nanoseconds (limit {NS_PER_S - 1})'
     if stamp.sec < 0:
         return f'is {stamp.sec} s, before 1970'
@@ -104,13 +106,13 @@ def stamp_problem(stamp: Time) -> str:
 
 
 class StampOrder:
-    """Finds jumps in the stamps of several streams that are in order otherwise."""
+    """Detects time jumps in the stamps of several ordered streams."""
 
     def __init__(self) -> None:
         self._newest_ns: dict[str, int] = {}
 
     def goes_back(self, stream: str, at_ns: int) -> bool:
-        """Take in a stamp [ns]; return whether time jumped back, and forget all stamps if so."""
+        """Add a stamp [ns]; return whether time jumped back. After a jump, forget all stamps."""
         newest_ns = self._newest_ns.get(stream, at_ns)
         jumped = at_ns < newest_ns - _MAX_DISORDER_NS
         if jumped:
@@ -125,23 +127,23 @@ class StampOrder:
 
 
 class ExactPairing:
-    """Collects messages until every topic has one of the same stamp. Memory is bounded.
+    """Collects messages until every topic has a message with the same stamp. Memory is bounded.
 
     Stamps are compared for equality, not for order: frames may arrive out of order.
 
-    Images wait for their detections. Large images may fill the memory before that. Then
-    each n-th stays, and the two that are the newest when detections arrive: a detector that is
-    done with an image mostly takes the newest one next.
+    Images wait for their detections. If large images fill the memory, every n-th is kept, and the
+    two newest images when detections arrive: a detector that has finished an image usually takes
+    the newest one next.
 
     Parameters
     ----------
     max_bytes : mapping of str to int
-        The topics, and how much memory the messages of each may hold [bytes].
+        The topics, and the memory limit of the messages of each [bytes].
     max_count : int
-        How many messages of each topic are kept.
+        Greatest number of messages kept per topic.
     early, late : str
-        The topics of the images and of the detections in them; without them, the oldest messages
-        give way.
+        The topics of the images and of their detections. Without them, the oldest messages are
+        dropped first.
     """
 
     def __init__(self, max_bytes: Mapping[str, int], max_count: int, early: str = '',
@@ -152,20 +154,20 @@ class ExactPairing:
             topic: OrderedDict() for topic in max_bytes}
         self._early, self._late = early, late
         self.last_stamp_ns: dict[str, int] = {}
-        # Number of each image by its stamp, and the numbers of images that stay in any case.
+        # Number of each image by its stamp, and the numbers of images that are always kept.
         self._numbers: dict[int, int] = {}
         self._expected: deque[int] = deque(maxlen=_EXPECTED)
         self.clear()
 
     def add(self, topic: str, stamp_ns: int, item: Any, size: int) -> dict[str, Any] | None:
-        """Take in a message; return the set by topic that it completes, or None.
+        """Add a message; return the set that it completes, by topic, or None.
 
         Parameters
         ----------
         item : object
-            Returned in the set.
+            The message as it is returned in the set.
         size : int
-            Memory that the item holds [bytes].
+            Memory of the item [bytes].
         """
         self.received[topic] += 1
         self.last_stamp_ns[topic] = stamp_ns
@@ -185,28 +187,29 @@ class ExactPairing:
         while len(waiting) > self._max_count or (
                 self._bytes[topic] > self._max_bytes[topic] and len(waiting) > 1):
             self._forget(topic, next(iter(waiting)) if topic != self._early else min(
-                waiting, key=lambda one: (one == stamp_ns, self._stays(one),
-                                          self._numbers.get(one) in self._expected)))
+                waiting, key=lambda stamp: (stamp == stamp_ns, self._stays(stamp),
+                                            self._numbers.get(stamp) in self._expected)))
         if any(stamp_ns not in other for other in self._waiting.values()):
             return None
         complete = {name: other[stamp_ns][0] for name, other in self._waiting.items()}
         for name, other in self._waiting.items():
-            self.dropped[name] -= 1  # the loop below counts the completed one, too
-            # Older messages will not be completed any more.
+            self.dropped[name] -= 1  # the loop below also counts the completed message
+            # Older messages cannot be completed any more.
             while stamp_ns in other:
                 self._forget(name, next(iter(other)))
         return complete
 
     def waits_near(self, topic: str, stamp_ns: int, tolerance_ns: float) -> bool:
         """Return whether a waiting item of a topic has a stamp near a given one."""
-        return any(abs(one - stamp_ns) <= tolerance_ns for one in self._waiting[topic])
+        return any(abs(waiting_ns - stamp_ns) <= tolerance_ns
+                   for waiting_ns in self._waiting[topic])
 
     def oldest(self, topic: str) -> Any:
-        """Return the oldest item of a topic that waits; None if there is none."""
+        """Return the oldest waiting item of a topic; None without any."""
         return next((item for item, _ in self._waiting[topic].values()), None)
 
     def waiting_bytes(self) -> int:
-        """Return the memory that all waiting messages hold [bytes]."""
+        """Return the memory of all waiting messages [bytes]."""
         return sum(self._bytes.values())
 
     def clear(self) -> None:
@@ -218,16 +221,16 @@ class ExactPairing:
         self.dropped = dict.fromkeys(self.received, 0)
         self.last_stamp_ns.clear()
         self._numbers.clear()
-        self._expected.extend([1, 2, 1, 2])  # a detector that starts takes one of the first images
+        self._expected.extend([1, 2, 1, 2])  # a starting detector takes one of the first images
         self.every, self.outrun = 1, 0
 
     def _stays(self, stamp_ns: int) -> bool:
-        """Return whether an image waits for its detections once it is not the newest one."""
+        """Return whether an image is kept when memory is short."""
         number = self._numbers.get(stamp_ns, 0)
         return number % self.every == 0 or number in self._expected
 
     def _learn(self, stamp_ns: int) -> None:
-        """Learn the delay of detections, in images, and expect those of the newest images."""
+        """Update the delay of detections, in images, and the images that are expected next."""
         newest, waiting = self.received[self._early], self._waiting[self._early]
         self._expected.extend([newest, newest + 1])
         if stamp_ns not in self._numbers or not waiting:
@@ -245,10 +248,10 @@ class ExactPairing:
 
 
 class MessageStamps:
-    """Finds out whether each message of a topic has a stamp of its own, which then names it.
+    """Checks that the stamps of a topic are unique, so that a stamp identifies a message.
 
-    Detections with a stamp that several images have may be of any of them. The same message may
-    come again.
+    Detections whose stamp several images share could belong to any of them. Repetitions of the
+    same message are allowed.
     """
 
     def __init__(self) -> None:
@@ -256,32 +259,32 @@ class MessageStamps:
 
     def clear(self) -> None:
         """Forget all stamps."""
-        #: Why the stamps name no messages, as in "the stamp is 0"; empty if they may.
+        #: Why stamps do not identify messages, to follow "the stamp", as in "is 0"; empty if none.
         self.problem = ''
-        # The last message of each stamp, and how often it came.
+        # The last message of each stamp, and the number of its repetitions.
         self._known: dict[int, tuple[int, int]] = {}
         self._own, self._lag_s = 0, math.nan
 
     @property
     def are_own(self) -> bool:
-        """Return whether the last messages had each its own stamp."""
+        """Return whether each of the last messages had a new stamp."""
         return self._own >= _SHOWN
 
     def is_repeated(self, at_ns: int) -> bool:
-        """Return whether the same message came again with a stamp [ns]."""
+        """Return whether the message with a stamp [ns] was repeated."""
         return self._known.get(at_ns, (0, 0))[1] >= _REPEATED
 
     def add(self, stamp: Time, content: Hashable, received_at: float) -> bool:
-        """Take in a stamp and the content of its message; return whether the stamp names it.
+        """Add a stamp and its message's content; return whether the stamp identifies the message.
 
-        After a stamp that does not, no stamp does until some in a row are right. The message
-        arrived at `received_at` (monotonic clock) [s].
+        After an invalid or shared stamp, the result is False until several successive stamps are
+        valid. `received_at` is when the message arrived (monotonic clock) [s].
         """
         at_ns, message, why, times = stamp_ns(stamp), hash(content), stamp_problem(stamp), 0
         if not why:
             known, times = self._known.pop(at_ns, (message, 0))
             if known != message:
-                times, why = 0, f'is {at_ns / NS_PER_S:.6f} on several of them'
+                times, why = 0, f'is {at_ns / NS_PER_S:.6f} for several of them'
             self._known[at_ns] = message, times + 1
             former_s, self._lag_s = self._lag_s, received_at - at_ns / NS_PER_S
             is_even = abs(self._lag_s - former_s) <= _UNEVEN_S

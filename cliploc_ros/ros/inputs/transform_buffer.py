@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""tf2's buffer, made safe against time jumps. Importing this module needs tf2_ros."""
+"""A tf2 buffer that handles time jumps. This module needs tf2_ros."""
 
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
@@ -11,12 +11,12 @@ from cliploc_ros.ros.inputs.stamps import StampOrder
 
 
 class TransformBuffer(Buffer):
-    """Listens to `/tf` and `/tf_static`; clears itself where the stamps of a transform go back.
+    """A buffer of `/tf` and `/tf_static` that is cleared when the stamps of a transform go back.
 
     tf2 itself refuses transforms that are ten seconds older than the newest one, and interpolates
-    between those from before and after a shorter jump. Jazzy's Buffer clears itself only where it
-    is given a node, and its first releases raise TypeError there. Transforms from before the
-    jump may also arrive after the clock's jump. clear() keeps static transforms.
+    across shorter jumps. Jazzy's Buffer is cleared only if it is given a node, and its first
+    releases raise TypeError then. Transforms from before the jump may also arrive after the clock
+    has jumped. clear() keeps static transforms.
     """
 
     def __init__(self, node: Node) -> None:
@@ -25,16 +25,16 @@ class TransformBuffer(Buffer):
         self._listener = TransformListener(self, node)
 
     def set_transform(self, transform: TransformStamped, authority: str) -> None:
-        """Take in a transform, and forget the others if time jumped back."""
+        """Add a transform; forget the other transforms if time jumped back."""
         if self._stamps.goes_back(transform.child_frame_id, stamp_ns(transform.header.stamp)):
             super().clear()
         super().set_transform(transform, authority)
 
     def clear(self) -> None:
-        """Forget all transforms but the static ones."""
+        """Forget all transforms except static ones."""
         self._stamps.clear()
         super().clear()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Unsubscribe."""
         self._listener.unregister()

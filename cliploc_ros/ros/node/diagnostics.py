@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A node's health on /diagnostics: once a second, and with each result.
+"""A node's health on /diagnostics, once a second and after each result.
 
-diagnostic_updater does this on an installed ROS, but has no package on PyPI.
+diagnostic_updater does the same, but has no package on PyPI.
 """
 
 import csv
@@ -23,34 +23,34 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 _PERIOD_S = 1.0
-# Over a shorter time a rate fluctuates.
+# Least period of a rate: over a shorter time it fluctuates.
 _MIN_RATE_PERIOD_S = 0.5
-# Results that means and percentiles cover.
+# Number of results in means and percentiles.
 _WINDOW = 200
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Return names as one value, separated by commas; those with a comma or a quote are quoted."""
+    """Return names as one CSV value: names with a comma or a quote are quoted."""
     text = io.StringIO()
     csv.writer(text).writerow(names)
     return text.getvalue().removesuffix('\r\n')
 
 
 def split_names(text: str) -> tuple[str, ...]:
-    """Return the names that join_names joined."""
+    """Return the names in a value of join_names."""
     return tuple(next(csv.reader(io.StringIO(text, newline='')), ()))
 
 
 @dataclass
 class Health:
-    """Problems, each with its level, and figures."""
+    """Problems with their levels, and values."""
 
-    #: Levels of diagnostic_msgs/DiagnosticStatus, and one line each
+    #: Levels of diagnostic_msgs/DiagnosticStatus, and messages of one line
     problems: list[tuple[bytes, str]] = field(default_factory=list)
     values: dict[str, object] = field(default_factory=dict)
 
     def warn(self, problem: str) -> None:
-        """Add a problem that may pass by itself."""
+        """Add a problem that may disappear without action."""
         self.problems.append((DiagnosticStatus.WARN, problem))
 
     def fail(self, problem: str) -> None:
@@ -58,10 +58,10 @@ class Health:
         self.problems.append((DiagnosticStatus.ERROR, problem))
 
     def add(self, part: 'Health', name: str) -> None:
-        """Add the problems of a part, and its figures below its name."""
+        """Add the problems of a component, and its values with its name as prefix."""
         self.problems += part.problems
-        self.values |= {f'{name}: {value}' if name else value: figure
-                        for value, figure in part.values.items()}
+        self.values |= {f'{name}: {key}' if name else key: value
+                        for key, value in part.values.items()}
 
     @property
     def level(self) -> bytes:
@@ -70,13 +70,13 @@ class Health:
 
     @property
     def message(self) -> str:
-        """Return the problems in one line, the worst first; empty without any."""
+        """Return the problems in one line, the worst first; empty without problems."""
         worst_first = sorted(self.problems, key=lambda problem: problem[0], reverse=True)
         return '; '.join(text for _, text in worst_first)
 
 
 class StageTimes:
-    """Times of the stages of one result; written in one thread, read in another.
+    """Times of the stages of one result, written in one thread and read in another.
 
     Parameters
     ----------
@@ -87,17 +87,17 @@ class StageTimes:
     """
 
     def __init__(self, stage: str, start: float) -> None:
-        # One tuple: a reader in another thread never sees half of a change.
+        # A tuple, so that a reader in another thread never sees a partial change.
         self._now: tuple[dict[str, float], str, float] = ({}, stage, start)
 
     def begin(self, stage: str, at: float | None = None) -> None:
-        """Begin a stage, or go on with it; the running one ends, by default now."""
+        """End the running stage and begin another, or continue it; by default now."""
         now = time.monotonic() if at is None else at
         self._now = (self._until(now), stage, now)
 
     @property
     def ms(self) -> dict[str, float]:
-        """Return how long each stage took until now [ms], in their order."""
+        """Return the duration of each stage until now [ms], in order."""
         return self._until(time.monotonic())
 
     def _until(self, now: float) -> dict[str, float]:
@@ -111,7 +111,7 @@ def in_words(stages_ms: Mapping[str, float]) -> str:
 
 
 class Stages:
-    """Times of recent stages; written in one thread, read in another."""
+    """Times of the stages of recent results, written in one thread and read in another."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -133,7 +133,7 @@ class Stages:
 
 
 class Rates:
-    """Rates from counts."""
+    """Computes rates from counts."""
 
     def __init__(self) -> None:
         self._counts: dict[str, int] = {}
@@ -141,7 +141,7 @@ class Rates:
         self._rates: dict[str, float] = {}
 
     def update(self, counts: Mapping[str, int]) -> dict[str, float]:
-        """Return the rates since the update before last [Hz]; counts may restart at 0."""
+        """Return the rates over the last 0.5 s or more [Hz]; counts may restart at 0."""
         now = time.monotonic()
         period_s = now - self._at
         if period_s >= _MIN_RATE_PERIOD_S:
@@ -176,7 +176,7 @@ class Diagnostics:
         """Publish the health now."""
         with self._lock:
             state, health = self._state(), self._health()
-        pages = int(Path('/proc/self/statm').read_text().split()[1])  # that are resident
+        pages = int(Path('/proc/self/statm').read_text().split()[1])  # resident pages
         values = {'state': state, **health.values, 'memory [MiB]':
                   f'{pages * os.sysconf("SC_PAGE_SIZE") / 2**20:.0f}', **_gpu_memory()}
         name = self._node.get_fully_qualified_name().lstrip('/')
@@ -190,9 +190,9 @@ class Diagnostics:
 
 
 def _gpu_memory() -> dict[str, object]:
-    """Return the GPU memory that PyTorch holds; nothing if it uses none."""
+    """Return the GPU memory that PyTorch uses; empty if it uses none."""
     torch = sys.modules.get('torch')
-    cuda = getattr(torch, 'cuda', None)  # while it is being imported it has none
+    cuda = getattr(torch, 'cuda', None)  # torch may be partially imported
     if cuda is None or not cuda.is_initialized():
         return {}
     return {'GPU memory [MiB]': f'{cuda.memory_allocated() / 2**20:.0f}'}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A managed node with its lifecycle, and the process that it runs in.
+"""A managed node with its lifecycle, and the main function of its process.
 
-run_node is the main function of that process, and the only caller of rclpy.init.
+run_node is the main function, and the only caller of rclpy.init in a node.
 """
 
 import atexit
@@ -43,20 +43,20 @@ from cliploc_ros.units import NS_PER_S
 # Nav2's defaults (nav2_util::LifecycleNode and its parameter bond_heartbeat_period).
 _HEARTBEAT_PERIOD_S = 0.1
 _HEARTBEAT_TIMEOUT_S = 4.0
-# How long the last message of a bond may take to a manager that hangs.
+# Longest wait until a manager, which may hang, acknowledges the last message of a bond.
 _LAST_WORD_S = 0.2
-# A transition may load weights for seconds; meanwhile clients can ask for the state.
+# A transition may load weights for seconds; meanwhile clients can request the state.
 _MAX_TRANSITION_REQUESTS = 3
-# Characters of the label of a transition; rclpy's own have 21.
+# Greatest length of the label of a transition; the labels of rclpy have up to 21 characters.
 _MOST_LABEL = 100
-# Between attempts of a node to bring itself up; the pause doubles each time.
+# Pause between attempts of a node to activate itself; it doubles each time.
 _FIRST_PAUSE_S = 2.0
 _LONGEST_PAUSE_S = 60.0
 _PACKAGE_LOGGER = logging.getLogger('cliploc_ros')
 _M_ARENA_MAX = -8  # malloc.h
-# Python handles a signal between two waits.
+# Longest wait of the executor: Python handles signals between waits.
 _SPIN_S = 0.2
-# Time for callbacks to end before their node is destroyed: requests are answered meanwhile.
+# Time for callbacks to end before their node is destroyed, so that requests are answered.
 _GRACE_S = 1.0
 _HELP = """\
 usage: ros2 run cliploc_ros {name} --ros-args [--params-file FILE] [-p NAME:=VALUE] [-r OLD:=NEW]
@@ -69,12 +69,12 @@ ros2 launch cliploc_ros relocalization.launch.py starts detector and relocalizer
 
 
 def start_bond(node: Node) -> Any:
-    """Return a started bond, which the manager takes up; None where bondpy is not installed.
+    """Start and return a bond with the lifecycle manager; None if bondpy is not installed.
 
     Parameters
     ----------
     node : Node
-        The manager identifies the bond by the node's name.
+        The node, by whose name the manager identifies the bond.
     """
     try:
         from bondpy.bondpy import Bond
@@ -88,7 +88,7 @@ def start_bond(node: Node) -> Any:
 
 
 class RosLogHandler(logging.Handler):
-    """Logs the records of Python's logging through a node."""
+    """Forwards records of Python's logging to the logger of a node."""
 
     def __init__(self, node: Node) -> None:
         super().__init__(logging.INFO)
@@ -96,7 +96,7 @@ class RosLogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log one record at its level."""
-        # rclpy refuses a level that varies at one call site.
+        # one call per level, because rclpy refuses different levels at one call site
         if record.levelno >= logging.ERROR:
             self._logger.error(record.getMessage())
         elif record.levelno >= logging.WARNING:
@@ -110,21 +110,21 @@ class NotActiveError(CliplocError):
 
 
 class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
-    """A lifecycle node whose networks run in a worker beside its executor.
+    """A lifecycle node whose networks run in a worker thread beside its executor.
 
-    The node brings itself up, and retries when that fails, until a client changes its state:
-    from then on that client manages it. With autostart false it waits for a manager.
+    The node configures and activates itself, and retries after failures, until a client changes
+    its state: from then on that client manages it. With autostart false it waits for a manager.
 
     Parameters
     ----------
     name : str
-        Name of the node. Parameters given at start-up are declared as they come.
+        Name of the node.
     parameters : type
-        Its parameters.
+        The dataclass of its parameters.
     others : type, optional
-        Parameters of the nodes that may be given the same file.
+        Parameters of other nodes that may be in the same parameter file.
     options
-        Of rclpy's Node.
+        Further arguments of rclpy's Node.
 
     Raises
     ------
@@ -137,7 +137,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         try:
             Node.__init__(self, name, automatically_declare_parameters_from_overrides=True,
                           **options)
-        except ValueError as error:  # of a parameter that rclpy does not name
+        except ValueError as error:  # rclpy does not name the parameter
             raise OptionsError('a parameter has no value: correct the parameter file; a map of '
                                f'keyframes alone is given as map_file ({error})') from error
         LifecycleNodeMixin.__init__(
@@ -161,7 +161,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         self._start: Future[None] | None = None
         self._start_lock = threading.Lock()
         self._pause_s = _FIRST_PAUSE_S
-        # Simulated time may stand still.
+        # Steady time, because simulated time may be paused.
         self._starter = self.create_timer(0.0, self._start_by_itself,
                                           MutuallyExclusiveCallbackGroup(),
                                           Clock(clock_type=ClockType.STEADY_TIME))
@@ -170,33 +170,33 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
 
     @abstractmethod
     def load(self) -> str:
-        """Load map and weights in the worker's thread; return what was loaded, in one line."""
+        """Load map and weights, in the worker's thread; return a description in one line."""
 
     @abstractmethod
     def unload(self) -> None:
-        """Drop what load brought, in the worker's thread."""
+        """Drop map and weights, in the worker's thread."""
 
     @abstractmethod
     def open(self) -> None:
-        """Begin to work. close undoes it, also where open failed halfway."""
+        """Start work. close() undoes it, also after open() failed."""
 
     @abstractmethod
     def close(self) -> None:
-        """Stop working, and release requests that wait. The worker may still be busy."""
+        """Stop work, and release waiting requests. The worker may still be busy."""
 
     @abstractmethod
     def examine(self, health: Health) -> None:
-        """Report how the active node is."""
+        """Add problems and values of the active node to its health."""
 
     def release(self) -> None:
-        """Release requests that wait: the process ends."""
+        """Release waiting requests, because the process is ending."""
 
     def end_bond(self) -> None:
-        """Tell the manager that the node ends its work; a bond needs the node to do so.
+        """End the bond with the manager. The node must still exist.
 
-        bondpy destroys its publisher as soon as it has said so, and the message with it. And it
-        destroys publisher and subscription, but leaves them to the node: its executor would come
-        upon them for ever, and do nothing else.
+        bondpy destroys its publisher directly after its last message, which is then lost, so this
+        waits for the acknowledgement. bondpy also leaves the destroyed publisher and subscription
+        in the node, where they would keep the executor busy for ever, so they are removed.
         """
         bond, self._bond = self._bond, None
         if bond is not None:
@@ -212,23 +212,23 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
     def state(self) -> str:
         """Return the name of the lifecycle state."""
         try:
-            with self._state_machine:  # keeps rclpy from destroying it meanwhile
+            with self._state_machine:  # so that rclpy does not destroy it meanwhile
                 return str(self._state_machine.current_state[1])
         except InvalidHandle:
             return 'finalized'
 
     def bring_up(self, deadline: float = math.inf) -> None:
-        """Return once the node is active; configure and activate it if it manages itself.
+        """Wait until the node is active; configure and activate it if it manages itself.
 
         Parameters
         ----------
         deadline : float
-            When to stop waiting (monotonic clock) [s]; loading goes on.
+            When to stop waiting (monotonic clock) [s]. Loading continues.
 
         Raises
         ------
         NotActiveError
-            It cannot be active, is still loading, or its manager does not want it to be.
+            The node failed to activate, is still loading, or its manager has not activated it.
         """
         if self._self_managed and not self.active:
             left_s = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
@@ -247,8 +247,8 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
             raise NotActiveError(f'the node is {state}: {self._failure or remedy}')
 
     def report(self, traceback_text: str) -> None:
-        """Log a defect, throttled: one that repeats with every frame would fill the disk."""
-        if self.context.ok():  # rclpy cannot log at the end of the process
+        """Log a traceback, throttled, because an error in every frame would fill the disk."""
+        if self.context.ok():  # rclpy cannot log after its shutdown
             self.get_logger().error(traceback_text, throttle_duration_sec=1.0)
 
     def _health(self) -> Health:
@@ -261,7 +261,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         return health
 
     def _begin_start(self) -> 'Future[None]':
-        """Return the start that is under way, or a new one."""
+        """Return the running activation, or begin a new one."""
         with self._start_lock:
             if self._start is None or self._start.done():
                 try:
@@ -281,7 +281,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
             raise StoppedError('the node is shutting down') from error
 
     def _start_by_itself(self) -> None:
-        """Bring the node up unless it has a manager; retry later where that fails."""
+        """Activate the node unless it has a manager; retry later after a failure."""
         try:
             if self._self_managed:
                 self.bring_up()
@@ -297,15 +297,15 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         return self._attempt(self._configure)
 
     def on_activate(self, state: LifecycleState) -> Outcome:
-        """Begin to work."""
+        """Start work."""
         return self._attempt(self._activate)
 
     def on_deactivate(self, state: LifecycleState) -> Outcome:
-        """Stop working; what is loaded stays."""
+        """Stop work, but keep map and weights."""
         return self._attempt(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> Outcome:
-        """Free what is loaded."""
+        """Free map and weights."""
         return self._attempt(self._free)
 
     def on_shutdown(self, state: LifecycleState) -> Outcome:
@@ -313,7 +313,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         return self._attempt(self._free)
 
     def on_error(self, state: LifecycleState) -> Outcome:
-        """Free everything after a defect of this package; the node can be configured again."""
+        """Free everything after an internal error; the node can be configured again."""
         failure = self._failure
         outcome = self._attempt(self._free)
         self._failure = failure
@@ -349,7 +349,10 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         free_memory()
 
     def _attempt(self, step: Callable[[], None]) -> Outcome:
-        """Take a step; rclpy would swallow its exceptions. A retry logs the same failure once."""
+        """Run a transition and log its exceptions, which rclpy would hide.
+
+        The same failure of a retry is not logged again.
+        """
         try:
             step()
         except CliplocError as error:
@@ -365,26 +368,26 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         return Outcome.SUCCESS
 
     def _answer_impossible_transitions(self) -> None:
-        """Let the service refuse where rclpy raises and leaves its client without an answer."""
+        """Make the service refuse impossible transitions; rclpy raises and never answers."""
         service = next(service for service in self.services if service.srv_type is ChangeState)
         change = service.callback
 
         def answer(request: ChangeState.Request, response: ChangeState.Response
                    ) -> ChangeState.Response:
             self._self_managed = False
-            # rcl logs a label that it does not know, of any length
+            # rcl logs unknown labels of any length
             request.transition.label = request.transition.label[:_MOST_LABEL]
             with self._transition, self._state_machine:
                 try:
                     return change(request, response)
-                except Exception as error:  # rcl's own type; rcl has logged it
+                except Exception as error:  # a type of rcl, which has logged it
                     self.get_logger().debug(str(error))
                     response.success = False
                     return response
         service.callback = answer
 
     def destroy_node(self) -> None:
-        """Destroy the services of the state machine, which rclpy leaves behind, and the node."""
+        """Destroy the node and the services of its state machine, which rclpy forgets."""
         _PACKAGE_LOGGER.removeHandler(self._log_handler)
         self._starting.shutdown(wait=False, cancel_futures=True)
         self._state_machine.destroy_when_not_in_use()
@@ -394,27 +397,27 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
 def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoReturn:
     """Spin a node until SIGINT or SIGTERM; then end the process with exit code 0 within 2 s.
 
-    With --help print what it is about in place of that.
+    With --help, print the text `about` instead.
     """
     if {'-h', '--help'} & {*split_ros_args(sys.argv[1:])[0]}:
         print(_HELP.format(name=name, about=about))
         sys.exit()
     # The networks of both nodes share a robot's cores. PyTorch's threads wait by spinning, which
-    # slows the other process tenfold. PyTorch reads this when it is loaded.
+    # slows the other process tenfold. PyTorch reads this variable when it is loaded.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
-    # All threads share two heaps: free memory kept in twenty of them adds up.
+    # Two heaps for all threads: free memory in twenty heaps adds up.
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
     if mallopt is not None:  # glibc
         mallopt(_M_ARENA_MAX, 2)
-    # Python would raise KeyboardInterrupt anywhere, even in the middle of a callback. rclpy would
-    # end its context at once: a request under way could not be answered, nor a bond be ended.
+    # Python would raise KeyboardInterrupt anywhere, even inside a callback. rclpy would shut down
+    # its context at once, so that the current request is not answered and the bond not ended.
     interrupted = Interruption()
     interrupted.catch(signal.SIGINT, signal.SIGTERM)
     try:
         rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rcl has its own types, for arguments and for missing folders
-        sys.exit(f'error: ROS does not start: {error} (is HOME or ROS_LOG_DIR set, to a folder '
-                 'with room?)')
+    except Exception as error:  # rcl raises different types for arguments and for folders
+        sys.exit(f'error: ROS does not start: {error}; correct the arguments, or set HOME or '
+                 'ROS_LOG_DIR to a writable folder')
     executor = NodeExecutor()
     node = None
     try:
@@ -437,22 +440,22 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
             node.end_bond()
             node.release()
             node.worker.stop()
-            # A callback that runs on in a destroyed node causes a segmentation fault. rclpy's
-            # own shutdown should wait for callbacks, but does not.
+            # A callback that still runs in a destroyed node causes a segmentation fault. The
+            # shutdown of rclpy should wait for callbacks, but does not.
             executor._work_tracker.wait(_GRACE_S)
-            # The executor's pending handlers keep references to all entities it waited for.
+            # Pending handlers of the executor keep references to all entities it waited for.
             executor.shutdown(0.0)
-            # Without this, other nodes take it for alive for 20 s, and requests to it are lost.
+            # Otherwise other nodes see the node for another 20 s, and requests to it are lost.
             node.destroy_node()
         rclpy.try_shutdown()
     _leave()
 
 
 def _leave() -> NoReturn:
-    """End the process now.
+    """End the process immediately.
 
-    A thread inside a network cannot be stopped. Python would wait for it, and then need seconds
-    to unload torch.
+    A thread that runs a network cannot be stopped. Python would wait for it, and then need
+    seconds to unload torch.
     """
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

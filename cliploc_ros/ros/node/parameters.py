@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters declared once: each field of a dataclass is declaration, validation, documentation.
+"""Node parameters as fields of a dataclass: declared, validated and documented in one place.
 
 generate_parameter_library does the same at build time, but has no package outside of apt.
 """
@@ -23,7 +23,7 @@ from cliploc_ros.errors import OptionsError, did_you_mean
 
 Value = str | int | float | bool | list[float] | list[str]
 
-# Parameters that rclpy declares itself, and the parameters of a map.
+# Parameters that rclpy declares, and the parameters of a map.
 _FOREIGN_PREFIXES = ('map.', 'qos_overrides.')
 _FOREIGN_NAMES = ('use_sim_time', 'start_type_description_service')
 
@@ -33,26 +33,26 @@ class ParameterRow:
     """One parameter of a node."""
 
     name: str
-    #: Its type is the parameter's. A list of texts may have any length, and ROS knows the type of
-    #: one that is not empty only: [''] stands for none.
+    #: Its type is that of the parameter. A list of texts may have any length. Because ROS does not
+    #: know the type of an empty list, [''] stands for it.
     default: Value
-    #: One sentence in prose.
+    #: One sentence.
     description: str
     #: SI symbol, px or ''.
     unit: str = ''
-    #: Range of a number, ends included.
+    #: Range of a number, including both ends.
     low: float = -math.inf
     high: float = math.inf
-    #: The allowed values of a text; empty allows any.
+    #: The allowed values of a text; empty: any.
     choices: tuple[str, ...] = ()
-    #: Read at start-up only. The others change at run time.
+    #: Read only at start-up. Other parameters can change at run time.
     read_only: bool = False
-    #: A list of numbers may be as long as its default, or several times as long.
+    #: Whether the length of a list may be a multiple of that of its default.
     repeats: bool = False
 
     @property
     def allowed(self) -> str:
-        """Return the allowed values in words."""
+        """Return a description of the allowed values."""
         if self.choices:
             return ', '.join(self.choices)
         if isinstance(self.default, bool) or not isinstance(self.default, int | float):
@@ -79,9 +79,9 @@ class ParameterRow:
         return descriptor
 
     def validated(self, value: Any) -> Value:
-        """Return a value in the parameter's type; an integer becomes a float where that is meant.
+        """Return a value in the parameter's type; an integer is converted to float if needed.
 
-        OptionsError: names the parameter and what it allows.
+        OptionsError: the value is invalid; the message names the parameter and allowed values.
         """
         if isinstance(self.default, float) and type(value) is int:
             value = float(value)
@@ -103,7 +103,7 @@ class ParameterRow:
             raise OptionsError(f'{self.name}: must be of type {type(self.default).__name__}, '
                                f'not {type(value).__name__} ({value!r:.60})')
         if self.choices and value not in self.choices:
-            raise OptionsError(f"{self.name}: '{value}' is none of {self.allowed}"
+            raise OptionsError(f"{self.name}: '{value}' is not one of {self.allowed}"
                                f'{did_you_mean(str(value), self.choices)}')
         if isinstance(value, int | float) and not self.low <= value <= self.high:
             raise OptionsError(f'{self.name}: {value} must be {self.allowed}')
@@ -111,7 +111,7 @@ class ParameterRow:
 
 
 def parameter(default: Value, description: str, **row_fields: Any) -> Any:
-    """Return the field of a parameter in a subclass of Parameters; see ParameterRow."""
+    """Return the field of a parameter for a subclass of Parameters; see ParameterRow."""
     row = ParameterRow('', default, description, **row_fields)
     if isinstance(default, list):
         return field(default_factory=default.copy, metadata={'row': row})
@@ -120,7 +120,7 @@ def parameter(default: Value, description: str, **row_fields: Any) -> Any:
 
 @dataclass(frozen=True)
 class Parameters:
-    """The values of a node's parameters; a subclass has a field for each, made by `parameter`."""
+    """The values of a node's parameters. Subclasses add fields made by `parameter`."""
 
     autostart: bool = parameter(
         True, 'Configure and activate at start-up; false: wait for a lifecycle manager.',
@@ -128,26 +128,26 @@ class Parameters:
 
     @classmethod
     def rows(cls) -> tuple[ParameterRow, ...]:
-        """Return the declarations, own ones before inherited ones."""
-        own_first = sorted(fields(cls), key=lambda one: one.name not in cls.__annotations__)
-        return tuple(replace(one.metadata['row'], name=one.name) for one in own_first)
+        """Return the declarations, those of this class before inherited declarations."""
+        own_first = sorted(fields(cls), key=lambda own: own.name not in cls.__annotations__)
+        return tuple(replace(own.metadata['row'], name=own.name) for own in own_first)
 
     def check(self) -> None:
-        """Raise OptionsError where values do not fit together."""
+        """Raise OptionsError if values contradict each other."""
 
 
 class NodeParameters[P: Parameters]:
-    """The parameters of one node: declared from a dataclass, validated at every change.
+    """The parameters of one node, declared from a dataclass and validated at every change.
 
-    An invalid value in a parameter file does not end the node: snapshot() raises it until the
-    value is corrected.
+    An invalid value in a parameter file does not end the node: snapshot() raises an error until
+    the value is corrected.
 
     Parameters
     ----------
     node : Node
         Made with automatically_declare_parameters_from_overrides=True.
     others : type, optional
-        Parameters of other nodes, which the same parameter file may hold.
+        Parameters of other nodes that may be in the same parameter file.
     """
 
     def __init__(self, node: Node, kind: type[P], others: type[Parameters] = Parameters) -> None:
@@ -161,8 +161,8 @@ class NodeParameters[P: Parameters]:
             if name not in known and not name.startswith(_FOREIGN_PREFIXES):
                 node.get_logger().warning(f"unknown parameter '{name}' has no effect"
                                           f'{did_you_mean(name, self._rows)}')
-        #: The values, which may not fit together. Replaced as a whole: a reader sees all of a
-        #: change or none of it.
+        #: The values, which may contradict each other. The object is replaced at a change, so
+        #: that readers never see a partial change.
         self.values: P = kind(**{name: node.get_parameter(name).value for name in self._rows})
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._take)
@@ -170,7 +170,7 @@ class NodeParameters[P: Parameters]:
     def snapshot(self) -> P:
         """Return the values.
 
-        OptionsError: a value given at start-up is not allowed, or the values do not fit together.
+        OptionsError: a value given at start-up is invalid, or values contradict each other.
         """
         if self._problems:
             raise OptionsError('parameter ' + '; '.join(self._problems.values()))
@@ -179,7 +179,7 @@ class NodeParameters[P: Parameters]:
         return values
 
     def _declare(self, row: ParameterRow) -> None:
-        """Declare one parameter with its value from the command line or file, or its default."""
+        """Declare a parameter with its value from command line or file, else with its default."""
         value: Value = row.default
         if self._node.has_parameter(row.name):
             given = self._node.get_parameter(row.name).value
@@ -193,7 +193,7 @@ class NodeParameters[P: Parameters]:
         self._node.declare_parameter(row.name, value, row.descriptor, ignore_override=True)
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Allow a change if all values are valid together; another callback may refuse it."""
+        """Allow a change if all values are valid together. Other callbacks may still refuse it."""
         try:
             for parameter in parameters:
                 if parameter.name.startswith('map.'):
@@ -206,13 +206,13 @@ class NodeParameters[P: Parameters]:
         return SetParametersResult(successful=True)
 
     def _take(self, parameters: list[Parameter]) -> None:
-        """Use a change that every callback allowed."""
+        """Apply a change that all callbacks allowed."""
         changed = self._validated(parameters)
         self.values = replace(self.values, **changed)
         self._problems = {name: text for name, text in self._problems.items()
                           if name not in changed}
 
     def _validated(self, parameters: list[Parameter]) -> dict[str, Any]:
-        """Return the values of the parameters that the table declares, by name."""
+        """Return the validated values of parameters that the dataclass declares, by name."""
         return {parameter.name: self._rows[parameter.name].validated(parameter.value)
                 for parameter in parameters if parameter.name in self._rows}

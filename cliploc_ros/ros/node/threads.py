@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The threads of a node: messages in one, services and timers in others, networks in a worker."""
+"""The threads of a node: one for messages, a pool for services and timers, one for networks."""
 
 import math
 import threading
@@ -20,13 +20,13 @@ from rclpy.timer import Timer
 
 from cliploc_ros.errors import CliplocError, InternalError, StoppedError, TimeUpError
 
-# Requests that may wait at a time, a thread each; further requests wait in the middleware.
+# Greatest number of requests that wait in a thread; further requests wait in the middleware.
 MAX_REQUESTS = 16
-# For requests that wait, transitions, parameters and timers. The pool creates threads on demand.
+# Threads for waiting requests, transitions, parameters and timers, created on demand.
 _THREADS = MAX_REQUESTS + 8
-# A thread is free, but may wait for a core.
+# Longest wait until a free thread gets a core and begins its callback.
 _BEGIN_S = 0.1
-# How long a running network may delay the end of its process.
+# Greatest delay of the end of the process by a running network.
 _GRACE_S = 0.2
 
 
@@ -40,12 +40,12 @@ class BoundedCallbackGroup(CallbackGroup):
         self._lock = threading.Lock()
 
     def can_execute(self, entity: object) -> bool:
-        """Return whether another callback may begin."""
+        """Return whether a further callback may begin."""
         with self._lock:
             return len(self._running) < self._limit
 
     def beginning_execution(self, entity: object) -> bool:
-        """Count a callback that begins; return whether it may."""
+        """Count a callback that begins; return whether it may begin."""
         with self._lock:
             if len(self._running) >= self._limit:
                 return False
@@ -59,11 +59,11 @@ class BoundedCallbackGroup(CallbackGroup):
 
 
 class NodeExecutor(SingleThreadedExecutor):
-    """Takes messages in the thread that spins; services and timers may block, so others run them.
+    """Runs callbacks of messages in the spinning thread, services and timers in a pool.
 
-    rclpy's MultiThreadedExecutor passes each message to another thread. Until that thread takes
-    it, a subscription with events wakes the executor again and again, which costs a whole core
-    and contention for Python's lock.
+    Services and timers may block. rclpy's MultiThreadedExecutor also passes each message to
+    another thread. Until that thread takes it, a subscription with events wakes the executor
+    repeatedly, which costs a whole core and contention for Python's lock.
     """
 
     def __init__(self) -> None:
@@ -71,7 +71,7 @@ class NodeExecutor(SingleThreadedExecutor):
         self._pool = ThreadPoolExecutor(_THREADS, thread_name_prefix='service')
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Execute one callback, or begin to. Its exceptions are logged and end nothing."""
+        """Execute one callback, or start it in the pool. Its exceptions are logged."""
         try:
             handler, entity, node = self.wait_for_ready_callbacks(timeout_sec)
         except (TimeoutException, InvalidHandle):  # an entity may be destroyed meanwhile
@@ -80,7 +80,7 @@ class NodeExecutor(SingleThreadedExecutor):
             _run(handler, node)
             return
         self._pool.submit(_run, handler, node)
-        # rclpy returns a handler again until it has begun
+        # wait, because rclpy returns a handler repeatedly until it has begun
         late = time.monotonic() + _BEGIN_S
         while not (handler.executing() or handler.done()) and time.monotonic() < late:
             time.sleep(0.0)
@@ -92,10 +92,10 @@ def _run(handler: Task, node: Node) -> None:
 
 
 def log_failure(error: Exception | None, node: Node) -> None:
-    """Log the exception of a callback, or of rclpy itself.
+    """Log the exception of a callback or of rclpy.
 
-    InvalidHandle is left out: an entity may be destroyed while rclpy waits for it. So is
-    everything that rclpy raises while the process ends.
+    InvalidHandle is ignored: an entity may be destroyed while rclpy waits for it. Exceptions
+    after the shutdown of rclpy are ignored, too.
     """
     if error is not None and not isinstance(error, InvalidHandle) and node.context.ok():
         text = ''.join(traceback.format_exception(error))
@@ -103,12 +103,12 @@ def log_failure(error: Exception | None, node: Node) -> None:
 
 
 class Worker:
-    """Runs tasks one at a time in a thread of its own, and survives all of them.
+    """Runs tasks one at a time in a separate thread. It survives their exceptions.
 
     Parameters
     ----------
     report : callable
-        Takes the traceback of an exception that is not a CliplocError.
+        Called with the traceback of an exception that is not a CliplocError.
     """
 
     def __init__(self, report: Callable[[str], object]) -> None:
@@ -118,7 +118,7 @@ class Worker:
         self._stopped: Future[None] = Future()
 
     def submit[T](self, task: Callable[[], T]) -> 'Future[T]':
-        """Queue a task; the returned future holds its result or its CliplocError."""
+        """Queue a task; return a future with its result or its CliplocError."""
         try:
             future = self._pool.submit(self._guarded, task)
         except RuntimeError as error:
@@ -128,20 +128,20 @@ class Worker:
         return future
 
     def run[T](self, task: Callable[[], T], deadline: float = math.inf) -> T:
-        """Return the result of a task when its turn has come.
+        """Queue a task, wait for it and return its result.
 
         Parameters
         ----------
         deadline : float
-            When to stop waiting (monotonic clock) [s]. A task that has begun goes on; one that
-            still waits is dropped, else requests would pile up behind a slow task.
+            When to stop waiting (monotonic clock) [s]. A task that has begun continues. A task
+            that still waits is dropped, because requests would pile up behind a slow task.
 
         Raises
         ------
         CliplocError
-            The task raised it; StoppedError when the process ends first.
+            The task raised it. StoppedError: the process ends before the task.
         TimeUpError
-            The deadline passed first.
+            The deadline passed before the task ended.
         """
         future = self.submit(task)
         either: list[Future[Any]] = [future, self._stopped]
@@ -153,7 +153,7 @@ class Worker:
             raise StoppedError('the node is shutting down')
         if not future.cancel() and future.done():
             return future.result()  # it has just ended
-        raise TimeUpError('localizing took longer than timeout_s: raise timeout_s, or choose '
+        raise TimeUpError('localization took longer than timeout_s: raise timeout_s, or choose '
                           'smaller networks')
 
     def _guarded[T](self, task: Callable[[], T]) -> T:
@@ -167,7 +167,7 @@ class Worker:
                                 'is in the log)') from error
 
     def stop(self) -> None:
-        """Drop the queue and give the running task a moment to end."""
+        """Drop all queued tasks and wait briefly for the running task."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         wait(list(self._running), _GRACE_S)
         if not self._stopped.done():
@@ -180,7 +180,7 @@ class LatestOnly[T]:
     Parameters
     ----------
     work : callable
-        Takes one item, in the worker's thread.
+        Called with an item, in the worker's thread.
     """
 
     def __init__(self, worker: Worker, work: Callable[[T], None]) -> None:
@@ -192,12 +192,12 @@ class LatestOnly[T]:
 
     @property
     def waiting(self) -> T | None:
-        """Return the waiting item, if there is one."""
+        """Return the waiting item; None without any."""
         with self._lock:
             return self._items[0] if self._items else None
 
     def offer(self, item: T) -> None:
-        """Queue an item; it replaces an item that still waits."""
+        """Queue an item in place of a waiting item."""
         with self._lock:
             waiting = bool(self._items)
             self.dropped += waiting
