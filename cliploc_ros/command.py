@@ -88,7 +88,7 @@ def _extra_with(package: str) -> str:
         requirements = []
     extras = re.findall(rf"^{re.escape(package)}\b.*extra == ['\"](\w+)",
                         '\n'.join(requirements), re.MULTILINE)
-    return f"'cliploc_ros[{extras[0]}]'" if extras else 'the extra that includes it, see doc/install.md'
+    return f"'cliploc_ros[{extras[0]}]'" if extras else 'the extra with it, see doc/install.md'
 
 
 def printable(text: str) -> str:

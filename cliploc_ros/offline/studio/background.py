@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Long computations, in a thread while people use the page."""
+"""Long computations in a background thread."""
 
 import threading
 from collections.abc import Callable, Hashable
@@ -9,7 +9,7 @@ _MOST_KEPT = 1000
 
 
 class Background[Answer]:
-    """Answers questions in a thread, and keeps the answers. Only the last question counts.
+    """Computes answers in a thread, and caches them. Only the newest question is computed.
 
     ``on_change`` is called in the thread after each answer.
     """
@@ -23,9 +23,9 @@ class Background[Answer]:
         self._is_stopped = False
 
     def ask(self, key: Hashable, find: Callable[[], Answer]) -> Answer | None:
-        """Return the answer to a question that a key tells from others; None until it is found.
+        """Return the answer to the question with this key; None until it is computed.
 
-        ``find`` returns the answer, and raises nothing. After a stop, no answer is looked for.
+        ``find`` computes the answer, and must not raise. After a stop, nothing is computed.
         """
         with self._lock:
             if key not in self._answers and not self._is_stopped:
@@ -36,7 +36,7 @@ class Background[Answer]:
             return self._answers.get(key)
 
     def stop(self) -> None:
-        """Forget the question, take no others, and wait for the thread."""
+        """Drop the question, refuse further questions, and wait for the thread."""
         with self._lock:
             self._is_stopped, self._wanted, thread = True, None, self._thread
         if thread is not None:

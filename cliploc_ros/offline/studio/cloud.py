@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The surfaces around the landmarks, as a coloured cloud.
 
-The cloud is the recording's depth, or else the points of the keyframes. Both are thinned, and end
-where neither a camera nor a landmark is: a ceiling would hide the room from above.
+The points come from the recording's depth images, or without depth, from the keyframes. They are
+thinned, and cut above the highest camera and landmark: a ceiling would hide the room from above.
 """
 
 from typing import Any, NamedTuple
@@ -19,20 +19,20 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.viewpoint import Bounds
 
-#: More points slow the browser down.
+#: Greatest number of points: more slow down the browser.
 MAX_POINTS = 100_000
-# Views whose depth is read, and every n-th pixel of them in each direction.
+# Number of views whose depth is read, and step between the pixels that are used.
 _DEPTH_VIEWS, _DEPTH_STEP = 50, 5
-# Depth beyond this is mostly noise [m].
+# Greatest depth used: greater depth is mostly noise [m].
 _MOST_DEPTH_M = 8.0
-# One point is kept of each cube of this side, or of a larger one where too many are left [m].
+# One point per cube of this side is kept [m]. The side grows by a factor until few enough remain.
 _LEAST_SIDE_M, _GROWTH = 0.02, 1.25
 _HEADROOM_M = 0.2
 _PALE = 0.25
-# Points without an image, from the floor to the top of the map.
+# Colours by height, from the floor to the top of the map, for points without an image.
 _HEIGHT_RGB = np.array([(150, 110, 60), (60, 150, 110), (60, 100, 190)], dtype=np.float64)
-# Size of a point, by the side of its cube: those of depth nearly touch, those of keyframes, which
-# lie on edges of objects, leave the landmarks free.
+# Size of a point relative to the side of its cube. Points of depth almost touch. Points of
+# keyframes lie on edges of objects and are smaller, so that they do not hide the landmarks.
 _DEPTH_SIZE, _KEYFRAME_SIZE = 0.25, 0.15
 
 
@@ -46,7 +46,7 @@ class Cloud(NamedTuple):
 
 def find_cloud(recording: Recording | None, layer: KeyframeLayer | None, extent: Bounds
                ) -> Cloud | None:
-    """Return the points of a map's surfaces; None if nothing is known of them.
+    """Return the points of a map's surfaces; None without depth and keyframes.
 
     CliplocError: an image or depth image cannot be read.
     """
@@ -59,7 +59,7 @@ def find_cloud(recording: Recording | None, layer: KeyframeLayer | None, extent:
         return None
     points = np.concatenate([part[0] for part in parts]).astype(np.float32)
     colors = np.concatenate([part[1] for part in parts])
-    with np.errstate(invalid='ignore'):  # the edges of a lens have no ray
+    with np.errstate(invalid='ignore'):  # pixels at the edge of a lens may have no ray
         is_low = points @ extent.up.astype(np.float32) < extent.top_m + _HEADROOM_M
     return _thinned(points[is_low], colors[is_low], size)
 
@@ -86,7 +86,7 @@ def _points_of_depth(detections: PosedDetections, images: Images
 
 def _points_of_keyframe(layer: KeyframeLayer, keyframe: int, recording: Recording | None,
                         extent: Bounds) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return points and their colours: of the keyframe's image, the recording's, or by height."""
+    """Return points with colours of the keyframe's or the recording's image, else by height."""
     points, image = layer.points_in_map(keyframe), layer.image_rgb(keyframe)
     if image is None and recording is not None:
         image = recording.image_at(layer.map_from_camera[keyframe])
@@ -101,9 +101,9 @@ def _points_of_keyframe(layer: KeyframeLayer, keyframe: int, recording: Recordin
 
 
 def _thinned(points: NDArray[np.float32], colors: NDArray[np.uint8], size: float) -> Cloud:
-    """Return one point of each cube, and its colour, a little paler than the landmarks'.
+    """Return one point per cube, in a colour that is paler than the landmarks.
 
-    ``size`` is that of a point, by the side of its cube.
+    ``size`` is the size of a point relative to the side of its cube.
     """
     side = _LEAST_SIDE_M / _GROWTH
     rows = np.arange(len(points))

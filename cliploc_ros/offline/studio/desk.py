@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the actions that the messages of a page name, and logs their results.
+"""Run the actions that the messages of a page request, and log their results.
 
-A message names an action and its values. An action is a method of the desk, the studio, its
-document, its review or its new landmark, and stands in the ACTIONS of its class. Each change wakes
-the page's redrawer.
+A message names an action and its arguments. An action is a method of the desk, the studio, its
+document, its review or its new landmark, and is listed in ACTIONS of its class. Each change wakes
+the thread that redraws the page.
 """
 
 import logging
@@ -22,31 +22,31 @@ from cliploc_ros.offline.studio.edits import EditError
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.viewpoint import Bounds, extent_of
 
-# Lines of the log, and characters of each.
+# Greatest number of lines in the log, and of characters in a line.
 _MAX_LINES, _MAX_TEXT = 60, 600
-# How long stopping waits for an action that takes long.
+# Longest wait for a slow action when the studio stops.
 _GRACE_S = 2.0
-# After these, the camera of the person flies to the selection.
+# Actions after which the user's camera flies to the new selection.
 _BRING_ANOTHER = ('step', 'accept', 'discard', 'create', 'select')
 
 logger = logging.getLogger(__name__)
 
 
 class Desk:
-    """The actions of the people at the page.
+    """The actions of the users of the page.
 
     Attributes
     ----------
     lines : tuple of tuple of str
-        The log, the newest line last: done, refused or error, and a text.
+        The log, newest line last: done, refused or error, and a text.
     is_old : bool
-        Whether a person did something after the newest line.
+        Whether a user acted after the newest line.
     running : dict of str to Thread
-        The actions that take long and go on.
+        The slow actions that are running.
     layers : dict of str to bool
-        Whether each layer of the scene is shown, by name.
+        Whether each layer of the scene is visible, by name.
     modes : dict of str to str
-        The mode of each person's page.
+        The mode of each user's page.
     """
 
     ACTIONS = ('show_layer', 'export')
@@ -62,7 +62,7 @@ class Desk:
         self._lock = threading.Lock()
 
     def stop(self) -> None:
-        """Stop the actions that take long."""
+        """Stop the slow actions."""
         self.studio.stop()
         for thread in list(self.running.values()):
             thread.join(_GRACE_S)
@@ -70,7 +70,7 @@ class Desk:
     # ---- messages -------------------------------------------------------------------------------
 
     def do(self, person: str, message: dict[str, Any]) -> None:
-        """Do what a message of a person's page says: its key 'do' names an action."""
+        """Run the action that a message of a user's page names under the key 'do'."""
         values = dict(message)
         name = str(values.pop('do', ''))
         if name in self.LOOKS:
@@ -78,20 +78,20 @@ class Desk:
         elif name == 'mode':
             self.show_mode(person, str(values.get('mode')))
         else:
-            # a page shows the best view of a selection by itself: nobody did anything else
+            # show_view is no action of the user: pages send it after each selection
             self.act(lambda: self._start(name, values), name != 'show_view')
             if name in _BRING_ANOTHER and not values.get('joins'):
                 self.look(self._client_of(person), 'fly')
 
     def show_mode(self, person: str, mode: str) -> None:
-        """Take the mode of a person's page, '' once it is closed."""
+        """Set the mode of a user's page; '' when the page is closed."""
         with self._lock:
-            others = {key: one for key, one in self.modes.items() if key != person}
+            others = {key: other for key, other in self.modes.items() if key != person}
             self.modes = {**others, person: mode} if mode else others
         self.studio.changed.set()
 
     def _start(self, name: str, values: dict[str, Any]) -> str | None:
-        """Do an action; one that takes long goes on in a thread."""
+        """Run an action; slow actions run in a thread."""
         studio = self.studio
         owners: tuple[Any, ...] = self, studio, studio.document, studio.review, studio.new
         for owner in owners:
@@ -108,23 +108,23 @@ class Desk:
             if name in self.running:
                 raise EditError(f"'{name.replace('_', ' ')}' is already running")
             if name == 'search_places':
-                studio.allow_search()  # before the thread begins: it may be stopped at once
+                studio.allow_search()  # before the thread starts, which may be stopped at once
             thread = threading.Thread(target=self._run, args=(name, action), daemon=True)
             with self._lock:
                 self.running = {**self.running, name: thread}
             thread.start()
             return None
-        raise EditError(f"the studio cannot '{name:.60}'"
+        raise EditError(f"the studio has no action '{name:.60}'"
                         + ('' if studio.new else ': there are no views to draw boxes in'))
 
     def _run(self, name: str, action: Callable[[], str | None]) -> None:
         self.ask(action)
         with self._lock:
-            self.running = {key: one for key, one in self.running.items() if key != name}
+            self.running = {key: thread for key, thread in self.running.items() if key != name}
         self.studio.changed.set()
 
     def act(self, action: Callable[[], str | None], makes_old: bool = True) -> None:
-        """Do something with the studio locked; the last result is old then, or stays new."""
+        """Run an action with the document locked; see `ask`."""
         def locked() -> str | None:
             with self.studio.document.lock:
                 return action()
@@ -132,7 +132,10 @@ class Desk:
         self.ask(locked, makes_old)
 
     def ask(self, action: Callable[[], str | None], makes_old: bool = True) -> None:
-        """Do something that locks the studio itself, if at all."""
+        """Run an action and log its result. `makes_old` marks earlier results as old.
+
+        The action locks the document where it needs to.
+        """
         try:
             message = action()
             self.is_old |= makes_old
@@ -141,7 +144,7 @@ class Desk:
         except CliplocError as error:
             self.log('refused', str(error))
         except Exception as error:
-            self.log('error', f'internal error: {error}; the terminal has more')
+            self.log('error', f'internal error: {error}; see the traceback in the terminal')
             logger.exception('an action of the page failed')
         self.studio.changed.set()
 
@@ -162,20 +165,20 @@ class Desk:
         self.layers = {**self.layers, name: is_shown is True}
 
     def export(self) -> str:
-        """Write the scene as one page that opens without a server."""
+        """Write the scene as an HTML file that can be opened without a server."""
         path = self.studio.document.path.with_suffix('.html')
         write_text(path, self.server.scene.as_html())
         return f'wrote {path.name}; open it in a browser'
 
     def extent(self) -> Bounds:
-        """Return the bounds of the landmarks and of the cameras that saw them."""
+        """Return the bounds of the landmarks and of the cameras."""
         studio = self.studio
         source = studio.layer if studio.recording is None else studio.recording.detections
         return extent_of([landmark.center for landmark in studio.document.landmarks.values()],
                          None if source is None else source.map_from_camera)
 
     def look(self, client: viser.ClientHandle | None, name: str, is_flat: bool = False) -> None:
-        """Move the camera of a person, which takes part of a second, in a thread."""
+        """Move the camera of a user in a thread, because it takes a fraction of a second."""
         if client is not None:
             threading.Thread(target=self._look, args=(client, name, is_flat), daemon=True).start()
 
@@ -197,11 +200,10 @@ class Desk:
             viewpoint.set_flat(client, is_flat)
 
     def _client_of(self, person: str) -> viser.ClientHandle | None:
-        """Return the scene's client of a person, whom the path of its connection names."""
+        """Return the scene's client of a user, by the path of its connection."""
         connections = self.server._websock_server._live_connections
         for number, client in self.server.get_clients().items():
-            one = connections.get(number)
-            if one is not None and one.request is not None and one.request.path.strip(
-                    '/') == f'scene/{person}':
+            request = getattr(connections.get(number), 'request', None)
+            if request is not None and request.path.strip('/') == f'scene/{person}':
                 return client
         return None

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The document: a map that is edited, with undo, a selection, a journal, and saving.
+"""The document: an edited map with undo, selection, journal and file.
 
-All threads share one document. Each method holds its lock; a caller that needs several steps at
-once holds it, too.
+All threads share one document. Each method holds its lock. Callers that need several steps to be
+atomic hold it, too.
 """
 
 from collections.abc import Callable, Iterable
@@ -37,16 +37,16 @@ _MAX_HISTORY = 10_000
 
 
 class Document:
-    """A map that is edited. Its file may not exist yet.
+    """An edited map. Its file may not exist yet.
 
     Attributes
     ----------
     landmarks : mapping of str to Landmark
-        By id. An edit makes a new mapping and leaves this one alone.
+        By id. Edits replace the mapping and do not modify it.
     changed : Event
         Set after each change of map, selection or file.
     notes : tuple of str
-        What a person should know of the files.
+        Remarks about the files, for the user.
 
     CliplocError: the file is not a map, another studio edits it, or its folder is not writable.
     """
@@ -57,7 +57,7 @@ class Document:
         self.lock = RLock()
         self.changed = Event()
         self.notes: tuple[str, ...] = ()
-        #: The digest of a content by another program, until a person decides about it
+        #: Digest of the file after another program changed it, until the user decides
         self.foreign = ''
         self._accepted = ''
         self.selection: tuple[str, ...] = ()
@@ -68,10 +68,10 @@ class Document:
         self._look_file = self._read_looks()
         self.landmarks: Landmarks = self._landmarks_of_file()
         self._saved: Landmarks = self.landmarks
-        # Edits that the file does not hold yet. Before the map is written, the journal gets the
-        # digest of its next content: replay starts at the right edit with either content.
+        # Edits that are not yet in the file. Before the map is written, the digest of its new
+        # content is added to the journal, so that replay works with the old and the new file.
         self._journal = Log(self.path.with_name(f'.{self.path.name}.studio'), DatasetError,
-                            "make room, and the map's folder writable",
+                            "free disk space, and make the map's folder writable",
                             lambda line: dict(parse_json(line)))
         try:
             entries, is_damaged = self._journal.read()
@@ -83,7 +83,7 @@ class Document:
             raise
         self._note_unknown_fields()
 
-    # ---- what it holds --------------------------------------------------------------------------
+    # ---- content --------------------------------------------------------------------------------
 
     @property
     def path(self) -> Path:
@@ -97,18 +97,18 @@ class Document:
 
     @property
     def encoder_key(self) -> str:
-        """The encoder of the landmarks' looks; '' if the map has none."""
+        """The encoder of the landmarks' embeddings; '' without embeddings."""
         return self._look_file.encoder_key
 
     def take_encoder(self, encoder_key: str) -> None:
-        """Let a map that starts empty have looks of an encoder; any other map stays as it is."""
+        """Set the encoder of the embeddings of a new, empty map; ignored for other maps."""
         with self.lock:
             if not self._file.landmarks and self._look_file.state is None:
                 self._look_file = self._look_file._replace(encoder_key=encoder_key)
 
     @property
     def selected(self) -> tuple[str, Landmark] | None:
-        """Id and landmark of a selection of exactly one."""
+        """Id and landmark of the selection; None unless it is exactly one landmark."""
         with self.lock:
             if len(self.selection) != 1:
                 return None
@@ -121,24 +121,24 @@ class Document:
         return self.selection
 
     def only_chosen(self) -> tuple[str, Landmark]:
-        """Return id and landmark of a selection of exactly one; EditError: it has others."""
+        """Return id and landmark of the selection; EditError: it is not exactly one landmark."""
         if (selected := self.selected) is None:
             raise EditError('select exactly one landmark first')
         return selected
 
     @property
     def is_saved(self) -> bool:
-        """Return whether the file holds all edits."""
+        """Return whether the file contains all edits."""
         return fields_of(self._saved) == fields_of(self.landmarks)
 
     @property
     def to_undo(self) -> str | None:
-        """The edit that the next undo takes back."""
+        """The edit that the next undo reverts."""
         return self._done[-1].what if self._done else None
 
     @property
     def to_redo(self) -> str | None:
-        """The edit that the next redo does again."""
+        """The edit that the next redo repeats."""
         return self._undone[-1].what if self._undone else None
 
     @property
@@ -147,14 +147,14 @@ class Document:
         return self._gesture is not None
 
     def to_map(self) -> LandmarkMap:
-        """Return the map as the relocalizer knows it; MapError where it has no landmarks."""
+        """Return the map of the relocalizer; MapError: there are no landmarks."""
         return replace(map_of(self.landmarks, self.frame_id, self.path.name),
                        map_set=self._file.map_set)
 
     # ---- edits ----------------------------------------------------------------------------------
 
     def apply(self, change: Change, gesture: object = None) -> None:
-        """Make a change; successive changes of one gesture, such as a drag, are undone together.
+        """Apply a change. Successive changes of one gesture, such as a drag, are undone together.
 
         CliplocError: the journal cannot be written.
         """
@@ -167,14 +167,17 @@ class Document:
 
     def edit(self, edit: Callable[..., Change], *arguments: Any, gesture: object = None,
              **values: Any) -> Change:
-        """Make an edit of the landmarks as they are, and return it; errors as of both."""
+        """Apply an edit to the current landmarks; return its change.
+
+        Errors: see `edit` and `apply`.
+        """
         with self.lock:
             change = edit(self.landmarks, *arguments, **values)
             self.apply(change, gesture)
             return change
 
     def undo(self) -> str | None:
-        """Undo the last edit; return which it was, None for none."""
+        """Undo the last edit; return a report, None without an edit."""
         with self.lock:
             if not self._done:
                 return None
@@ -182,15 +185,15 @@ class Document:
             return f'undid: {self.to_redo}'
 
     def redo(self) -> str | None:
-        """Do again the edit that was undone last; return which it was, None for none."""
+        """Redo the edit that was undone last; return a report, None without an edit."""
         with self.lock:
             if not self._undone:
                 return None
             self._do('redo', self._undone[-1])
-            return f'did again: {self.to_undo}'
+            return f'redid: {self.to_undo}'
 
     def select(self, landmark_ids: Iterable[str]) -> None:
-        """Select landmarks; unknown ids are left out."""
+        """Select landmarks; unknown ids are ignored."""
         with self.lock:
             self.selection = tuple(dict.fromkeys(
                 key for key in landmark_ids if key in self.landmarks))
@@ -202,7 +205,7 @@ class Document:
         self.changed.set()
 
     def _take(self, kind: str, change: Change) -> None:
-        """Make a change, and write history."""
+        """Apply a change, and update the history."""
         back, self.landmarks = change.undoing(self.landmarks), change.apply(self.landmarks)
         self._gesture = None
         if kind == 'undo':
@@ -218,10 +221,10 @@ class Document:
     # ---- the files ------------------------------------------------------------------------------
 
     def save(self) -> str:
-        """Write the map file in one step, and report it; refuse to overwrite others' changes.
+        """Write the map file atomically; return a report.
 
         CliplocError: another program changed the file, the map is empty, or a file cannot be
-        written; that one is as it was.
+        written. The file is then unchanged.
         """
         with self.lock:
             if not self.landmarks:
@@ -238,7 +241,7 @@ class Document:
             self._journal.append({'writing': file.digest, 'looks': {
                 key: look.to_json() for key, look in looks.items()
                 if key not in self.landmarks or self.landmarks[key].look is not look}})
-            # the map comes last: once it has its new content, nothing is left to do
+            # the map is written last: its new content marks a complete save
             self._look_file, fault = self._look_file.write(self.landmarks)
             self.notes += (fault,) if fault and fault not in self.notes else ()
             file.write()
@@ -251,7 +254,7 @@ class Document:
             return f'saved {self.path.name}'
 
     def overwrite(self) -> str:
-        """Save the map over the foreign content that saving found."""
+        """Save the map over the content of another program that `save` found."""
         with self.lock:
             self._accepted = self.foreign
             try:
@@ -260,9 +263,9 @@ class Document:
                 self._accepted = ''
 
     def reload(self) -> str:
-        """Take the map from the file; this is an edit that undo takes back.
+        """Read the map from the file again, as an edit that can be undone.
 
-        CliplocError: the file is not a map, or there is none.
+        CliplocError: the file is not a map, or does not exist.
         """
         with self.lock:
             file = read_map_file(self.path)
@@ -271,18 +274,18 @@ class Document:
             self._file = file
             self._look_file = self._read_looks()
             before = self.landmarks
-            found = {key: replace(one, marks=before[key].marks if key in before else Marks())
-                     for key, one in self._landmarks_of_file().items()}
+            found = {key: replace(landmark, marks=before[key].marks if key in before else Marks())
+                     for key, landmark in self._landmarks_of_file().items()}
             self._take('edit', Change('reload the file', {**dict.fromkeys(before), **found}))
             self._saved = found
             self.foreign = ''
             self._journal.restart([self._header()])
             self._note_unknown_fields()
             self.changed.set()
-            return f'reloaded {self.path.name}; undo takes it back'
+            return f'reloaded {self.path.name}; undo reverts this'
 
     def close(self) -> None:
-        """Release the journal, which stays if it holds edits or marks."""
+        """Close the journal; remove it if it has neither edits nor marks."""
         with self.lock:
             is_needed = not self.is_saved or self._marks()
             self._journal.close() if is_needed else self._journal.remove()
@@ -313,7 +316,7 @@ class Document:
                 if landmark.marks != Marks()}
 
     def _replay(self, entries: list[dict[str, Any]]) -> None:
-        """Do again the edits in the journal, from the content that the file has."""
+        """Repeat the edits of the journal that are not in the file."""
         digest = self._file.digest
         starts = [row for row, entry in enumerate(entries)
                   if digest in (entry.get('base'), entry.get('writing'))]
@@ -322,7 +325,7 @@ class Document:
         header, done = self._header(), list[dict[str, Any]]()
         try:
             if edits and not starts:
-                raise EditError('they do not fit the file, which another program changed')
+                raise EditError('another program changed the file, so they do not match it')
             self._restore(entries[:start + 1], entries[-1:])
             header = self._header()
             for entry in edits:
@@ -336,20 +339,21 @@ class Document:
         if not starts:
             self._journal.restart([header])
         if done and not self.is_saved:
-            self.notes += (f'restored {len(done)} edits that were not saved; undo takes them '
-                           'back',)
+            self.notes += (f'restored {len(done)} edits that were not saved; undo reverts '
+                           'them',)
 
     def _restore(self, entries: list[dict[str, Any]], last: list[dict[str, Any]]) -> None:
-        """Restore the marks and looks that belong to the file's content.
+        """Restore the marks and embeddings that belong to the content of the file.
 
-        Marks come from the header and, where a content was written since, the edits before it.
-        Looks that a save replaced before it was cut off come from the last entry, unless an
-        earlier version wrote it: it named them only.
+        Marks come from the header and, if the file was written since, from the edits before that.
+        If a save was interrupted after it had replaced embeddings, the old embeddings come from
+        the last entry. Entries of earlier versions contain only their ids.
         """
         marks: dict[str, Any] = {}
         for entry in entries:
             marks |= entry.get('marks', {})
-            marks |= {key: one['marks'] for key, one in entry.get('after', {}).items() if one}
+            marks |= {key: fields['marks'] for key, fields in entry.get('after', {}).items()
+                      if fields}
         looks = {} if last == entries[-1:] else last[0].get('looks', {})
         self.landmarks = self._saved = {
             key: replace(landmark, marks=Marks(**marks.get(key, {})),

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The edits of a map. Each edit returns a change as a value and alters nothing.
+"""The edits of a map. Each edit returns a change and modifies nothing.
 
-A change holds the landmarks after it; the change that undoes it holds the landmarks before it.
+A change contains the changed landmarks after the edit. The change that undoes it contains them
+before the edit.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,10 +29,10 @@ from cliploc_ros.offline.studio.landmark import (
     shape_fields,
 )
 
-# Fields that a recording measured; they do not hold for an ellipsoid that a person placed.
+# Fields measured from a recording. They are invalid for an ellipsoid that a person placed.
 _NO_EVIDENCE = {'position_sigma': None, 'support': None, 'seen_ratio': None, 'baseline_deg': None}
 _MEASURED = (*_NO_EVIDENCE, 'last_seen')
-# What an edit of a field is called, and the field that is not true after it.
+# The name of the edit of each field, and the field that the edit invalidates.
 _FIELDS = {'label': ('label', 'labels'), 'class_id': ('class', 'class_weights'),
            'center': ('move', 'position_sigma'), 'semi_axes': ('resize', 'position_sigma'),
            'orientation': ('rotate', 'position_sigma')}
@@ -44,21 +45,22 @@ class EditError(CliplocError):
 class Change(NamedTuple):
     """The effect of an edit."""
 
-    what: str  #: For the person who edits
-    after: Mapping[str, Landmark | None]  #: Landmarks by id, None for one that goes
+    what: str  #: Description for the user
+    after: Mapping[str, Landmark | None]  #: Landmarks by id, None for a deleted landmark
 
     def apply(self, landmarks: Landmarks) -> dict[str, Landmark]:
         """Return the landmarks after the change."""
         return {**{key: landmark for key, landmark in landmarks.items()
                    if self.after.get(key, landmark) is not None},
-                **{key: one for key, one in self.after.items() if one is not None}}
+                **{key: landmark for key, landmark in self.after.items()
+                   if landmark is not None}}
 
     def undoing(self, landmarks: Landmarks) -> 'Change':
-        """Return the change that undoes this one of some landmarks."""
+        """Return the change that undoes this change of the landmarks."""
         return Change(self.what, {key: landmarks.get(key) for key in self.after})
 
     def to_json(self, landmarks: Landmarks) -> dict[str, Any]:
-        """Return the change of some landmarks as JSON holds it; looks only if it is of them."""
+        """Return the change of the landmarks as JSON, with embeddings only if they change."""
         return {'what': self.what, 'after': {key: one and {
             'fields': one.fields, 'marks': asdict(one.marks),
             **({} if key in landmarks and one.look is landmarks[key].look else
@@ -66,28 +68,28 @@ class Change(NamedTuple):
 
 
 def change_from_json(tree: Mapping[str, Any], landmarks: Landmarks) -> Change:
-    """Return a change of some landmarks from JSON.
+    """Return a change of the landmarks from JSON.
 
-    LookupError, TypeError, AttributeError, ValueError or MapError: it is none, or a landmark is
-    invalid.
+    LookupError, TypeError, AttributeError, ValueError or MapError: it is not a change, or a
+    landmark is invalid.
     """
     def look_of(key: str, look: Any) -> Encoded | None:
         if isinstance(look, str):
             return landmarks[key].look if key in landmarks else None
         return look and Encoded.from_json(look)
 
-    # earlier versions wrote a key of the look, or nothing: the present look stays
+    # earlier versions wrote a key of the embeddings, or nothing: keep the current embeddings
     after = {key: one and Landmark(one['fields'], Marks(**one['marks']),
                                    look_of(key, one.get('look', '')))
              for key, one in tree['after'].items()}
-    if valid := {key: one for key, one in after.items() if one is not None}:
+    if valid := {key: landmark for key, landmark in after.items() if landmark is not None}:
         map_of(valid)
     return Change(str(tree['what']), after)
 
 
 def _change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | None]) -> Change:
-    """Return the change to other landmarks; refuse locked and invalid landmarks."""
-    changed = {key: one for key, one in after.items() if one != landmarks.get(key)}
+    """Return the change to the landmarks `after`; raise for locked and invalid landmarks."""
+    changed = {key: landmark for key, landmark in after.items() if landmark != landmarks.get(key)}
     for landmark_id, landmark in changed.items():
         old = landmarks.get(landmark_id)
         if old is not None and old.marks.is_locked and (
@@ -99,7 +101,7 @@ def _change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | N
 
 
 def numbers(value: Any, count: int, what: str) -> list[float]:
-    """Return the numbers of a page's message; EditError: it has others than finite numbers.
+    """Return `count` finite numbers of a page's message; EditError: the value is anything else.
 
     ``what`` names the value in the error.
     """
@@ -117,8 +119,8 @@ def numbers(value: Any, count: int, what: str) -> list[float]:
 def set_fields(landmarks: Landmarks, landmark_ids: Iterable[str], **fields: Any) -> Change:
     """Set fields of landmarks: label, class_id, center, semi_axes, or orientation.
 
-    A quaternion may have any length but 0, a semi-axis is a millimetre or more. A label takes the
-    place of all weighted phrases, a class that of all class weights.
+    A quaternion may have any length except 0, a semi-axis is at least a millimetre. A label
+    replaces all weighted phrases, a class replaces all class weights.
     """
     ids = list(landmark_ids)
     if unknown := fields.keys() - _FIELDS.keys():
@@ -127,7 +129,7 @@ def set_fields(landmarks: Landmarks, landmark_ids: Iterable[str], **fields: Any)
         norm = float(np.linalg.norm(quat_xyzw))
         if not 1e-6 <= norm < np.inf:
             raise EditError(f'rotate {", ".join(ids)}: the quaternion {list(quat_xyzw)} has no '
-                            'direction; give x, y, z, w that are not all 0')
+                            'direction; at least one of x, y, z, w must not be 0')
         fields['orientation'] = np.divide(quat_xyzw, norm)
     fields = {name: ' '.join(value.split()) if isinstance(value, str) else rounded(value)
               for name, value in fields.items()}
@@ -153,14 +155,15 @@ def mark(landmarks: Landmarks, landmark_ids: Iterable[str], what: str, **marks: 
     """Set marks of landmarks, also of locked landmarks."""
     chosen = {key: _get(landmarks, key) for key in landmark_ids}
     return _change_of(f'{what} {", ".join(chosen)}', landmarks, {
-        key: replace(one, marks=replace(one.marks, **marks)) for key, one in chosen.items()})
+        key: replace(landmark, marks=replace(landmark.marks, **marks))
+        for key, landmark in chosen.items()})
 
 
 def create(landmarks: Landmarks, label: str, class_id: str, center: NDArray[np.float64],
            basis: NDArray[np.float64], look: Encoded | None = None) -> Change:
-    """Add a landmark of a centre (3,) and a basis (3, 3), whose columns are the semi-axes [m].
+    """Add a landmark with a centre (3,) and a basis (3, 3), whose columns are the semi-axes [m].
 
-    The change has one id, that of the new landmark.
+    The change contains only the new landmark.
     """
     fields = {'label': ' '.join(label.split()), 'class_id': ' '.join(class_id.split()),
               **shape_fields(center, basis), 'source': 'studio'}
@@ -171,10 +174,10 @@ def create(landmarks: Landmarks, label: str, class_id: str, center: NDArray[np.f
 
 def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
           fit: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None) -> Change:
-    """Make one landmark of two or more, with the classes of all; the first id and label stay.
+    """Merge two or more landmarks. The result has the first id and label, and all classes.
 
-    A fit is the centre (3,) and basis (3, 3) that fit the boxes of all. Without it, the ellipsoid
-    has the mean and the second moments of the volume of all.
+    `fit` is the centre (3,) and basis (3, 3) that fit the boxes of all landmarks. Without it, the
+    ellipsoid has the mean and the second moments of their total volume.
     """
     ids = list(dict.fromkeys(landmark_ids))
     if len(ids) < 2:
@@ -191,7 +194,8 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
         halves = np.concatenate([bases, offsets], axis=2)
         squares, directions = np.linalg.eigh(np.einsum('n,nij,nkj->ik', weights, halves, halves))
         fit = center, directions * np.sqrt(squares)
-    classes = join_details([(one.label, one.class_id, one.details) for one in parts]).class_weights
+    classes = join_details([(part.label, part.class_id, part.details)
+                            for part in parts]).class_weights
     merged = replace(
         parts[0].changed(**shape_fields(*fit), **_NO_EVIDENCE,
                          class_weights=None if classes is None else dict(classes)),
@@ -202,7 +206,7 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
 
 
 def split(landmarks: Landmarks, landmark_id: str) -> Change:
-    """Make two landmarks of one: halves of its longest axis."""
+    """Split a landmark into two along its longest axis."""
     old = _get(landmarks, landmark_id)
     axes = old.semi_axes.copy()
     longest = int(np.argmax(axes))
@@ -215,7 +219,7 @@ def split(landmarks: Landmarks, landmark_id: str) -> Change:
 
 
 def take_fits(landmarks: Landmarks, landmark_ids: Iterable[str], fitted: LandmarkMap) -> Change:
-    """Give landmarks the ellipsoids of a fitted map, with their optional fields."""
+    """Replace the ellipsoids of landmarks by those of a fitted map, with optional fields."""
     rows = {key: row for row, key in enumerate(fitted.landmark_ids)}
     after = {}
     for key in landmark_ids:

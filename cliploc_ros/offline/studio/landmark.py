@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One landmark as the studio holds it: its fields of the map file, and its look.
+"""A landmark of the studio: its fields of the map file, and its look.
 
-The relocalizer refuses a map with unknown fields, since a misspelled field would be silently
-without effect. The studio opens such a map, keeps these fields, and says that they are refused.
+The relocalizer refuses a map with unknown fields, because a misspelled field would silently have
+no effect. The studio opens such a map, keeps the fields, and notes that they are refused.
 
-A look holds the image embeddings of a landmark. It is a part of the landmark, so it follows its
-landmark through merge, split, delete, undo and redo.
+A look is the image embeddings of a landmark. It is a part of the landmark, so that merge, split,
+delete, undo and redo apply to it, too.
 """
 
 import base64
@@ -26,7 +26,7 @@ from cliploc_ros.offline.mapping.labelling import choose_medoids
 from cliploc_ros.offline.mapping.landmarks import Landmarks as Ellipsoids
 
 KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation', *OPTIONAL_FIELDS)
-#: Edited numbers are rounded to these, so that the file holds exactly what the studio shows.
+#: Edited numbers are rounded to these decimals, so that the file has the numbers that are shown.
 DECIMALS = 6
 #: The least semi-axis that an edit may set [m]; the file format allows less.
 LEAST_SEMI_AXIS_M = 1e-3
@@ -37,12 +37,12 @@ class Encoded:
     """The image embeddings of one landmark."""
 
     mean: NDArray[np.float16]  #: (d,): the mean direction of its crops, of unit length
-    #: (m, d): crops that stand for all of its crops, unit rows; at most five
+    #: (m, d): unit rows, embeddings of at most five representative crops
     medoids: NDArray[np.float16]
     encoder_key: str
 
     def to_json(self) -> dict[str, str]:
-        """Return the look as JSON holds it."""
+        """Return the look as JSON."""
         return {'encoder': self.encoder_key,
                 'mean': base64.b64encode(self.mean.tobytes()).decode(),
                 'medoids': base64.b64encode(self.medoids.tobytes()).decode()}
@@ -56,10 +56,10 @@ class Encoded:
 
 
 def merge_looks(looks: Sequence[Encoded | None], weights: Sequence[float]) -> Encoded | None:
-    """Return the look of one landmark that several become; None if no look is known.
+    """Merge the looks of several landmarks; None if no look is known.
 
-    The weights are, for example, the numbers of boxes. Looks of another encoder than the first
-    one's do not count.
+    The weights are, for example, the numbers of boxes. Looks whose encoder differs from that of
+    the first known look are ignored.
     """
     known = [(look, weight) for look, weight in zip(looks, weights, strict=True)
              if look is not None]
@@ -77,7 +77,7 @@ def merge_looks(looks: Sequence[Encoded | None], weights: Sequence[float]) -> En
 
 
 def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Encoded]:
-    """Return the known looks by id of the landmark."""
+    """Return the known looks by landmark id."""
     offsets = embeddings.medoid_offsets
     return {landmark_id: Encoded(embeddings.means[row],
                                  embeddings.medoids[offsets[row]:offsets[row + 1]],
@@ -88,16 +88,16 @@ def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Encoded]:
 
 @dataclass(frozen=True)
 class Marks:
-    """The state of a landmark in the studio, which the map file does not hold."""
+    """The state of a landmark in the studio, which is not stored in the map file."""
 
     is_locked: bool = False  #: Edits are refused
-    is_hidden: bool = False  #: The scene and the views leave it out
-    decision: str = ''  #: Decision of the review: accepted, fixed; '' for none
+    is_hidden: bool = False  #: The landmark is not shown in the scene and the views
+    decision: str = ''  #: Decision in the review: accepted, fixed; '' without a decision
 
 
 @dataclass(frozen=True)
 class Landmark:
-    """A landmark of the map that is edited."""
+    """A landmark of the edited map."""
 
     fields: Mapping[str, Any]  #: As in the map file, below the landmark's id
     marks: Marks = Marks()
@@ -110,7 +110,7 @@ class Landmark:
 
     @property
     def label(self) -> str:
-        """The label; of several, the label with the greatest weight."""
+        """The label, or the label with the greatest weight."""
         if 'label' in self.fields:
             return str(self.fields['label'])
         return max(self.details.labels or (('', 0.0),), key=lambda pair: pair[1])[0]
@@ -142,7 +142,7 @@ class Landmark:
         return np.asarray(Rotation.from_quat(self.quat_xyzw).as_matrix() * self.semi_axes)
 
     def changed(self, **fields: Any) -> 'Landmark':
-        """Return the landmark with other values; a field that is None is left out."""
+        """Return the landmark with changed fields; None removes a field."""
         together = {**self.fields, **fields}
         return replace(self, fields={name: value for name, value in together.items()
                                      if value is not None or name not in fields})
@@ -152,9 +152,10 @@ Landmarks = Mapping[str, Landmark]
 
 
 def map_of(landmarks: Landmarks, frame_id: Any = 'map', source: str = 'studio') -> LandmarkMap:
-    """Return landmarks as the relocalizer knows them, without unknown fields.
+    """Return landmarks as a map of the relocalizer, without unknown fields.
 
-    MapError: there are none, or one is invalid. Names the source, the landmark and the field.
+    MapError: there are no landmarks, or one is invalid; the message names the source, the
+    landmark and the field.
     """
     known = {landmark_id: {name: value for name, value in landmark.fields.items()
                            if name in KNOWN_FIELDS} for landmark_id, landmark in landmarks.items()}
@@ -162,12 +163,12 @@ def map_of(landmarks: Landmarks, frame_id: Any = 'map', source: str = 'studio') 
 
 
 def fields_of(landmarks: Landmarks) -> dict[str, Mapping[str, Any]]:
-    """Return the fields of landmarks, which tell whether a map was edited; locks do not."""
+    """Return the fields of landmarks. A map is edited if they differ; marks do not matter."""
     return {key: landmark.fields for key, landmark in landmarks.items()}
 
 
 def rounded(values: Iterable[float]) -> list[float]:
-    """Return numbers as an edit writes them."""
+    """Round numbers as edits write them."""
     return [round(float(value), DECIMALS) + 0.0 for value in values]
 
 

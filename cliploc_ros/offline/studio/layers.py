@@ -35,29 +35,30 @@ _MAX_CAMERAS = 300
 _FRUSTUM_M = 0.08
 _CAMERA_RGB, _PATH_RGB, _KEYFRAME_RGB = (120, 120, 200), (90, 90, 90), (0, 150, 136)
 _VERDICT_RGB = {'accepted': (30, 170, 60), 'refused': (150, 150, 150), 'misled': (220, 0, 0)}
-# No heading is accepted; few are, all are.
+# Colours without an accepted heading and without a useful heading; range from few to all accepted.
 _NONE_RGB, _UNSEEN_RGB = (230, 159, 0), (120, 120, 120)
 _HEAT = np.array([[160, 210, 240], [0, 62, 107]], dtype=np.float64)
 _TILE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
 _TILE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 _GAP = 0.92
-# Above the floor grid, which would flicker through.
+# Height above the floor grid, which would flicker through.
 _LIFT_M = 0.005
-# A storey: landmarks that begin below this stand on the floor z = 0 [m].
+# Height of a storey: if the lowest landmarks begin below it, the floor is z = 0 [m].
 _STOREY_M = 2.5
 _MAX_LOOK_ALIKES = 20
 _CIRCLE_POINTS = 48
 LEGEND = (
-    ('#003E6B', 'all headings with three landmarks are accepted'), ('#A0D2F0', 'few of them'),
-    ('#E69F00', 'none'), ('#787878', 'no heading shows three landmarks'),
-    ('#009688', 'none, but a keyframe is within reach'),
+    ('#003E6B', 'all headings with three landmarks are accepted'),
+    ('#A0D2F0', 'few of them are accepted'), ('#E69F00', 'none of them is accepted'),
+    ('#787878', 'no heading shows three landmarks'),
+    ('#009688', 'none is accepted, but a keyframe is within reach'),
     (MISLED, 'a heading is misled; the line leads to the wrong pose'),
     (LOOK_ALIKE, 'places that look alike'))
 _CURRENT_RGB, _OLD_RGB = (30, 170, 60), (150, 150, 150)
-# The relocalizer's camera is not known here; a usual one.
+# Field of view and aspect of the robot's camera: typical values, because they are unknown here.
 _FOV_RAD, _ASPECT = 0.85, 4.0 / 3.0
 _ROBOT_M = 0.25
-# Semi-axes of a standard deviation of 1 m [m], and what can be seen and drawn [m].
+# Radius of the 95 % ellipsoid for a standard deviation of 1 m [m]; limits of its semi-axes [m].
 _RADIUS_95 = float(np.sqrt(chi2.ppf(0.95, 3)))
 _LEAST_M, _GREATEST_M = 1e-3, 100.0
 
@@ -73,7 +74,7 @@ class Layers:
         self._drawn: dict[str, tuple[object, list[Any]]] = {}
 
     def show(self, name: str, what: Any, draw: Draw, is_shown: bool = True) -> None:
-        """Draw something unless it is what the layer shows, None for nothing; or hide it."""
+        """Draw an object (None: nothing) unless it is already drawn; show or hide the layer."""
         old, handles = self._drawn.get(name, (None, []))
         if what is not old:
             for handle in handles:
@@ -86,19 +87,19 @@ class Layers:
 
 
 def linear(rgb: Any) -> NDArray[np.uint8]:
-    """Return colours (n, 3) as viser takes those of instances: for linear light."""
+    """Convert sRGB colours (n, 3) to linear colours, as viser expects for instances."""
     return np.asarray(255.0 * (np.asarray(rgb) / 255.0) ** 2.2, dtype=np.uint8)
 
 
 def _lines(scene: viser.SceneApi, name: str, points: Any, rgb: Any, thickness: float = 1.5) -> Any:
-    """Draw lines (n, 2, 3) in one colour or those of their ends (n, 2, 3)."""
+    """Draw lines (n, 2, 3) in one colour, or with a colour for each end (n, 2, 3)."""
     return scene.add_line_segments(name, np.reshape(points, (-1, 2, 3)), rgb, thickness=thickness,
                                    thickness_units='screen')
 
 
 def _dots(scene: viser.SceneApi, name: str, points: NDArray[np.float64], radius_m: float, rgb: Any
           ) -> Any:
-    """Draw spheres at points (n, 3), in one colour or one each (n, 3)."""
+    """Draw spheres at points (n, 3) in one colour, or with a colour for each point (n, 3)."""
     return scene.add_batched_meshes_simple(
         name, SPHERE.vertices * radius_m, SPHERE.faces,
         np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)), points, batched_colors=linear(rgb),
@@ -106,12 +107,12 @@ def _dots(scene: viser.SceneApi, name: str, points: NDArray[np.float64], radius_
 
 
 def some_cameras(count: int) -> NDArray[np.int64]:
-    """Return the rows of the cameras to draw: all, or every n-th of many."""
+    """Return the rows of the cameras to draw: all of few, every n-th of many."""
     return np.arange(0, count, max(1, -(-count // _MAX_CAMERAS)))
 
 
 def draw_cameras(on_click: Callable[[int], None]) -> Draw:
-    """Return a function that draws the trajectory and the cameras; a click chooses a view."""
+    """Return a function that draws the trajectory and the cameras. A click selects a view."""
     def draw(scene: viser.SceneApi, detections: PosedDetections) -> list[Any]:
         poses, order = detections.map_from_camera, detections.by_camera
         is_way = np.diff(detections.frame_cameras[order]) == 0
@@ -133,7 +134,7 @@ def draw_cameras(on_click: Callable[[int], None]) -> Draw:
 
 
 def draw_keyframes(scene: viser.SceneApi, layer: KeyframeLayer) -> list[Any]:
-    """Draw the cameras of the keyframes, all of them or every n-th."""
+    """Draw the cameras of the keyframes: all of few, every n-th of many."""
     shown = some_cameras(len(layer))
     return [_lines(scene, '/keyframes', frusta(
         [layer.camera_of(row) for row in shown], layer.map_from_camera[shown], 1.5 * _FRUSTUM_M),
@@ -147,7 +148,8 @@ def draw_answers(scene: viser.SceneApi, answers: Mapping[int, Trial]) -> list[An
              if answer.estimate is not None]
     return [_dots(scene, '/answers/places', np.reshape(
         [answer.position for answer in answers.values()], (-1, 3)), 0.03, colors or (0, 0, 0)),
-            _lines(scene, '/answers/lines', [(one.position, one.estimate) for one, _ in found],
+            _lines(scene, '/answers/lines',
+                   [(answer.position, answer.estimate) for answer, _ in found],
                    np.repeat([rgb for _, rgb in found] or np.empty((0, 3)), 2, axis=0).reshape(
                        -1, 2, 3).astype(np.uint8), 2.0)]
 
@@ -155,7 +157,7 @@ def draw_answers(scene: viser.SceneApi, answers: Mapping[int, Trial]) -> list[An
 # ---- coverage and look-alike places -------------------------------------------------------------
 
 def draw_coverage(tell: Callable[[str], None]) -> Draw:
-    """Return a function that draws a tile at each position; a click shows its figures."""
+    """Return a function that draws a tile at each position. A click shows its numbers."""
     def draw(scene: viser.SceneApi, places: Coverage) -> list[Any]:
         check = places.check
         if not len(check.positions):
@@ -180,7 +182,8 @@ def draw_coverage(tell: Callable[[str], None]) -> Draw:
                          f', {places.keyframes.headings[row]} within reach of a keyframe'))
 
         return [tiles, _lines(scene, '/coverage/misled', [
-            (one.position, one.estimate) for one in check.trials if one.verdict == 'misled'],
+            (trial.position, trial.estimate) for trial in check.trials
+            if trial.verdict == 'misled'],
             _rgb(MISLED), 3.0)]
 
     return draw
@@ -201,7 +204,7 @@ def draw_look_alikes(scene: viser.SceneApi, places: Coverage) -> list[Any]:
 
 
 def tile_colors(places: Coverage) -> NDArray[np.uint8]:
-    """Return the colour (P, 3) of each position: how many of its useful headings are accepted."""
+    """Return a colour (P, 3) for each position, by the share of useful headings accepted."""
     check, useful = places.check, places.check.useful
     share = np.clip(check.accepted / np.maximum(useful, 1), 0.0, 1.0)
     colors = np.column_stack([np.interp(share, [0.0, 1.0], channel) for channel in _HEAT.T])
@@ -214,9 +217,9 @@ def tile_colors(places: Coverage) -> NDArray[np.uint8]:
 
 
 def _floor(places: Coverage) -> float:
-    """Return the height of the floor: 0 where the landmarks begin a storey above it or less."""
-    low = np.quantile([one.center[2] - one.semi_axes.max() for one in places.landmarks.values()],
-                      0.03)
+    """Return the height of the floor: 0 if the lowest landmarks are at most a storey above 0."""
+    low = np.quantile([landmark.center[2] - landmark.semi_axes.max()
+                       for landmark in places.landmarks.values()], 0.03)
     return 0.0 if -_LIFT_M <= low < _STOREY_M else float(low)
 
 
@@ -227,7 +230,7 @@ def _rgb(color: str) -> tuple[int, int, int]:
 # ---- the running relocalizer --------------------------------------------------------------------
 
 def draw_robot(scene: viser.SceneApi, state: 'LiveState') -> list[Any]:
-    """Draw the last pose and its covariance, grey where it is not the last answer."""
+    """Draw the last pose and its covariance, in grey if it is not the last answer."""
     pose = state.pose
     if pose is None:
         return []

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The running relocalizer over ROS: its last answer, and requests to it.
+"""A connection to the running relocalizer: its last answer, and requests.
 
-The only module of the studio that imports ROS; the studio runs without it.
+This is the only module of the studio that imports ROS. The studio also runs without ROS.
 """
 
 import threading
@@ -30,28 +30,28 @@ from cliploc_ros.ros.conversions import pose_from_msg
 from cliploc_ros.ros.node.diagnostics import split_names
 from cliploc_ros.ros.running import RelocalizerStatus
 
-# The relocalizer reports once a second. While it loads libraries it may be late (a guess).
+# The relocalizer reports once a second, but may be late while it loads libraries. Not measured.
 _SILENCE_S = 10.0
-# Beyond any sensible timeout_s of the relocalizer.
+# Longest wait for an answer, beyond any sensible timeout_s of the relocalizer.
 _PATIENCE_S = 120.0
 _POLL_S = 0.1
-# How long closing waits for a request that is released.
+# Longest wait for a released request when the connection is closed.
 _GRACE_S = 2.0
-# Answers that are not a failure, though no pose was delivered.
+# Answers without a delivered pose that are not failures.
 _ANSWERS = ('refused', 'withheld')
 _MAX_TEXT = 600
 
 
 class LiveError(CliplocError):
-    """The running relocalizer does not do what was requested; the message says why."""
+    """A request to the running relocalizer failed; the message says why."""
 
 
 class LivePose(NamedTuple):
     """A pose that the relocalizer accepted."""
 
-    #: (4, 4): of the camera, or of the robot if the relocalizer has a base_frame
+    #: Pose (4, 4) of the camera, or of the robot if the relocalizer has a base_frame
     map_from_body: NDArray[np.float64]
-    covariance: NDArray[np.float64]  #: (3, 3): of the position [m^2]
+    covariance: NDArray[np.float64]  #: Covariance (3, 3) of the position [m^2]
     frame_id: str  #: The coordinate frame of the pose
     stamp_s: float  #: Stamp of the image [s]
 
@@ -59,33 +59,36 @@ class LivePose(NamedTuple):
 class LiveState(NamedTuple):
     """The last reports of the running relocalizer."""
 
-    is_heard: bool  #: It reported within the last seconds
-    values: Mapping[str, str]  #: Values of its last diagnostics
-    pose: LivePose | None  #: The last accepted one
+    is_heard: bool  #: Whether the last diagnostics are recent
+    values: Mapping[str, str]  #: Values of the last diagnostics
+    pose: LivePose | None  #: The last accepted pose
 
     @property
     def verdict(self) -> str:
-        """Its last answer in one line; '' for none."""
+        """The last answer in one line; '' without an answer."""
         return self.values.get('last verdict', '').removesuffix('none yet')
 
     @property
     def base_frame(self) -> str:
-        """The frame of the robot whose pose it gives; '' for the camera."""
+        """The frame whose pose the relocalizer publishes; '' for the camera."""
         return self.values.get('base frame', '')
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Landmarks that its watch does not see any more."""
+        """Landmarks that the watch no longer detects."""
         return split_names(self.values.get('watch missing', ''))
 
     @property
     def is_current(self) -> bool:
-        """Return whether the pose is the last answer, and its node still reports."""
+        """Return whether the pose is that of the last answer, and the diagnostics are recent."""
         return self.is_heard and self.verdict.startswith(('accepted', 'withheld'))
 
 
 class LiveRelocalizer:
-    """A client of the running relocalizer, whose name has its namespace: '/relocalizer'."""
+    """A client of the running relocalizer.
+
+    `name` is the node's name with its namespace, as '/relocalizer'.
+    """
 
     def __init__(self, node: Node, name: str):
         self.name, self._node = name, node
@@ -100,11 +103,11 @@ class LiveRelocalizer:
                                  qos.POSE)
 
     def subscribe(self, listener: Callable[[], None]) -> None:
-        """Call a function after each change of the state, in any thread."""
+        """Register a function that is called after each change of the state, in any thread."""
         self._listeners.append(listener)
 
     def update(self) -> None:
-        """Take over what was heard since the last time."""
+        """Update the state from the received messages."""
         values = self._status.values
         is_heard = bool(values) and self._status.silent_s <= _SILENCE_S
         if self._pose is not self.state.pose or (is_heard, values) != self.state[:2]:
@@ -118,14 +121,14 @@ class LiveRelocalizer:
         return self._turn.locked()
 
     def lines(self, document: Document) -> list[str]:
-        """Return the state in lines, for a person who edits a map."""
+        """Return the state as lines for the page."""
         state, values, pose = self.state, self.state.values, self.state.pose
         file, missing = Path(values.get('map file', '')), ', '.join(state.missing)
         is_other = file.is_absolute() and file.resolve() != document.path.resolve()
-        lines = [f'{self.name}: nothing heard', '', ''] if not state.is_heard else [
+        lines = [f'{self.name}: no diagnostics', '', ''] if not state.is_heard else [
             f'{self.name}: {values.get("state", "")}',
-            f'its map: {values.get("map") or "none loaded"}',
-            f'it reads {file}, which is not the map of this studio' if is_other else '']
+            f'map: {values.get("map") or "none loaded"}',
+            f'the map file is {file}, not that of this studio' if is_other else '']
         lines += [f'watch: {values["watch reason"]}' if values.get('watch reason') else '',
                   f'missing, red in the map: {missing}' if missing else '',
                   f'last answer: {state.verdict}' if state.verdict else 'no answer yet']
@@ -133,24 +136,24 @@ class LiveRelocalizer:
             lines.append(f'{"" if state.is_current else "earlier "}pose of '
                          f'{state.base_frame or "the camera"}, stamp {pose.stamp_s:.2f} s')
             if pose.frame_id != document.frame_id:
-                lines.append(f'the pose is in {pose.frame_id}, the map in {document.frame_id}: it '
-                             'is not shown')
+                lines.append(f'the pose is in {pose.frame_id}, the map in {document.frame_id}: '
+                             'the pose is not shown')
         return [line[:_MAX_TEXT] for line in lines if line]
 
     def relocalize(self) -> str:
         """Request a relocalization; return the answer.
 
-        LiveError: there is no relocalizer, it fails or ends, or another request waits.
+        LiveError: there is no relocalizer, it failed or ended, or another request is waiting.
         """
         answer = self._request(self._relocalize)
         if answer.success or answer.message.startswith(_ANSWERS):
             return str(answer.message)
-        raise LiveError(f'the relocalizer gave no answer: {answer.message}')
+        raise LiveError(f'the relocalizer failed: {answer.message}')
 
     def reload_map(self) -> str:
-        """Let the relocalizer read its map file again; return its report.
+        """Make the relocalizer read its map file again; return its report.
 
-        LiveError: as above, or the map is invalid, and the relocalizer keeps its old one.
+        LiveError: as for relocalize, or the map is invalid and the relocalizer keeps its old map.
         """
         answer = self._request(self._reload)
         if answer.success:
@@ -158,7 +161,7 @@ class LiveRelocalizer:
         raise LiveError(f'{answer.message}; the relocalizer keeps its map')
 
     def close(self) -> None:
-        """Release the request that waits, and return when it is gone."""
+        """Release the waiting request, and wait until it has ended."""
         self._closed.set()
         if self._turn.acquire(timeout=_GRACE_S):
             self._turn.release()
@@ -166,14 +169,14 @@ class LiveRelocalizer:
     def _request(self, client: Any) -> Any:
         """Call a service and wait for its answer, as long as the relocalizer is alive."""
         if not self._turn.acquire(blocking=False):
-            raise LiveError('a request waits for its answer: repeat yours after it')
+            raise LiveError('another request is waiting for its answer: retry afterwards')
         try:
             if not client.service_is_ready():
                 others = sorted(name.removesuffix('/relocalize') for name, types in
                                 self._node.get_service_names_and_types()
                                 if name.endswith('/relocalize')
                                 and 'std_srvs/srv/Trigger' in types)
-                hint = f'; --relocalizer {others[0]} would find another' if others else ''
+                hint = f'; for another relocalizer use --relocalizer {others[0]}' if others else ''
                 raise LiveError(
                     f'no relocalizer found at {self.name}: start it with ros2 run cliploc_ros '
                     'relocalizer --ros-args -p map_file:=MAP, in the ROS domain of the studio'
@@ -194,26 +197,26 @@ class LiveRelocalizer:
     def _check_alive(self, client: Any, begin: float) -> None:
         now = time.monotonic()
         if self._closed.is_set():
-            raise LiveError('the studio ends: the answer is not waited for')
+            raise LiveError('the studio is ending and does not wait for the answer')
         if not client.service_is_ready():
             raise LiveError(f'{self.name} ended before it answered: start it again')
         if (silence_s := min(self._status.silent_s, now - begin)) > _SILENCE_S:
-            raise LiveError(f'{self.name} has not reported for {silence_s:.0f} s and gave no '
-                            'answer: see whether it still runs')
+            raise LiveError(f'{self.name} has not reported for {silence_s:.0f} s and did not '
+                            'answer: check that it still runs')
         if now - begin > _PATIENCE_S:
-            raise LiveError(f'{self.name} gave no answer within {_PATIENCE_S:.0f} s: see its log')
+            raise LiveError(f'{self.name} did not answer within {_PATIENCE_S:.0f} s: see its log')
 
     def _on_pose(self, msg: PoseWithCovarianceStamped) -> None:
         pose, stamp = pose_from_msg(msg.pose.pose), msg.header.stamp
         covariance = np.array(msg.pose.covariance).reshape(6, 6)[:3, :3]
-        if pose is not None and np.isfinite(covariance).all():  # else of another program
+        if pose is not None and np.isfinite(covariance).all():  # else it is of another program
             self._pose = LivePose(pose, covariance, msg.header.frame_id,
                                   stamp.sec + 1e-9 * stamp.nanosec)
 
 
 @contextmanager
 def follow_relocalizer(name: str, ros_args: Sequence[str] = ()) -> Iterator[LiveRelocalizer]:
-    """Follow the running relocalizer in a thread for as long as the block lasts.
+    """Connect to the running relocalizer, in a thread, while the context is open.
 
     ``ros_args`` are '--ros-args' and the arguments after it.
 
@@ -227,7 +230,7 @@ def follow_relocalizer(name: str, ros_args: Sequence[str] = ()) -> Iterator[Live
                    signal_handler_options=SignalHandlerOptions.NO)
         node = Node('map_studio', context=context, enable_rosout=False,
                     start_parameter_services=False)
-    except Exception as error:  # rcl has its own types, for names, arguments and folders
+    except Exception as error:  # rcl raises different types for names, arguments and folders
         raise OptionsError(f'--ros {name}: ROS does not start: {error}') from error
     live = LiveRelocalizer(node, name)
     executor = SingleThreadedExecutor(context=context)

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a map that is edited: its YAML, and the image embeddings next to it.
+"""The files of an edited map: its YAML, and the image embeddings next to it.
 
-Only the lines of edited fields are replaced, so that comments, order and style survive. The new
-text is read again before it is used. Where it does not say what it should, as in files whose
-landmarks are written in braces, the whole file is written again, without its comments.
-The round trip of ruamel.yaml keeps comments, too, but it takes 9 s for a map of 5,000 landmarks
-that this module reads and saves in 1.4 s.
+Only the lines of edited fields are replaced, so that comments, order and style are kept. The new
+text is parsed for verification. If it differs from the edited map, as for files with landmarks in
+flow style, the whole file is rewritten without its comments.
+The round trip of ruamel.yaml keeps comments, too, but takes 9 s for a map of 5,000 landmarks that
+this module reads and saves in 1.4 s.
 """
 
 import hashlib
@@ -57,9 +57,9 @@ NO_FILE = ''
 
 @dataclass(frozen=True)
 class MapFile:
-    """A map file: its text, '' if there is none, and the same as a tree.
+    """A map file: its text, '' for a file that does not exist, and the parsed tree.
 
-    ``node`` is the key in the file whose parameters hold the map.
+    ``node`` is the key of the node whose parameters contain the map.
     """
 
     path: Path
@@ -69,7 +69,7 @@ class MapFile:
 
     @property
     def digest(self) -> str:
-        """The digest of the text; NO_FILE where there is none."""
+        """The digest of the text; NO_FILE without a file."""
         return _digest_of(self.text.encode()) if self.text else NO_FILE
 
     @property
@@ -93,12 +93,12 @@ class MapFile:
         return found
 
     def with_landmarks(self, landmarks: Mapping[str, Landmark]) -> 'MapFile':
-        """Return the file with other landmarks, not yet written.
+        """Return the file with other landmarks. It is not written.
 
-        MapError: it holds fields that cannot be written again.
+        MapError: the file has fields that cannot be rewritten.
         """
         old = self._map['landmarks']
-        # undo puts a deleted landmark last; in the file it keeps its place
+        # undo adds a deleted landmark at the end; in the file it keeps its position
         order = [*(key for key in old if key in landmarks),
                  *(key for key in landmarks if key not in old)]
         new = {key: landmarks[key].fields for key in order}
@@ -112,20 +112,20 @@ class MapFile:
         for text in texts:
             if _says(text, tree):
                 return MapFile(self.path, text, self.node, tree)
-        raise MapError(f'{self.path}: holds fields that cannot be written again; nothing was '
+        raise MapError(f'{self.path}: has fields that cannot be rewritten; the file was not '
                        'changed')
 
     def write(self) -> None:
-        """Write the file in one step; MapError: it cannot be written, nothing was changed."""
+        """Write the file atomically; MapError: it cannot be written and is unchanged."""
         try:
             with replace_file(self.path) as partial:
                 partial.write_bytes(self.text.encode())
         except OSError as error:
-            raise MapError(f'{self.path}: cannot be written: {error.strerror}; nothing was '
+            raise MapError(f'{self.path}: cannot be written: {error.strerror}; the file was not '
                            f'changed: {MAKE_ROOM}') from error
 
     def digest_on_disk(self) -> str:
-        """Return the digest of the file as it is now, NO_FILE where there is none."""
+        """Return the digest of the current file on disk; NO_FILE without a file."""
         try:
             return _digest_of(read_file(self.path))
         except FileNotFoundError:
@@ -135,9 +135,10 @@ class MapFile:
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Return a map file; an empty map where there is none.
+    """Read a map file; return an empty map if it does not exist.
 
-    MapError: it is not a map, or a landmark is invalid. Unknown fields of landmarks are accepted.
+    MapError: the file is not a map, or a landmark is invalid. Unknown fields of landmarks are
+    accepted.
     """
     path = path.resolve()
     if not os.path.exists(path):  # noqa: PTH110 - never raises
@@ -164,7 +165,7 @@ def _digest_of(content: bytes) -> str:
 
 
 def _says(text: str, tree: Mapping[str, Any]) -> bool:
-    """Return whether a text holds a tree; where both hold NaN, that is equal, too."""
+    """Return whether a text parses to a tree; NaN is equal to NaN."""
     try:
         return repr(_sorted(parse_parameters(text, 'map'))) == repr(_sorted(tree))
     except MapError:
@@ -172,20 +173,20 @@ def _says(text: str, tree: Mapping[str, Any]) -> bool:
 
 
 def _sorted(tree: Any) -> Any:
-    """Return a tree with sorted keys, tuples as lists, and 1 as 1.0, which mean the same."""
+    """Normalize a tree for comparison: sorted keys, tuples as lists, integers as floats."""
     if isinstance(tree, Mapping):
         return {key: _sorted(tree[key]) for key in sorted(tree)}
     if isinstance(tree, list | tuple):
-        return [_sorted(one) for one in tree]
+        return [_sorted(item) for item in tree]
     return float(tree) if isinstance(tree, int) and not isinstance(tree, bool) else tree
 
 
 # ---- the text -----------------------------------------------------------------------------------
 
 def patched(text: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    """Return the text of a tree as that of another one, whose other lines are the same.
+    """Return the text with the lines that differ between two trees replaced.
 
-    LookupError, ValueError or YAMLError: it is not the text of the old tree.
+    LookupError, ValueError or YAMLError: it is not the text of the tree `old`.
     """
     pieces, done = [], 0
     patches = _patches(text, yaml.compose(text, Loader=_LOADER), old, new)
@@ -197,7 +198,7 @@ def patched(text: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
 
 def _patches(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mapping[str, Any]
              ) -> Iterator[tuple[int, int, str]]:
-    """Yield start and end of each change below a mapping, and the text in its place."""
+    """Yield start and end of each change below a mapping, and the new text."""
     entries = {key.value: (key, value) for key, value in node.value}
     newline = '\r\n' if '\r\n' in text else '\n'
     for name, value in old.items():
@@ -205,7 +206,7 @@ def _patches(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mapping[st
         if name not in new:
             start = text.rfind('\n', 0, key.start_mark.index) + 1
             above = text.rfind('\n', 0, start - 1) + 1
-            # the comments directly above are about it
+            # comments directly above belong to the deleted entry
             while start and text.startswith(' ' * key.start_mark.column + '#', above):
                 start, above = above, text.rfind('\n', 0, above - 1) + 1
             yield start, _line_end(text, _end(written)), ''
@@ -215,25 +216,25 @@ def _patches(text: str, node: yaml.Node, old: Mapping[str, Any], new: Mapping[st
             yield from _patches(text, written, value, new[name])
         else:
             end = _end(written)
-            line_end = newline if text[end - 1] == '\n' else ''  # of a text in a block
+            line_end = newline if text[end - 1] == '\n' else ''  # the old value is a block text
             yield (text.index(':', key.end_mark.index) + 1, end,
                    f' {_flow(name, new[name])}{line_end}')
     if added := {name: value for name, value in new.items() if name not in old}:
-        # on lines of their own
+        # added entries begin on a new line
         end = _line_end(text, _end(node))
         lines = [f'{line}{newline}' for line in _emit(added, node.value[0][0].start_mark.column)]
         yield end, end, ('' if text[end - 1] == '\n' else newline) + ''.join(lines)
 
 
 def _end(node: yaml.Node) -> int:
-    """Return where a value ends; a mapping or list in block style ends with its last value."""
+    """Return the end of a value; a mapping or list in block style ends with its last value."""
     if isinstance(node, yaml.ScalarNode) or node.flow_style:
         return int(node.end_mark.index)
     return _end(node.value[-1][1] if isinstance(node, yaml.MappingNode) else node.value[-1])
 
 
 def _line_end(text: str, index: int) -> int:
-    """Return where the line after the last character before an index begins."""
+    """Return the index of the next start of a line, or the index itself if a line starts there."""
     if index > 0 and text[index - 1] == '\n':
         return index
     found = text.find('\n', index)
@@ -241,9 +242,9 @@ def _line_end(text: str, index: int) -> int:
 
 
 def _emit(tree: Mapping[str, Any], column: int) -> Iterator[str]:
-    """Yield the lines of a tree in block style; lists and the values of fields are on one line.
+    """Yield the lines of a tree in block style, with lists and values of fields on one line.
 
-    Names of fields are plain, ids and classes quoted, as write_map does it.
+    Names of fields are plain, ids and classes are quoted, as in write_map.
     """
     for key, value in tree.items():
         name = key if key in _PLAIN else quoted(key)
@@ -255,12 +256,12 @@ def _emit(tree: Mapping[str, Any], column: int) -> Iterator[str]:
 
 
 def _flow(name: str, value: Any) -> str:
-    """Return a value of a field on one line; a geometric one always as floats."""
+    """Return the value of a field on one line; geometric values are always floats."""
     if isinstance(value, Mapping):
-        inner = ', '.join(f'{quoted(key)}: {_flow(key, one)}' for key, one in value.items())
+        inner = ', '.join(f'{quoted(key)}: {_flow(key, item)}' for key, item in value.items())
         return f'{{{inner}}}'
     if isinstance(value, list | tuple):
-        return f'[{", ".join(_flow(name, one) for one in value)}]'
+        return f'[{", ".join(_flow(name, item) for item in value)}]'
     if isinstance(value, str):
         return quoted(value)
     if name in _GEOMETRY or (isinstance(value, float) and math.isfinite(value)):
@@ -271,24 +272,24 @@ def _flow(name: str, value: Any) -> str:
 # ---- the image embeddings -----------------------------------------------------------------------
 
 class LookFile(NamedTuple):
-    """The file of image embeddings next to a map, with the looks by id of the landmark.
+    """The file of image embeddings next to a map, with the looks by landmark id.
 
-    ``encoder_key`` is '' if the file is missing or cannot be used. ``state`` tells whether
-    another program changed the file since; None if there is none.
+    ``encoder_key`` is '' if the file is missing or unusable. ``state`` is the file's time and
+    size, to detect changes by other programs; None without a file.
     """
 
     path: Path
     encoder_key: str
     looks: Mapping[str, Encoded]
     state: tuple[int, int] | None
-    set_digest: str = ''  #: As in the head of the map, which an edit keeps
+    set_digest: str = ''  #: The digest in the head of the map, which edits keep
 
     def write(self, landmarks: Landmarks) -> tuple['LookFile', str]:
-        """Write the looks of all landmarks of the map in one step.
+        """Write the looks of all landmarks of the map atomically.
 
-        Looks of another encoder are left out. An unchanged file is not written, and the content
-        of another program is not overwritten. Return the file after that, and the reason if it
-        does not hold these looks, otherwise ''. MapError: it cannot be written.
+        Looks of another encoder are left out. An unchanged file is not rewritten, and changes by
+        another program are not overwritten. Return the new file, and the reason if the looks were
+        not written, else ''. MapError: the file cannot be written.
         """
         known = {key: landmark.look for key, landmark in landmarks.items()
                  if landmark.look is not None and landmark.look.encoder_key == self.encoder_key}
@@ -296,7 +297,7 @@ class LookFile(NamedTuple):
             return self, ''
         if _state_of(self.path) != self.state:
             return self, (f'{self.path.name}: another program changed this file, so the studio '
-                          'leaves it as it is; build the map again, or remove the file')
+                          'does not write it; rebuild the map, or remove the file')
         size = len(next(iter((*self.looks.values(), *known.values()))).mean)
         nothing = Encoded(np.zeros(size, np.float16), np.empty((0, size), np.float16), '')
         rows = [known.get(key, nothing) for key in landmarks]
@@ -308,7 +309,7 @@ class LookFile(NamedTuple):
 
 
 def read_look_file(file: MapFile) -> tuple[LookFile, str]:
-    """Return the image embeddings next to a map, and what is wrong with them, or ''."""
+    """Read the image embeddings next to a map; return also their fault, '' if they are valid."""
     path = embeddings_path(file.path)
     nothing = LookFile(path, '', {}, _state_of(path))
     if nothing.state is None:
@@ -317,9 +318,9 @@ def read_look_file(file: MapFile) -> tuple[LookFile, str]:
         embeddings = load_landmark_embeddings(path)
         check_set(embeddings.set_digest, file.map_set.digest)
     except MapError as error:
-        return nothing, f'{error}. The studio leaves this file as it is'
+        return nothing, f'{error}. The studio does not change this file'
     except ValueError as error:
-        return nothing, f'{path}: {error}. The studio leaves this file as it is'
+        return nothing, f'{path}: {error}. The studio does not change this file'
     return nothing._replace(encoder_key=embeddings.encoder_key, looks=looks_of(embeddings),
                             set_digest=embeddings.set_digest), ''
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A landmark that a person makes of boxes: one box of the object in each of some views.
+"""A landmark that a user creates from boxes of the object in several views.
 
-The boxes of the other views show where the object lies in a view without one: on the ray of one
-box, or where the ellipsoid that fits two or more projects to.
+The drawn boxes predict where the object lies in a further view: with one box, on the projection of
+its ray; with two or more, at the projection of the ellipsoid that fits them.
 """
 
 from collections.abc import Sequence
@@ -24,41 +24,41 @@ from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
 from cliploc_ros.offline.studio.recording import LEAST_BOXES, Recording
 
-#: Views nearer to one another leave the distance of the object open.
+#: Least angle between the views; with less, the distance of the object is uncertain.
 LEAST_ANGLE_DEG = 25.0
 MIN_BOX_PX = 4.0
 _STRETCH = 2.0
-# The object of one box may lie between these distances [m].
+# Possible distances of an object with a single box [m].
 _DEPTHS_M = np.geomspace(0.4, 12.0, 24)
-# A drawn box that overlaps a detector's box by more than this has its class.
+# A drawn box takes the class of a detector's box if their IoU is greater.
 _SAME_IOU = 0.5
-# Angle between the view of the next box and the views of the other boxes, if possible [deg].
+# Preferred angle between the view of the next box and the views of the other boxes [deg].
 _GOOD_ANGLE_DEG = 45.0
-# Asking again means that the last view did not help: views this near to it are skipped [deg].
+# A repeated request means that the last view was unsuitable: closer views are skipped [deg].
 _OTHER_ANGLE_DEG = 10.0
 
 
 class NewLandmark:
-    """The boxes by view, the class that they suggest, and the ellipsoid that fits them."""
+    """The boxes by view, the class that they suggest, and the fitted ellipsoid."""
 
     ACTIONS = ('draw', 'forget', 'create')
 
     def __init__(self, document: Document, recording: Recording):
         self._document, self._recording = document, recording
         self.boxes: dict[int, list[float]] = {}
-        #: Class of the detector's boxes that were chosen or drawn over; '' for none
+        #: Class of the detector's boxes that match the drawn boxes; '' if unknown
         self.class_id = ''
-        #: The ellipsoid that fits the boxes, if there is one, and what is doubtful about it
+        #: The ellipsoid that fits the boxes, if there is one, and a warning about it
         self.fit: Fit | None = None
         self.doubt = ''
-        # the next views since the last box
+        # results of next_view since the last box
         self._offered: list[int] = []
 
     def draw(self, view: int, corner: Any, other: Any) -> str:
-        """Put a box into a view, between two opposite corners (2,) [px]."""
+        """Set the box of a view, given two opposite corners (2,) [px]."""
         if type(view) is not int or not 0 <= view < len(self._recording.detections):
             raise EditError(f'there is no view {view!r:.60}')
-        corners = [edits.numbers(one, 2, 'corner') for one in (corner, other)]
+        corners = [edits.numbers(pixel, 2, 'corner') for pixel in (corner, other)]
         camera = self._recording.detections.camera_of(view)
         low, high = np.clip(np.sort(corners, axis=0), 0.0, (camera.width, camera.height))
         if not (high - low).min() >= MIN_BOX_PX:
@@ -82,7 +82,7 @@ class NewLandmark:
         return f'boxes drawn: {len(self.boxes)}'
 
     def _set(self, boxes: dict[int, list[float]]) -> None:
-        """Take over other boxes, and fit an ellipsoid to two or more."""
+        """Replace the boxes, and fit an ellipsoid to two or more."""
         self.boxes, self._offered, self.fit, self.doubt = boxes, [], None, ''
         if len(boxes) > 1:
             try:
@@ -107,7 +107,7 @@ class NewLandmark:
         document.edit(edits.create, *of, recording.look_of(rows, document.encoder_key))
         document.select([landmark_id])
         self.forget()
-        hint = (f'{len(rows)} boxes of the recording show it: Refit fits it to them'
+        hint = (f'{len(rows)} boxes of the recording show it: use Refit to fit it to them'
                 if len(rows) >= LEAST_BOXES else '')
         return '; '.join(filter(None, [f'created {landmark_id}', warning, hint]))
 
@@ -127,7 +127,7 @@ class NewLandmark:
         return np.asarray(_DEPTHS_M[:, None] * ray + pose[:3, 3])
 
     def guide(self, view: int) -> NDArray[np.float64]:
-        """Return the line (n, 2) [px] on which the object of one box lies in another view."""
+        """Return the line (n, 2) [px] in a view on which the object of a single box lies."""
         if len(self.boxes) != 1 or view in self.boxes:
             return np.empty((0, 2))
         detections = self._recording.detections
@@ -136,14 +136,14 @@ class NewLandmark:
         return pixels[is_front]
 
     def next_view(self) -> int:
-        """Return the view without a box that is best for the next one; again: another one.
+        """Return the best view for the next box; a repeated call returns a different view.
 
-        It is seen from another side, and shows as many of the object's possible places as
-        possible. EditError: there is no box, or no other view shows one of these places.
+        The view has another direction, and shows as many possible positions of the object as
+        possible. EditError: there is no box, or no other view shows any of these positions.
         """
         places = self._places()
         if not len(places):
-            raise EditError('draw the first box: it tells which views show the object')
+            raise EditError('draw the first box, which shows where the object may be')
         if len(places) > 1:
             places = places[(_DEPTHS_M > 0.8) & (_DEPTHS_M < 4.0)]
         detections, boxed = self._recording.detections, list(self.boxes)
@@ -165,7 +165,7 @@ class NewLandmark:
         best = int(np.argmax(values.mean(axis=1)))
         if not values[best].any():
             self._offered = []
-            raise EditError('no other view is sure to show the object; choose one yourself')
+            raise EditError('no other view is certain to show the object; choose a view yourself')
         self._offered.append(best)
         return best
 
@@ -182,17 +182,17 @@ def _project(camera: Camera, map_from_camera: NDArray[np.float64], points: NDArr
 
 def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
               bboxes_xyxy: NDArray[np.float64]) -> tuple[Fit, str]:
-    """Return the ellipsoid that fits boxes of one object, and what is doubtful about it, or ''.
+    """Fit an ellipsoid to boxes of one object; return it and a warning, '' without one.
 
     The boxes (n, 4) lie in undistorted images [px] of n cameras with poses (n, 4, 4).
 
-    EditError: there are fewer than two boxes, one is too small, or their rays do not meet in front
+    EditError: there are fewer than two boxes, a box is too small, or the rays do not meet in front
     of the cameras.
     """
     count = len(bboxes_xyxy)
     if count < 2:
-        raise EditError(f'create: boxes drawn: {count}; draw one in each of two images or more, '
-                        'best three')
+        raise EditError(f'create: boxes drawn: {count}; draw a box in at least two images, '
+                        'preferably three')
     if small := [box.tolist() for box in bboxes_xyxy if (box[2:] - box[:2]).min() < MIN_BOX_PX]:
         raise EditError(f'create: the box {small[0]} is smaller than {MIN_BOX_PX:g} pixels; draw '
                         'it around the whole object')
@@ -201,7 +201,7 @@ def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
         stamps_s=np.arange(count, dtype=np.float64), frame_offsets=np.arange(count + 1),
         bboxes_xyxy=bboxes_xyxy, class_names=('drawn',), classes=np.zeros(count, dtype=np.int64),
         scores=np.ones(count), camera_rows=np.arange(count)))
-    # each box was drawn for itself: none shares the error of a detector that stood still
+    # equal weights: drawn boxes have independent errors, unlike boxes of a detector at rest
     views = views._replace(weights=np.ones(count))
     origins = views.centers
     start, radius = _meeting_point(views, origins)
@@ -212,7 +212,7 @@ def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
              Rotation.from_euler('z', 45, degrees=True).as_matrix()
              @ (sphere * (_STRETCH, 1.0 / _STRETCH, 1.0))]
     fit = min((fit_ellipsoid(views, np.arange(count), start, basis) for basis in bases),
-              key=lambda one: one.cost)
+              key=lambda candidate: candidate.cost)
     offsets = fit.center - origins
     angle_deg = widest_angle_deg(offsets / np.linalg.norm(offsets, axis=1, keepdims=True))
     return fit, ('' if angle_deg >= LEAST_ANGLE_DEG else (
@@ -222,7 +222,7 @@ def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
 
 def _meeting_point(views: Views, origins: NDArray[np.float64]
                    ) -> tuple[NDArray[np.float64], float]:
-    """Return the point nearest to the rays of all boxes' centres, and the radius they suggest."""
+    """Return the point closest to the rays of all box centres, and a radius by the box sizes."""
     middles = 0.5 * (views.edges[:, :2] + views.edges[:, 2:])
     rays = np.column_stack([middles, np.ones(len(middles))])
     rays = np.einsum('fji,fj->fi', views.rotations, rays)

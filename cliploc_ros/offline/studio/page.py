@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page: the scene in three dimensions, and the one loop that redraws it and the parts.
+"""The page: the 3D scene, and the loop that redraws the scene and the other parts.
 
-viser shows the scene, in a frame of our own page: its widgets have no image to zoom and draw on,
-no rows with buttons, and no place for them but one column. Data moves one way: the pages send
-messages, viser calls back from many threads, and the desk does what they say with the document's
-lock held. One thread redraws, at most 20 times a second, and reads the studio under the same lock.
-So all browsers show the same state, and a slow one delays no edit.
+viser shows the scene in a frame of our page: its widgets have no image for zooming and drawing, no
+rows with buttons, and only a single column. Data flows in one direction: pages send messages,
+viser calls back from many threads, and the desk runs the actions with the document locked. One
+thread redraws at most 20 times a second, and reads the studio under the same lock. Thus all
+browsers show the same state, and a slow browser delays no edit.
 """
 
 import io
@@ -44,12 +44,12 @@ if TYPE_CHECKING:
 
 _REDRAW_INTERVAL_S = 0.05
 _BLANK = 70
-# The selection is drawn around its landmarks, larger by this factor; a missing one shines through.
+# Scales of the shapes around selected and missing landmarks. The latter are visible through them.
 _SELECTED_RGB: Rgb = (255, 220, 0)
 _AROUND = 1.03
 _MISSING_RGB: Rgb = (220, 0, 0)
 _MISSING_SCALE = 1.3
-# Between the clicks of a double click [s].
+# Greatest time between the clicks of a double click [s].
 _DOUBLE_CLICK_S = 0.6
 
 logger = logging.getLogger(__name__)
@@ -92,14 +92,14 @@ class Page:
         threading.Thread(target=self._load_cloud, args=(extent,), daemon=True).start()
 
     def stop(self) -> None:
-        """Stop redrawing, which asks for answers, and then the searches."""
+        """Stop redrawing, which starts searches, and then the searches."""
         self._stopped.set()
         self._studio.changed.set()
         self._redrawer.join()
         self.desk.stop()
 
     def _load_cloud(self, extent: viewpoint.Bounds) -> None:
-        """Read the surfaces, which takes seconds, while people use the page."""
+        """Read the surfaces in the background, which takes seconds."""
         studio = self._studio
         try:
             self._cloud = find_cloud(studio.recording, studio.layer, extent)
@@ -110,7 +110,7 @@ class Page:
                 self.desk.layers = {**self.desk.layers, 'Surfaces': True}
             studio.changed.set()
 
-    # ---- what a person does in the scene --------------------------------------------------------
+    # ---- actions in the scene -------------------------------------------------------------------
 
     def _click(self, event: Any, landmark_id: str) -> None:
         """Select a landmark; the second click of a double click flies to it."""
@@ -122,7 +122,7 @@ class Page:
             self.desk.act(lambda: self._studio.select(landmark_id, event.modifier == 'shift'))
 
     def _drag_gizmo(self, event: Any) -> None:
-        # Callbacks may overtake one another: each takes the gizmo's present pose, not its own.
+        # Callbacks may arrive out of order, so each uses the gizmo's current pose, not its own.
         if event.client is None:
             return
         if event.phase == 'start':
@@ -155,7 +155,7 @@ class Page:
         studio, show, is_on = self._studio, self._layers.show, self.desk.layers.get
         document, shown = studio.document, studio.shown()
         chosen = {key: shown[key] for key in document.selection if key in shown}
-        # all of them: a second click comes with the number that the first one's picture has
+        # also the selected landmarks: both clicks of a double click must have the same index
         self._all.show(shown, studio.color_of)
         self._selected.show(chosen, lambda class_id: _SELECTED_RGB)
         self._labels.show(shown if is_on('Labels') else {}, list(chosen))
@@ -167,7 +167,7 @@ class Page:
         show('Cameras', recording, self._draw_cameras, is_on('Cameras', True))
         show('Keyframes', studio.layer, draw_keyframes, is_on('Keyframes', True))
         show('Answers', studio.answers or None, draw_answers)
-        # only the mode test shows these
+        # these layers are shown only in test mode
         is_testing = 'test' in self.desk.modes.values()
         if studio.places is not None:
             self.desk.layers = {'Coverage': True, 'Look-alikes': True} | self.desk.layers
@@ -179,7 +179,7 @@ class Page:
                                 if key in document.landmarks}, lambda class_id: _MISSING_RGB)
             is_here = state.pose is not None and state.pose.frame_id == document.frame_id
             show('Robot', state if is_here else None, draw_robot)
-        # the pages need not wait for the image of the scene
+        # before the image of the scene, which takes time
         self.board.show(parts_of(self.desk))
         if recording is not None:
             show('Image', studio.view, self._draw_image)
@@ -195,7 +195,7 @@ class Page:
         return draw_image(scene, image, camera, self._studio.map_from_camera)
 
     def picture(self, path: str) -> Content | None:
-        """Return the picture of a path; None if there is none."""
+        """Return the picture at a path; None without a picture."""
         try:
             return picture_of(self._studio, path)
         except CliplocError as error:
@@ -206,10 +206,10 @@ class Page:
 @contextmanager
 def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | None' = None
                  ) -> Iterator[tuple[str, viser.ViserServer]]:
-    """Serve the page of a studio for as long as the block lasts; yield the URL and the server.
+    """Serve the page of a studio while the context is open; yield the URL and the server.
 
-    The port is the next free one from this on; 0: any. The URL holds a token. ``live`` is the
-    running relocalizer, to show it, too.
+    The first free port from ``port`` on is used; 0: any port. The URL contains a token. ``live``
+    is the connection to the running relocalizer, if it is to be shown.
     """
     gate, pages = Gate(host), list[Page]()
 
@@ -227,7 +227,7 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
 
     with gate.guard(answer, talk), redirect_stdout(io.StringIO()):  # viser prints another URL
         server = viser.ViserServer(host, port, verbose=False)
-    # viser would open a tunnel to a server on the Internet for any browser that asks
+    # disabled, because viser would open a tunnel to a public server at any browser's request
     server.request_share_url = lambda *args, **options: None  # type: ignore[method-assign]
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     if live is not None:

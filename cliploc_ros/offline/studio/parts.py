@@ -15,10 +15,10 @@ from cliploc_ros.offline.studio.layers import LEGEND
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.web import Content
 
-# More outlines hide the image, and a drag would wait for them.
+# Greatest number of outlines: more hide the image and delay a drag.
 _MAX_OUTLINES = 200
 _CROP_PX, _QUALITY = 160, 88
-# Answers that are listed after a run over the recording.
+# Greatest number of answers in the list after a run over the recording.
 _MAX_ANSWERS = 100
 
 
@@ -98,7 +98,7 @@ def _view_parts(studio: Studio) -> dict[str, Any]:
 
 
 def _axes_of(ellipse: NDArray[np.float64]) -> list[float]:
-    """Return an outline's centre, semi-axes [px], and the angle of the first one [deg]."""
+    """Return an outline's centre and semi-axes [px], and the angle of the first axis [deg]."""
     cx, cy, exx, exy, eyy = ellipse
     mean, apart = 0.5 * (exx + eyy), np.hypot(0.5 * (exx - eyy), exy)
     axes = np.sqrt(np.maximum([mean + apart, mean - apart], 0.0))

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Phrases that describe a landmark best, chosen by CLIP.
+"""The phrases that describe a landmark best, ranked by CLIP.
 
-Loading CLIP takes seconds, and reading a vocabulary for the first time up to a minute.
+Loading CLIP takes seconds, and embedding a vocabulary for the first time up to a minute.
 """
 
 import logging
@@ -23,23 +23,23 @@ from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
 from cliploc_ros.offline.vocabulary.vocabulary import Vocabulary, shipped_phrases
 
 _PHRASES = 5
-# Views in which a landmark without embeddings is looked at.
+# Number of views that are embedded for a landmark without embeddings.
 _CROPS = 3
 
 logger = logging.getLogger(__name__)
 
 
 class FoundPhrases(NamedTuple):
-    """The best phrases, best first, and a note for the user; '' for none."""
+    """The best phrases, best first, and a note for the user; '' without a note."""
 
     phrases: tuple[str, ...]
     note: str
 
 
 class PhraseFinder:
-    """Finds phrases of landmarks.
+    """Finds phrases for landmarks.
 
-    Landmarks without a look are looked at in the recording: in its embeddings, or its images.
+    Landmarks without a look get embeddings from the recording: its embeddings, or its images.
     """
 
     def __init__(self, clip: ClipOptions, vocabulary: Vocabulary, recording: Recording | None):
@@ -49,13 +49,13 @@ class PhraseFinder:
     def find(self, landmarks: Landmarks, landmark_id: str) -> FoundPhrases:
         """Return the phrases for a landmark, or why there are none.
 
-        Weights that cannot be loaded are not tried again: the fault answers for all landmarks.
+        If the weights cannot be loaded, this is not retried: all landmarks get the same fault.
         """
         if self._fault:
             return FoundPhrases((), self._fault)
         try:
             return self._find(landmarks, landmark_id)
-        except Exception as error:  # also of torch, open_clip: the page shows it and goes on
+        except Exception as error:  # including those of torch and open_clip: the page shows them
             return FoundPhrases((), _explained(error))
 
     @cached_property
@@ -74,7 +74,7 @@ class PhraseFinder:
         mean = self._mean(landmarks, landmark_id)
         if mean is None:
             return FoundPhrases((), 'CLIP offers no phrases: neither embeddings nor images show '
-                                'all of this landmark')
+                                'the whole landmark')
         names = classes_of(map_of({landmark_id: landmarks[landmark_id]}), 0)
         phrases = phrases_of_classes(
             self._weights, self._clip,
@@ -84,7 +84,7 @@ class PhraseFinder:
         return FoundPhrases(tuple(text for text, _ in best[:_PHRASES]), '')
 
     def _mean(self, landmarks: Landmarks, landmark_id: str) -> NDArray[np.float32] | None:
-        """Return the mean embedding (d,) of a landmark's crops; None if nothing shows it."""
+        """Return the mean embedding (d,) of a landmark's crops; None without crops."""
         look, recording, key = landmarks[landmark_id].look, self._recording, self._weights.key
         if (look is None or look.encoder_key != key) and recording is not None:
             look = recording.look_of(recording.boxes_of(landmarks)[landmark_id], key)
@@ -92,8 +92,9 @@ class PhraseFinder:
             return look.mean.astype(np.float32)
         if recording is None:
             return None
-        seen = [(recording.image(one.view), one.bbox_xyxy)
-                for one in recording.sightings(landmarks, landmark_id, _CROPS) if one.is_whole]
+        sightings = recording.sightings(landmarks, landmark_id, _CROPS)
+        seen = [(recording.image(sighting.view), sighting.bbox_xyxy)
+                for sighting in sightings if sighting.is_whole]
         embeddings = [self._encoder.encode_crops(image, box[None])[0] for image, box in seen
                       if image is not None]
         mean = np.sum(embeddings, axis=0)
@@ -102,7 +103,7 @@ class PhraseFinder:
 
 
 def _explained(error: Exception) -> str:
-    """Return why there are no phrases; log an error that is not this package's own."""
+    """Return why there are no phrases; log errors of other packages."""
     if isinstance(error, CliplocError):
         return f'CLIP offers no phrases: {error}'
     logger.error('CLIP finds no phrases', exc_info=error)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coverage: places where a robot would be accepted, refused or misled, and look-alike places.
 
-Both are check_map's, with fewer positions. Their order spreads them over the map, so that the
-positions tried before time runs out cover all of it.
+Both are computed as by check_map, but with fewer positions. The positions are in random order, so
+that those tried before the time limit cover the whole map.
 """
 
 import time
@@ -34,7 +34,7 @@ from cliploc_ros.offline.simulation import DetectorModel, guess_detector
 from cliploc_ros.offline.studio.landmark import Landmarks, map_of
 from cliploc_ros.offline.studio.recording import Recording
 
-#: No position is begun after this [s].
+#: No further position is tried after this time [s].
 LIMIT_S = 60.0
 _OPTIONS = CheckOptions(max_positions=100, headings=8)
 
@@ -42,16 +42,16 @@ _OPTIONS = CheckOptions(max_positions=100, headings=8)
 class Coverage(NamedTuple):
     """The coverage and the look-alikes of a map."""
 
-    landmarks: Landmarks  #: Checked landmarks
-    grid: Grid  #: All positions; tried positions come first
+    landmarks: Landmarks  #: The landmarks that were checked
+    grid: Grid  #: All positions; the tried positions are first
     check: GridCheck  #: Check of the tried positions
     look_alikes: tuple[LookAlike, ...]
-    detector: str  #: The source of the detector's errors, in words
+    detector: str  #: Description of the source of the detector's errors
     keyframes: KeyframeCheck | None  #: Check of the tried positions; None without keyframes
 
     @property
     def figures(self) -> dict[str, str]:
-        """The figures by name."""
+        """The results by name."""
         verdicts, views = count_verdicts(self.check.trials), len(self.check.trials)
         return {'where a robot is localized': str(carried_positions(self.check, self.keyframes)),
                 'views accepted by objects': f'{verdicts["accepted"]} of {views}',
@@ -59,12 +59,13 @@ class Coverage(NamedTuple):
                 'pairs of places that look alike': str(len(self.look_alikes))}
 
     def lines(self, before: 'Coverage | None') -> list[str]:
-        """Return the figures in lines, with those of the time before."""
+        """Return the results as lines, with those of the previous search."""
         old = before.figures if before is not None else {}
         lines = [f'{name}: {value}' + (f' (was {old[name]})' if old else '')
                  for name, value in self.figures.items()]
         if len(self.check.positions) < len(self.grid.positions):
-            lines.append(f'time ran out: {len(self.grid.positions)} positions were planned')
+            lines.append(f'time is up: {len(self.check.positions)} of '
+                         f'{len(self.grid.positions)} positions were tried')
         return [*lines, f'{self.detector}; similarities are simulated']
 
 
@@ -73,10 +74,10 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Cover
                 layer: KeyframeLayer | None = None) -> Coverage:
     """Return the places of a map where a robot would be accepted, refused or misled.
 
-    The recording gives the camera's height and the detector's errors. The positions of the time
-    before are tried again where they suit, so that only edits change the figures. ``tell`` is
-    called with the share that is done; an error that it raises ends the search. No position is
-    begun after the limit. MapError: there are no landmarks.
+    Camera height and detector errors come from the recording. The positions of the previous
+    search are reused if they still cover the map, so that only edits change the results. ``tell``
+    is called with the completed share; an error that it raises ends the search. No position is
+    begun after ``limit_s``. MapError: there are no landmarks.
     """
     tell(0.0)
     landmark_map = map_of(landmarks)
@@ -86,7 +87,7 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Cover
     begin = time.monotonic()
     for trial in each_pose(model, landmark_map, grid.poses, _OPTIONS):
         if not trials:
-            begin = time.monotonic()  # the first one may have compiled kernels
+            begin = time.monotonic()  # the first trial may have compiled kernels
         trials.append(trial)
         tell(len(trials) / len(grid.poses))
         is_whole = len(trials) % _OPTIONS.headings == 0
@@ -99,22 +100,22 @@ def find_places(landmarks: Landmarks, recording: Recording | None, before: Cover
 
 def _detector(landmark_map: LandmarkMap, recording: Recording | None
               ) -> tuple[DetectorModel, str]:
-    """Return the detector of a recording, or else a guess, and in words what it is."""
+    """Return the detector of a recording, else an assumed detector, and its description."""
     guess = guess_detector(landmark_map)
     if recording is None:
-        return guess, 'without a recording, the camera and the detector are guesses'
+        return guess, 'without a recording, camera and detector are assumed'
     detections = recording.detections
     if len(detections.classes):
         witness = recording.witness(landmark_map)
         if (witness.shown >= 0).any():
             return measure_detector(landmark_map, detections, recording.views, witness
-                                    ), 'the detector is as in the recording'
+                                    ), 'the errors of the detector are those of the recording'
     return (replace(guess, camera=detections.cameras[0]),
-            'no box of the recording shows a landmark: the detector is a guess')
+            'no box of the recording shows a landmark: the detector is assumed')
 
 
 def _grid(landmark_map: LandmarkMap, recording: Recording | None, before: Coverage | None) -> Grid:
-    """Return positions all over the map, those of the time before if their corners agree."""
+    """Return positions all over the map; reuse the previous positions if their corners agree."""
     poses = None if recording is None else recording.detections.of_first_camera
     grid = make_grid(landmark_map, poses, _OPTIONS)
     if before is not None and len(grid.positions) and len(before.grid.positions):

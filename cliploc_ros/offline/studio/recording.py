@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The recording of a studio: boxes of landmarks, their places in its views, relocalizations.
+"""The recording of a studio: boxes and outlines of landmarks in its views, and relocalization.
 
-Relocalizations have the recording's boxes and poses. Similarities are simulated, as check_map does
-it. The views are not held out: a landmark that was fitted to them fits them better than new
-images.
+Relocalization uses the boxes and poses of the recording. Similarities are simulated, as in
+check_map. The views are not held out: landmarks that were fitted to them match them better than
+new images.
 """
 
 from collections.abc import Sequence
@@ -41,13 +41,13 @@ from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.edits import Change, EditError
 from cliploc_ros.offline.studio.landmark import Encoded, Landmarks, looks_of, map_of
 
-#: Fewer boxes leave an ellipsoid open.
+#: Least number of boxes that determine an ellipsoid.
 LEAST_BOXES = 3
-# Margin around a box that is examined, as a share of its size.
+# Margin of a crop around a box, as a share of its size.
 _MARGIN = 0.25
-# Between the pictures of the film [s].
+# Time between the pictures of the film [s].
 _PICTURE_S = 0.2
-# Poses of one camera differ by rounding only: entries of their matrices.
+# Tolerance of the entries of two pose matrices of the same image, which differ by rounding.
 _SAME_POSE = 1e-3
 
 
@@ -61,14 +61,14 @@ class Outline(NamedTuple):
 
 
 class Recording:
-    """Boxes and poses of a recording of the mapped place, and its images where they are known."""
+    """Boxes and poses of a recording of the mapped place, and optionally its images."""
 
     def __init__(self, detections: PosedDetections, images: Images | None = None):
         self.detections, self.images = detections, images
 
     @cached_property
     def views(self) -> Views:
-        """The arrays that the kernels of mapping read."""
+        """The arrays for the kernels of mapping."""
         return make_views(self.detections)
 
     @cached_property
@@ -84,7 +84,7 @@ class Recording:
         return hear_witness(self.views, landmark_map, self.detections.class_names)
 
     def boxes_of(self, landmarks: Landmarks) -> dict[str, NDArray[np.int64]]:
-        """Return the boxes that show each landmark; a box shows one at most."""
+        """Return the boxes of each landmark; a box shows at most one landmark."""
         if not landmarks:
             return {}
         shown = associate(self.views, landmarks_of_map(
@@ -92,7 +92,7 @@ class Recording:
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
 
     def outlines(self, landmarks: Landmarks, view: int) -> list[Outline]:
-        """Return the outlines of landmarks in a view, the nearest first."""
+        """Return the outlines of landmarks in a view, nearest first."""
         if not landmarks:
             return []
         camera, centers = self.detections.camera_of(view), _array(landmarks, 'center')
@@ -103,35 +103,35 @@ class Recording:
         with np.errstate(invalid='ignore'):
             is_inside = (boxes[:, 2:] > 0.0).all(axis=1) & (
                 boxes[:, :2] < (camera.width, camera.height)).all(axis=1)
-        found = [Outline(*one) for one in zip(landmarks, ellipses, boxes, distances.tolist(),
-                                              strict=True)]
+        found = [Outline(*fields) for fields in zip(landmarks, ellipses, boxes,
+                                                    distances.tolist(), strict=True)]
         return sorted((found[row] for row in np.nonzero(is_inside)[0]),
-                      key=lambda one: one.distance_m)
+                      key=lambda outline: outline.distance_m)
 
     def sightings(self, landmarks: Landmarks, landmark_id: str, limit: int = 6) -> list[Sighting]:
         """Return the views that show a landmark best; CliplocError: an image cannot be read."""
-        one = landmarks[landmark_id]
+        landmark = landmarks[landmark_id]
         return find_sightings(
-            self.detections, self.boxes_of(landmarks)[landmark_id], one.center,
-            shape_matrices(one.semi_axes[None], one.quat_xyzw[None])[0], limit,
+            self.detections, self.boxes_of(landmarks)[landmark_id], landmark.center,
+            shape_matrices(landmark.semi_axes[None], landmark.quat_xyzw[None])[0], limit,
             None if self.images is None else self._sharpness)
 
-    def _sharpness(self, one: Sighting) -> float:
-        """Return the share of fine detail in the view around the landmark."""
-        crop = self.crop(one.view, one.bbox_xyxy)
+    def _sharpness(self, sighting: Sighting) -> float:
+        """Return the share of fine detail in the image around the landmark."""
+        crop = self.crop(sighting.view, sighting.bbox_xyxy)
         if crop is None:
             return 0.0
         grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
         return float(cv2.Laplacian(grey, cv2.CV_64F).var() / max(1.0, float(grey.var())))
 
     def image(self, view: int) -> NDArray[np.uint8] | None:
-        """Return the undistorted image (h, w, 3) of a view, red first; None without one."""
+        """Return the undistorted RGB image (h, w, 3) of a view; None without an image."""
         if self.images is None or not 0 <= view < len(self.detections):
             return None
         return self.images.of(self.detections, view)
 
     def image_at(self, map_from_camera: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        """Return the image of the view with a pose (4, 4); None without one."""
+        """Return the image of the view with a pose (4, 4); None without an image."""
         poses = self.detections.map_from_camera
         views = np.nonzero(np.abs(poses - map_from_camera).max(axis=(1, 2)) < _SAME_POSE)[0]
         return self.image(int(views[0])) if len(views) else None
@@ -139,7 +139,7 @@ class Recording:
     def crop(self, view: int, box: NDArray[np.float64]) -> NDArray[np.uint8] | None:
         """Return the crop of a box (4,) [px] with a margin.
 
-        None without the image, or for a box that is not finite.
+        None without an image, or if the box is not finite.
         """
         image = self.image(view)
         if image is None or not np.isfinite(box).all():
@@ -152,7 +152,7 @@ class Recording:
         return image[top:bottom, left:right]
 
     def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Encoded | None:
-        """Return the look that an encoder has of some boxes; None if it saw none of them."""
+        """Return the look by an encoder of the boxes `rows`; None without their embeddings."""
         detections = self.detections
         if detections.encoder_key != encoder_key or detections.embeddings is None or not len(rows):
             return None
@@ -162,14 +162,14 @@ class Recording:
 
     def refitted(self, landmarks: Landmarks, landmark_ids: Sequence[str]
                  ) -> tuple[Change, dict[str, str]]:
-        """Return the change that fits landmarks to their boxes, and why others are left out.
+        """Return the change that fits landmarks to their boxes, and why others are not fitted.
 
-        EditError: one is locked. MappingError: none can be fitted.
+        EditError: a landmark is locked. MappingError: no landmark can be fitted.
         """
         if locked := [key for key in landmark_ids if landmarks[key].marks.is_locked]:
             raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
         chosen = np.array([key in set(landmark_ids) for key in landmarks])
-        # the others keep their boxes, so that none takes those of its neighbour
+        # all landmarks take part, so that none gets the boxes of its neighbour
         refit = refit_map(self.detections, map_of(landmarks), chosen)
         reasons = {key: reason for key, reason in zip(landmarks, refit.reasons, strict=True)
                    if reason is not None and key in landmark_ids}
@@ -177,7 +177,7 @@ class Recording:
         return edits.take_fits(landmarks, fitted, refit.landmark_map), reasons
 
     def merged(self, landmarks: Landmarks, landmark_ids: Sequence[str]) -> tuple[Change, str]:
-        """Return the change that merges landmarks, and how: by boxes, or else by volume."""
+        """Return the change that merges landmarks, and the method: 'by boxes' or 'by volume'."""
         change = edits.merge(landmarks, landmark_ids)
         merged = change.after[landmark_ids[0]]
         assert merged is not None
@@ -191,9 +191,9 @@ class Recording:
 
     def relocalize(self, landmarks: Landmarks, views: Sequence[int],
                    layer: KeyframeLayer | None = None) -> dict[int, Trial]:
-        """Return the relocalizer's answers in some views; MapError without landmarks.
+        """Return the relocalizer's answers in some views; MapError: there are no landmarks.
 
-        Keyframes of a view's time are not used for it.
+        Keyframes recorded at about the time of a view are not used for it.
         """
         keyframes = None if layer is None or self.images is None else RecordedKeyframes(
             layer, self.image)
@@ -202,7 +202,7 @@ class Recording:
         shown = np.full(len(detections.classes), -1, dtype=np.int64)
         for landmark, rows in enumerate(self.boxes_of(landmarks).values()):
             shown[rows] = landmark
-        # equal noise each time, so that only edits change the answer
+        # a fixed random seed, so that only edits change the answers
         return {view: try_view(
             relocalizer, simulated(detections, view, shown, labels, options.random_seed),
             detections.map_from_camera[view], 0, options, float(detections.stamps_s[view]),

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The review: each landmark of the map once, the worst first, until a person has decided on all.
+"""The review: the user decides on each landmark of the map once, worst landmarks first.
 
-The order is that of the last check, so that a decision moves no landmark below the person's hand.
-Landmarks that are newer come last. Decisions are marks of the landmarks: undo takes them back,
-and they survive a restart.
+The order is that of the last check, so that the list does not change under the user's cursor.
+Newer landmarks are at the end. Decisions are marks of the landmarks: undo reverts them, and they
+survive a restart.
 """
 
 from collections.abc import Sequence
@@ -34,11 +34,11 @@ class ReviewQueue:
         self._duplicates: list[tuple[str, str]] = []
         self._order: tuple[str, ...] = ()
 
-    # ---- what is known --------------------------------------------------------------------------
+    # ---- state ----------------------------------------------------------------------------------
 
     @property
     def has_boxes(self) -> bool:
-        """Return whether boxes of a recording judge the landmarks, not the map's own figures."""
+        """Return whether landmarks are checked by boxes of a recording, not by the map alone."""
         return self._recording is not None and len(self._recording.detections.classes) > 0
 
     def check_of(self, landmark_id: str) -> LandmarkCheck | None:
@@ -47,29 +47,29 @@ class ReviewQueue:
 
     @property
     def order(self) -> list[str]:
-        """The landmarks of the last check, worst first, also if deleted; then newer landmarks."""
+        """Ids of the last check, worst first, including deleted ones; then newer landmarks."""
         return list(dict.fromkeys([*self._order, *self._document.landmarks]))
 
     def decision(self, landmark_id: str) -> str:
-        """Return the decision on a landmark, '' for none; an undone deletion is none."""
-        one = self._document.landmarks.get(landmark_id)
-        return 'deleted' if one is None else one.marks.decision
+        """Return the decision on a landmark; '' without one, or after an undone deletion."""
+        landmark = self._document.landmarks.get(landmark_id)
+        return 'deleted' if landmark is None else landmark.marks.decision
 
     def severity(self, landmark_id: str) -> float:
-        """Return how bad the faults of a landmark are; 0 once a person has decided on it."""
+        """Return the severity of the faults of a landmark; 0 after a decision on it."""
         check = self._checks.get(landmark_id)
         return 0.0 if check is None or self.decision(landmark_id) else check.severity
 
     def counts(self) -> dict[str, int]:
-        """Return the number of landmarks in the queue, 0 before it, and of each decision."""
+        """Return the number of landmarks in the queue, 0 before a check, and of each decision."""
         found = [self.decision(key) for key in self.order] if self._order else []
         return {'total': len(found), **{name: found.count(name)
                                         for name in ('accepted', 'fixed', 'deleted')}}
 
-    # ---- what a person does ---------------------------------------------------------------------
+    # ---- actions --------------------------------------------------------------------------------
 
     def check(self) -> str:
-        """Judge all landmarks; once more after a complete review, a new one begins."""
+        """Check all landmarks. After a complete review, this begins a new one."""
         self._judge()
         with self._document.lock:
             landmarks = self._document.landmarks
@@ -77,30 +77,30 @@ class ReviewQueue:
             if begins_anew:
                 self._document.edit(edits.mark, landmarks, 'review', decision='')
         self._order = tuple(self._checks)
-        serious = sum(one.severity >= SERIOUS for one in self._checks.values())
+        serious = sum(check.severity >= SERIOUS for check in self._checks.values())
         source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'
         what = f'checked {len(self._order)} landmarks{source}: {serious} with a serious fault'
-        # what a person has chosen meanwhile stays
+        # keep the selection that the user has made meanwhile
         return what if self._document.selection and not begins_anew else self._go_on('', what)
 
     def accept(self) -> str:
-        """Accept the selection as it is, whatever the check says, and go on."""
+        """Accept the selection regardless of the check, and select the next landmark."""
         ids = self._document.chosen()
         return self._decide(ids, 'accepted', f'accepted {", ".join(ids)}')
 
     def discard(self) -> str:
-        """Delete the selection, and go on."""
+        """Delete the selection, and select the next landmark."""
         ids = self._document.chosen()
         self._document.edit(edits.delete, ids)
         if self._document.landmarks and any({*pair} & {*ids} for pair in self._duplicates):
-            self._judge()  # or else its duplicate would be called one
+            self._judge()  # the other landmark of the pair is no longer a duplicate
         return self._go_on(ids[-1], f'deleted {", ".join(ids)}')
 
     def fix(self) -> str:
-        """Do what the check advises: merge a duplicate, fit any other landmark to its boxes.
+        """Apply the remedy of the check: merge a duplicate, fit any other landmark to its boxes.
 
-        The landmark is checked once more; the review goes on if no serious fault is left. The
-        boxes of a moved object may still lie where it was: look at the result.
+        The landmark is checked again, and the next one is selected if no serious fault is left.
+        The boxes of a moved object may still lie at its old place: look at the result.
         """
         landmark_id = self._document.chosen()[0]
         if self._recording is None or not self.has_boxes:
@@ -119,7 +119,7 @@ class ReviewQueue:
                 raise EditError(f'{landmark_id} {left_out[landmark_id]}: edit, accept or delete '
                                 'it')
             what = f'fitted {landmark_id} to its boxes'
-        gesture = object()  # one undo takes back both
+        gesture = object()  # one undo reverts both the fix and the decision
         self._document.apply(change, gesture)
         self._judge()
         left = self._checks[landmark_id]
@@ -129,7 +129,7 @@ class ReviewQueue:
         return self._decide([landmark_id], 'fixed', what, gesture)
 
     def step(self, count: int) -> None:
-        """Select the landmark that lies some places farther in the queue."""
+        """Select the landmark `count` places further in the queue."""
         if type(count) is not int:
             raise EditError(f'step: expected a whole number, not {count!r:.60}')
         ids = [key for key in self.order if key in self._document.landmarks]
@@ -143,7 +143,7 @@ class ReviewQueue:
 
     def _decide(self, ids: Sequence[str], decision: str, what: str, gesture: object = None
                 ) -> str:
-        """Keep a decision, and select the next landmark without one."""
+        """Store a decision, and select the next landmark without a decision."""
         self._document.edit(edits.mark, ids, decision, decision=decision, gesture=gesture)
         return self._go_on(ids[-1], what)
 
@@ -166,6 +166,6 @@ class ReviewQueue:
         overlaps = find_map_overlaps(landmark_map, witness, views)
         found = check_landmarks(landmark_map, witness, overlaps)
         ids = list(landmarks)
-        self._checks = {one.landmark_id: one for one in found}
+        self._checks = {check.landmark_id: check for check in found}
         self._duplicates = [(ids[overlap.first], ids[overlap.second]) for overlap in overlaps
                             if overlap.is_duplicate]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The landmarks in three dimensions: ellipsoids, labels, the gizmo; and the selected image."""
+"""The 3D scene: landmarks as ellipsoids with labels, the gizmo, and the selected image."""
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -17,12 +17,12 @@ from cliploc_ros.offline.studio.landmark import Landmark, Landmarks, fields_of
 from cliploc_ros.offline.studio.layers import SPHERE, linear
 from cliploc_ros.offline.studio.viewpoint import Bounds, pixels_of, wxyz_of
 
-# More labels than these hide the map.
+# Greatest number of labels: more hide the map.
 _MAX_LABELS = 60
 _MAX_LABEL_LENGTH, _SHORT_LABEL_LENGTH = 60, 24
-# Size of a letter and of a line with its margins, in a label of scale 1 [px].
+# Width of a letter, and height of a line with its margins, in a label of scale 1 [px].
 _LETTER_PX, _LINE_PX = 6.5, 28.0
-# The image of the selected view lies this far in front of its camera [m].
+# Distance of the image of the selected view from its camera [m].
 _IMAGE_DEPTH_M = 0.1
 _RING_POINTS = 40
 _GIZMO_PX = 90.0
@@ -42,10 +42,10 @@ _RINGS = _make_rings()
 
 
 class Ellipsoids:
-    """Landmarks as one node of many equal spheres, each with its own scale.
+    """Landmarks as one node with an instance of a sphere for each, scaled to its ellipsoid.
 
-    A click calls a function with the event and the landmark's id. With outlines, each is a
-    shade with three rings along its axes, which hides nothing behind it.
+    A click calls a function with the event and the landmark's id. With outlines, each landmark is
+    a translucent body with three rings along its axes, so that it hides nothing behind it.
     """
 
     def __init__(self, scene: viser.SceneApi, name: str, on_click: Callable[[Any, str], None],
@@ -56,16 +56,17 @@ class Ellipsoids:
         self._handles: list[Any] = []
 
     def show(self, landmarks: Landmarks, rgb_of: Callable[[str], tuple[int, int, int]]) -> None:
-        """Show these landmarks, in the colours of their classes."""
+        """Show the given landmarks in the colours of their classes."""
         if list(fields_of(landmarks).items()) == list(fields_of(self._shown).items()):
             return
         before, self._shown = self._shown, landmarks
         shown = list(landmarks.values())
-        colors = np.array([rgb_of(one.class_id) for one in shown], dtype=np.uint8)
+        colors = np.array([rgb_of(landmark.class_id) for landmark in shown], dtype=np.uint8)
         arrays: dict[str, Any] = {
-            'batched_wxyzs': np.array([np.roll(one.quat_xyzw, 1) for one in shown], np.float32),
-            'batched_positions': np.array([one.center for one in shown], np.float32),
-            'batched_scales': np.array([self._scale * one.semi_axes for one in shown],
+            'batched_wxyzs': np.array([np.roll(landmark.quat_xyzw, 1) for landmark in shown],
+                                      np.float32),
+            'batched_positions': np.array([landmark.center for landmark in shown], np.float32),
+            'batched_scales': np.array([self._scale * landmark.semi_axes for landmark in shown],
                                        np.float32)}
         if len(shown) != len(before):
             for handle in self._handles:
@@ -83,7 +84,7 @@ class Ellipsoids:
                    batched_colors=linear(colors))
         for modifier in (None, 'shift'):
             body.on_click(modifier=modifier)(self._clicked)
-        # edges of empty triangles: a mesh of lines, one pixel wide at any scale, and dark
+        # wireframe of triangles without area: dark lines, one pixel wide at any scale
         return [body] + ([add(f'{self._name}_outlines', *_RINGS, wireframe=True, lod='off',
                               batched_colors=colors)] if self._has_outlines else [])
 
@@ -94,10 +95,10 @@ class Ellipsoids:
 
 
 class Labels:
-    """Ids of the landmarks in the scene; where they overlap, the nearest landmarks keep theirs.
+    """Ids of the landmarks in the scene. Of overlapping ids, only the nearest is shown.
 
-    Those of the selection come with their labels: labels may be equal, and are long.
-    They fit the window of the browser whose camera moved last.
+    Selected landmarks also show their labels, which may be equal and long. The layout fits the
+    window of the browser whose camera moved last.
     """
 
     def __init__(self, server: viser.ViserServer, up: NDArray[np.float64]):
@@ -114,7 +115,7 @@ class Labels:
             self._moved(client.camera)
 
     def show(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
-        """Show the labels of these landmarks; those of the selection come first."""
+        """Show the labels of the given landmarks, with priority for the selection."""
         self._shown = landmarks, selection
         self._lay_out()
 
@@ -123,7 +124,7 @@ class Labels:
         self._lay_out()
 
     def _lay_out(self) -> None:
-        """Lay out the labels; a call during another one has that one do it once more."""
+        """Lay out the labels. A call during another call makes that call repeat the layout."""
         self._is_stale = True
         while self._is_stale and self._lock.acquire(blocking=False):
             try:
@@ -150,16 +151,17 @@ class Labels:
             half = 0.5 * scale * _LETTER_PX * (len(texts[row]) + 2)
             x, bottom = pixels[row].tolist()
             left, top, right = x - half, bottom - scale * _LINE_PX, x + half
-            if not any(left < one[2] and right > one[0] and top < one[3] and bottom > one[1]
-                       for one in taken):
+            if not any(left < other[2] and right > other[0] and top < other[3]
+                       and bottom > other[1] for other in taken):
                 taken.append((left, top, right, bottom))
                 yield row, scale
             if len(taken) >= _MAX_LABELS:
                 return
 
     def _set(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
-        tops = np.array([one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
-                         for one in landmarks.values()]).reshape(-1, 3)
+        tops = np.array([
+            landmark.center + float(np.linalg.norm(landmark.basis.T @ self._up)) * self._up
+            for landmark in landmarks.values()]).reshape(-1, 3)
         keys, texts = list(landmarks), [
             _shortened(f'{key}: {landmark.label}', _MAX_LABEL_LENGTH) if key in selection
             else _shortened(key, _SHORT_LABEL_LENGTH) for key, landmark in landmarks.items()]
@@ -170,7 +172,7 @@ class Labels:
             _set_props(self._handles[key], visible=False)
         for row, scale in rows.items():
             if keys[row] not in self._handles:
-                # ids may hold any characters, names of nodes not
+                # nodes are numbered, because ids may contain characters that names must not
                 self._handles[keys[row]] = self._server.scene.add_label(
                     f'/labels/{self._count}', texts[row], anchor='bottom-center')
                 self._count += 1
@@ -179,7 +181,7 @@ class Labels:
 
 
 def _set_props(handle: Any, **props: Any) -> None:
-    """Set properties that differ: viser sends each that is set to all browsers."""
+    """Set the properties that changed: viser sends each property that is set to all browsers."""
     for name, value in props.items():
         if not np.array_equal(getattr(handle, name), value):
             setattr(handle, name, value)
@@ -190,16 +192,16 @@ def _shortened(text: str, length: int) -> str:
 
 
 class Gizmo:
-    """The handles that move and turn the selected landmark."""
+    """The handles for moving and rotating the selected landmark."""
 
     def __init__(self, scene: viser.SceneApi, on_drag: Callable[[Any], None]):
-        # of the same size at any distance, and visible inside large landmarks
+        # fixed size at any distance, and visible inside large landmarks
         self.handle = scene.add_transform_controls('/gizmo', scale=_GIZMO_PX, fixed=True,
                                                    depth_test=False, visible=False)
         self.handle.on_update(on_drag)
 
     def show(self, landmark: Landmark | None) -> None:
-        """Put the gizmo to a landmark, or hide it."""
+        """Place the gizmo at a landmark, or hide it."""
         _set_props(self.handle, visible=landmark is not None)
         if landmark is None:
             return
@@ -224,7 +226,7 @@ def draw_image(scene: viser.SceneApi, picture: NDArray[np.uint8], camera: Camera
 
 
 def draw_floor(scene: viser.SceneApi, extent: Bounds) -> None:
-    """Draw the lines of the floor, half a metre apart."""
+    """Draw the grid of the floor, with cells of half a metre."""
     side = 2.0 * float(np.ceil(1.3 * extent.radius_m)) + 2.0
     below = extent.middle - (extent.middle @ extent.up - extent.floor_m) * extent.up
     scene.add_grid('/floor', width=side, height=side, cell_size=0.5, fade_strength=2.0,

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The actions of a person in the studio, without the page.
+"""The actions of the studio, independent of the page.
 
-Every action returns a line that says what it did, or raises a CliplocError.
+Every action returns a line with its result, or raises a CliplocError.
 """
 
 import threading
@@ -34,40 +34,40 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.studio.live import LiveRelocalizer
 
 Rgb = tuple[int, int, int]
-# Views of the whole recording in which the relocalizer is tried.
+# Greatest number of views of a recording in which the relocalizer is tried.
 _MAX_TRIALS = 100
-# Distinct on grey and on photographs; yellow and magenta are the selection's and drawn boxes'.
+# Distinct on grey and on photographs. Yellow is used for the selection, magenta for drawn boxes.
 _PALETTE: tuple[Rgb, ...] = (
     (31, 119, 180), (255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75),
     (0, 190, 190), (255, 110, 130), (120, 190, 32), (70, 90, 255), (0, 105, 92), (128, 0, 40),
     (190, 140, 255), (90, 70, 0), (120, 200, 255), (20, 40, 110), (255, 170, 120), (0, 220, 130),
     (110, 110, 110), (180, 70, 0))
-_PENDING = FoundPhrases((), 'CLIP looks for phrases; the map offers its own until then')
+_PENDING = FoundPhrases((), 'CLIP is searching for phrases; these are from the map')
 
 
 class Studio:
-    """The document and its surroundings, which all people at the page share.
+    """The document with its recording, searches and results. All users of the page share it.
 
-    ``recording`` has views with boxes, poses and images, ``layer`` the keyframes next to the map,
-    ``walls`` are to be shown.
+    ``recording`` has views with boxes, poses and images, ``layer`` has the keyframes next to the
+    map, and ``walls`` are shown in the scene.
 
     Attributes
     ----------
     changed : Event
-        Set by any thread when there is something to redraw.
+        Set by any thread when the page must be redrawn.
     view : int
         The selected view.
     answers : dict of int to Trial
-        The relocalizer's answers that are shown, by view; an edit leaves them as they are.
+        The relocalizer's answers that are shown, by view. Edits do not change them.
     places, places_before : Coverage
-        The last two searches of places.
+        Results of the last two searches of places.
     share : float
-        How much of a search of places is done, 0 to 1.
+        Completed share of a search of places, 0 to 1.
     """
 
     ACTIONS = ('select', 'edit', 'lock', 'hide', 'delete', 'split', 'merge', 'refit', 'refit_all',
                'show_view', 'next_view', 'stop_search')
-    #: These take long, and lock the document themselves.
+    #: Slow actions, which lock the document only while they need it.
     SLOW_ACTIONS = ('relocalize_here', 'relocalize_all', 'search_places', 'relocalize_robot',
                     'reload_robot')
 
@@ -82,7 +82,7 @@ class Studio:
         self.new = None if recording is None else NewLandmark(document, recording)
         self.view = 0
         self.answers: dict[int, Trial] = {}
-        # of the last run over the whole recording, by verdict
+        # counts of the last run over the whole recording, by verdict
         self._counts: dict[str, int] = {}
         self.places: Coverage | None = None
         self.places_before: Coverage | None = None
@@ -125,11 +125,11 @@ class Studio:
         """Return the recording; EditError: there is none."""
         if self.recording is None:
             raise EditError('there are no views: start the studio with --observations, or with '
-                            '--images and a TUM folder that has poses')
+                            '--images and a TUM folder with poses')
         return self.recording
 
     def show_view(self, view: int) -> None:
-        """Select a view; a number beyond the last one selects the last one."""
+        """Select a view. A number beyond the last view selects the last view."""
         view = int(edits.numbers([view], 1, 'view')[0])
         self.view = max(0, min(view, self.views - 1))
         self.changed.set()
@@ -141,16 +141,16 @@ class Studio:
         self.show_view(self.new.next_view())
 
     def sightings(self, landmark_id: str) -> list[Sighting] | None:
-        """Return the best views of a landmark; None until they are found."""
+        """Return the best views of a landmark; None while they are computed."""
         recording, landmarks = self.recording, self.document.landmarks
         known = self._sightings[1] if landmark_id == self._sightings[0] else None
-        # a landmark that is being dragged keeps those that it had
+        # during a drag, the views are not updated
         if recording is not None and (known is None or not self.document.is_in_gesture):
 
             def find() -> list[Sighting]:
                 try:
                     return recording.sightings(landmarks, landmark_id)
-                except CliplocError:  # an image that cannot be read; the view says so
+                except CliplocError:  # an image cannot be read; the view reports it
                     return []
 
             found = self._found_sightings.ask(
@@ -160,7 +160,7 @@ class Studio:
         return known
 
     def color_of(self, class_id: str) -> Rgb:
-        """Return the colour of a class; the first twenty classes of a map differ."""
+        """Return the colour of a class. The first twenty classes of a map differ in colour."""
         return self._colors.setdefault(class_id, _PALETTE[len(self._colors) % len(_PALETTE)])
 
     # ---- selection and edits --------------------------------------------------------------------
@@ -178,8 +178,8 @@ class Studio:
         self.document.select(others if is_chosen else [*others, id])
 
     def edit(self, field: str, value: Any, gesture: object = None) -> str | None:
-        """Set a field of the selected landmark, its angles [deg], or move it by some metres."""
-        key, one = self.document.only_chosen()
+        """Set a field or the angles [deg] of the selected landmark, or move it by metres."""
+        key, landmark = self.document.only_chosen()
         is_text = field in ('label', 'class_id')
         if not is_text and field not in ('center', 'by', 'angles', 'semi_axes'):
             raise EditError(f"a landmark has no field '{field!s:.60}'")
@@ -188,7 +188,7 @@ class Studio:
         if field == 'angles':
             values = {'orientation': Rotation.from_euler('xyz', value, degrees=True).as_quat()}
         elif field == 'by':
-            values = {'center': np.add(one.center, value)}
+            values = {'center': np.add(landmark.center, value)}
         change = self.document.edit(edits.set_fields, [key], **values,
                                     gesture=(field, key, gesture))
         return f'{key}: {change.what}' if is_text and change.after else None
@@ -211,7 +211,7 @@ class Studio:
                 off: tuple[str, str]) -> str:
         """Set a mark, or clear it if all landmarks have it.
 
-        `on` and `off` name setting and clearing: the verb, and its past tense for the log.
+        `on` and `off` are the verbs for setting and clearing, and their past tenses for the log.
         """
         if ids is not None and not (isinstance(ids, list)
                                     and all(isinstance(key, str) for key in ids)):
@@ -230,7 +230,7 @@ class Studio:
         return f'split {landmark_id} into {" and ".join(change.after)}'
 
     def merge(self) -> str:
-        """Merge the selection; its boxes decide the shape, or else the volumes."""
+        """Merge the selection. The shape fits its boxes, or without boxes the total volume."""
         ids, landmarks = self.document.chosen(), self.document.landmarks
         change, how = ((edits.merge(landmarks, ids), 'by volume') if self.recording is None
                        else self.recording.merged(landmarks, ids))
@@ -273,7 +273,7 @@ class Studio:
             f'{max(0, len(result.hypotheses) - 1)} rivals; similarities are simulated']))
 
     def relocalize_all(self) -> str:
-        """Relocalize in views along the trajectory, and compare with the time before."""
+        """Relocalize in views along the trajectory, and compare with the previous run."""
         views = sample_frames(self.seen().detections, _MAX_TRIALS).tolist()
         answers = self.seen().relocalize(self.document.landmarks, views, self.layer)
         self.answers = answers
@@ -285,8 +285,8 @@ class Studio:
     def search_places(self) -> None:
         """Find where a robot would be accepted in the map, and places that look alike.
 
-        CliplocError: the map is empty, or the search was stopped; the last result stays. After a
-        stop, ``allow_search`` comes before the next search.
+        CliplocError: the map is empty, or the search was stopped; the last result is kept. After
+        a stop, call ``allow_search`` before the next search.
         """
         self.share = 0.0
 
@@ -306,7 +306,7 @@ class Studio:
         self._stopped.set()
 
     def allow_search(self) -> None:
-        """Let the next search of places go on; only a stop from now on ends it."""
+        """Allow the next search of places; only later calls of ``stop_search`` stop it."""
         self._stopped.clear()
 
     @property
@@ -316,14 +316,13 @@ class Studio:
             self.document.landmarks)
 
     def relocalize_robot(self) -> str:
-        """Let the running relocalizer relocalize."""
+        """Request a relocalization from the running relocalizer."""
         return self._robot().relocalize()
 
     def reload_robot(self) -> str:
-        """Let the running relocalizer read its map again."""
+        """Make the running relocalizer read its map again."""
         message = self._robot().reload_map()
-        return message if self.document.is_saved else (
-            f'{message}; without the edits not saved here')
+        return message if self.document.is_saved else f'{message}; without the unsaved edits'
 
     def _robot(self) -> 'LiveRelocalizer':
         if self.live is None:
@@ -331,14 +330,14 @@ class Studio:
         return self.live
 
     def phrases(self, landmark_id: str) -> FoundPhrases:
-        """Return up to five phrases for a landmark: CLIP's, or else the map's."""
+        """Return up to five phrases for a landmark, of CLIP, or without CLIP, of the map."""
         landmarks, finder = self.document.landmarks, self.finder
-        one = landmarks[landmark_id]
+        landmark = landmarks[landmark_id]
         found = FoundPhrases((), '') if finder is None else self._found_phrases.ask(
-            (landmark_id, one.class_id, one.details.class_weights, one.look),
+            (landmark_id, landmark.class_id, landmark.details.class_weights, landmark.look),
             lambda: finder.find(landmarks, landmark_id)) or _PENDING
-        own = sorted(one.details.labels or (), key=lambda pair: -pair[1])
+        own = sorted(landmark.details.labels or (), key=lambda pair: -pair[1])
         alike = [other.label for other in landmarks.values()
-                 if other.class_id == one.class_id and other.label != one.label]
+                 if other.class_id == landmark.class_id and other.label != landmark.label]
         return found if found.phrases else found._replace(
             phrases=tuple(dict.fromkeys([text for text, _ in own] + alike))[:5])

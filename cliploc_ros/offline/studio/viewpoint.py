@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Viewpoints: the whole map, from above, one landmark, a view of the recording."""
+"""Viewpoints of the scene: the whole map, from above, one landmark, a view of the recording."""
 
 import time
 from collections.abc import Sequence
@@ -16,17 +16,18 @@ from cliploc_ros.offline.mapping.tilt import find_tilt, rotation_to_z
 
 #: The vertical angle of view [rad].
 FOV_RAD = 0.9
-# viser has no orthographic camera: this angle of view, from afar, is nearly one [rad].
+# Angle of view that is almost orthographic from afar; viser has no orthographic camera [rad].
 _FLAT_RAD = 0.08
-# The near plane, as a share of the distance: depth has too few digits for both near and far.
+# Near plane of the flat view as a share of the distance, and of other views [m]. The depth buffer
+# is not precise enough for both near and far objects.
 _FLAT_NEAR, _NEAR_M = 0.3, 0.01
-# A vertical by hand-held cameras that is so near z confirms z [deg].
+# If the vertical by hand-held cameras is within this angle of z, z is used [deg].
 _SAME_UP_DEG = 20.0
 # Share of landmarks and cameras within the extent.
 _EXTENT_SHARE = 0.95
-# Steps of a flight, and seconds of one.
+# Number of steps of a flight, and seconds per step.
 _FLIGHT_STEPS, _STEP_S = 10, 0.03
-# A landmark that is looked at fills about a third of the page's height, unless it is small.
+# Least radius [m] and margin of a landmark in view: it fills about a third of the page's height.
 _LEAST_RADIUS_M, _AROUND = 0.2, 2.5
 _LEAST_RISE = 0.35
 #: Aspect of the scene between the panels, until the page reports it.
@@ -39,11 +40,11 @@ class Bounds(NamedTuple):
     """A sphere around the map."""
 
     middle: NDArray[np.float64]  #: (3,) [m]
-    radius_m: float  #: Radius of a sphere around almost all of it
+    radius_m: float  #: Radius of a sphere around 95 % of landmarks and cameras
     up: NDArray[np.float64]  #: (3,): the unit vector that points up
     floor_m: float  #: Height of the floor along ``up``
     top_m: float  #: Height of the highest landmark or camera
-    aside: NDArray[np.float64]  #: (3,): from the middle towards the cameras, level
+    aside: NDArray[np.float64]  #: (3,): horizontal direction from the middle to the cameras
 
     @property
     def upright(self) -> NDArray[np.float64]:
@@ -52,10 +53,10 @@ class Bounds(NamedTuple):
 
 
 def up_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the direction (3,) that points up in a map, by cameras (n, 4, 4) that saw it.
+    """Return the direction (3,) that points up in a map, given the poses (n, 4, 4) of cameras.
 
-    It is z, unless the cameras' tilt clearly says something else: the map is in a camera's
-    coordinate frame.
+    It is z, unless the cameras' tilt clearly differs, because the map is in a camera's coordinate
+    frame.
     """
     z, found = np.array([0.0, 0.0, 1.0]), find_tilt(poses)
     return z if found is None or found[1] < _SAME_UP_DEG else np.asarray(found[0].T @ z)
@@ -73,7 +74,7 @@ def extent_of(landmarks: Sequence[NDArray[np.float64]], poses: NDArray[np.float6
     share = np.array([1.0 - _EXTENT_SHARE, _EXTENT_SHARE])
     middle = np.quantile(centers if len(centers) else points, share, axis=0).mean(axis=0)
     distances = np.linalg.norm(points - middle, axis=1)
-    # the floor of a map with z up is its z = 0; of another one nothing is known but its points
+    # the floor of a map with z up is z = 0; for other maps it is estimated from the points
     floor_m = 0.0 if up[2] == 1.0 else float(np.quantile(points @ up, 0.02)) - 0.3
     aside = poses[:, :3, 3].mean(axis=0) - middle if len(poses) else np.zeros(3)
     aside = aside - (aside @ up) * up
@@ -84,11 +85,12 @@ def extent_of(landmarks: Sequence[NDArray[np.float64]], poses: NDArray[np.float6
 
 
 def overview(extent: Bounds, aspect: float, is_from_above: bool = False) -> NDArray[np.float64]:
-    """Return the position (3,) that sees all of a map, from the side of its cameras or from above.
+    """Return a position (3,) with a view of the whole map, from the side or from above.
 
-    ``aspect`` is the width of the page by its height. From above, y is up on the page.
+    The side is that of the map's cameras. ``aspect`` is the width of the page divided by its
+    height. From above, y is up on the page.
     """
-    # the camera orbits about the vertical, so that it may look along it almost only
+    # not exactly vertical, because the camera orbits about the vertical
     direction = (extent.upright @ [0.0, -1e-3, 1.0] if is_from_above
                  else extent.aside + 0.8 * extent.up)
     distance = 1.15 * extent.radius_m / np.tan(FOV_RAD / 2.0) / min(1.0, max(aspect, 0.1))
@@ -97,7 +99,7 @@ def overview(extent: Bounds, aspect: float, is_from_above: bool = False) -> NDAr
 
 def fly_to(client: Any, center: NDArray[np.float64], radius_m: float, up: NDArray[np.float64]
            ) -> None:
-    """Move the camera of a browser to an object, to the side where it looks from now."""
+    """Move the camera of a browser to an object, keeping its viewing direction if possible."""
     camera = client.camera
     direction = camera.position - camera.look_at
     direction = direction / max(float(np.linalg.norm(direction)), 1e-9)
@@ -108,9 +110,10 @@ def fly_to(client: Any, center: NDArray[np.float64], radius_m: float, up: NDArra
 
 def fly(client: Any, position: NDArray[np.float64], look_at: NDArray[np.float64],
         up: NDArray[np.float64]) -> None:
-    """Move the camera of a browser to a position (3,), so that it looks at a point (3,).
+    """Move the camera of a browser to a position (3,), looking at a point (3,).
 
-    It orbits that point from then on. A flat view is from so far away that it shows as much.
+    From then on it orbits that point. In a flat view, the camera is further away, so that it
+    shows the same section.
     """
     camera = client.camera
     is_flat = camera.fov < 2.0 * _FLAT_RAD
@@ -148,12 +151,12 @@ def _put(client: Any, position: NDArray[np.float64], look_at: NDArray[np.float64
 
 def _unflattened(position: NDArray[np.float64], look_at: NDArray[np.float64], fov: float
                  ) -> NDArray[np.float64]:
-    """Return the position (3,) that shows as much with FOV_RAD."""
+    """Return the position (3,) that shows the same section with FOV_RAD."""
     return np.asarray(look_at + (position - look_at) * np.tan(fov / 2.0) / np.tan(FOV_RAD / 2.0))
 
 
 def look_through(client: Any, pose: NDArray[np.float64], intrinsics: Camera) -> None:
-    """Put the camera of a browser where an image was taken, so that it shows all of it."""
+    """Move the camera of a browser to the pose of an image, with the whole image in view."""
     camera = client.camera
     _FLIGHTS.pop(client, None)
     with client.atomic():
@@ -162,7 +165,7 @@ def look_through(client: Any, pose: NDArray[np.float64], intrinsics: Camera) -> 
         camera.look_at = pose[:3, 3] + pose[:3, 2]
         camera.up_direction = -pose[:3, 1]
         camera.wxyz = wxyz_of(pose)
-        # the whole image, also where the panels leave a narrow gap
+        # show the whole image even if the gap between the panels is narrow
         half = max(intrinsics.height / intrinsics.fy,
                    intrinsics.width / intrinsics.fx / max(camera.aspect, 0.1)) / 2.0
         camera.fov = 2.0 * float(np.arctan(1.1 * half))
@@ -170,7 +173,7 @@ def look_through(client: Any, pose: NDArray[np.float64], intrinsics: Camera) -> 
 
 def pixels_of(camera: Any, points: Sequence[NDArray[np.float64]] | NDArray[np.float64]
               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the pixels (n, 2) of points (n, 3) in a browser, and how far away they are (n,)."""
+    """Return the pixels (n, 2) of points (n, 3) in a browser, and their depths (n,)."""
     rotation = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix()
     seen = (np.reshape(points, (-1, 3)) - camera.position) @ rotation
     focal = camera.image_height / 2.0 / np.tan(camera.fov / 2.0)
@@ -180,5 +183,5 @@ def pixels_of(camera: Any, points: Sequence[NDArray[np.float64]] | NDArray[np.fl
 
 
 def wxyz_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation of a pose (4, 4), or a rotation (3, 3), as viser wants it: w first."""
+    """Return the rotation of a pose (4, 4) or matrix (3, 3) as viser's quaternion w, x, y, z."""
     return np.asarray(np.roll(Rotation.from_matrix(rotation[:3, :3]).as_quat(), 1))

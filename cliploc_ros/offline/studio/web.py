@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Access to the page, and the answers of its port: our page, its images, and viser's scene.
+"""Access control, and the content of the port: our page, its images, and viser's scene.
 
-viser 1.1 lets in everyone who reaches its port. On the loopback interface these include all users
-of this machine, and every page that its browsers show, since a browser opens WebSockets to any
-host. So each request needs the token that the studio prints, a request to this machine needs a
-loopback name as its host, and a WebSocket needs the studio's own page as its origin.
+viser 1.1 admits everyone who reaches its port. On the loopback interface these are all users of
+this machine, and every page open in its browsers, because a browser opens WebSockets to any host.
+Therefore each request needs the token that the studio prints, a request to this machine needs a
+loopback name as host, and a WebSocket needs the studio's page as origin.
 
-Below the token, ``/`` is the page, ``/scene/PERSON`` is viser's, ``/socket/PERSON`` is the page's
-WebSocket, and ``/image`` and ``/crop`` are pictures. PERSON is a word that each page makes up.
+Below the token, ``/`` is the page, ``/scene/PERSON`` is viser's scene, ``/socket/PERSON`` is the
+page's WebSocket, and ``/image`` and ``/crop`` are pictures. PERSON is a random word of each page.
 """
 
 import asyncio
@@ -34,21 +34,21 @@ LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
 _FILES = Path(__file__).parent / 'web'
 _TYPES = {'.html': 'text/html; charset=utf-8', '.css': 'text/css; charset=utf-8',
           '.js': 'text/javascript; charset=utf-8', '.jpg': 'image/jpeg'}
-# Nothing but the page's own files runs in it, and no other page frames it.
+# The page may only load its own files, and other pages may not embed it in a frame.
 _POLICY = ("default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'; "
            "frame-ancestors 'self'")
 
 
 class Content(NamedTuple):
-    """The content of a file, and the ending of its name."""
+    """The content of a file, and the suffix of its name."""
 
     content: bytes
     suffix: str
-    is_kept: bool  #: The browser may keep it
+    is_kept: bool  #: Whether the browser may cache it
 
 
 class Board:
-    """The content of all open pages: parts by name, as JSON. A page gets changed parts only."""
+    """The content of all open pages: parts by name, as JSON. Only changed parts are sent."""
 
     def __init__(self) -> None:
         self._parts: dict[str, str] = {}
@@ -56,9 +56,9 @@ class Board:
         self._pages: set[asyncio.Event] = set()
 
     def show(self, parts: dict[str, Any]) -> None:
-        """Show these parts, from any thread."""
+        """Show the given parts; may be called in any thread."""
         texts = {name: json.dumps([name, value]) for name, value in parts.items()}
-        # a part that is equal stays the same object
+        # an unchanged part stays the same object
         self._parts = {name: self._parts[name] if self._parts.get(name) == text else text
                        for name, text in texts.items()}
         if self._loop is not None:
@@ -69,7 +69,7 @@ class Board:
             event.set()
 
     async def serve(self, connection: Any, do: Callable[[dict[str, Any]], None]) -> None:
-        """Send parts to one page until it closes, and do what it says, one by one."""
+        """Send parts to a page until it closes, and process its messages one by one."""
         self._loop, event, sent = asyncio.get_running_loop(), asyncio.Event(), dict[str, str]()
         self._pages.add(event)
         event.set()
@@ -98,7 +98,7 @@ class Board:
 
 
 def once(url: str) -> str:
-    """Return an address that leads to the page of an address a single time.
+    """Return an address that opens the page of `url` only once.
 
     It is for the command line of a browser, which all users of the machine can read.
     """
@@ -111,7 +111,7 @@ def _ticket(token: str) -> str:
 
 
 class Gate:
-    """The check of a server that listens at an address."""
+    """Access control of a server that listens at an address."""
 
     def __init__(self, host: str):
         self.is_local = host in LOOPBACK_NAMES
@@ -124,12 +124,12 @@ class Gate:
         return f'/{self.token}/'
 
     def admit(self, request: Request) -> str | None:
-        """Return the path below the token, '' for a ticket; None if the request is refused."""
+        """Return the path below the token, '' for a ticket, None for a refused request."""
         try:
             host, origin = request.headers.get('Host', ''), request.headers.get('Origin')
             name, their_host = urlsplit(f'//{host}').hostname, urlsplit(origin or '').netloc
             is_socket = request.headers.get('Upgrade', '').lower() == 'websocket'
-        except (LookupError, ValueError):  # a header comes twice, or names no host
+        except (LookupError, ValueError):  # a header is repeated, or has no host
             return None
         if ((self.is_local and name not in LOOPBACK_NAMES)
                 or (origin is not None and their_host != host) or (is_socket and origin is None)):
@@ -138,18 +138,18 @@ class Gate:
         if first in self._tickets and not is_socket:
             self._tickets.remove(first)
             return ''
-        # websockets reads bytes beyond ASCII as surrogates
+        # websockets decodes non-ASCII bytes as surrogates
         is_known = hmac.compare_digest(first.encode(errors='surrogateescape'), self.token.encode())
         return f'/{rest}' if is_known else None
 
     @contextmanager
     def guard(self, answer: Callable[[str], Content | None],
               talk: Callable[[Any, str], Any]) -> Iterator[None]:
-        """Let a viser server that starts inside of the block ask this gate first.
+        """Guard a viser server that is started while this context is open.
 
-        ``answer`` returns the picture of a path, ``talk`` talks with the page of a person.
+        ``answer`` returns the picture at a path, ``talk`` serves the WebSocket of a user's page.
         viser 1.1.1 has no option for either. It looks up ``websockets.asyncio.server.serve`` when
-        it starts, so that name leads here for as long as the block lasts.
+        it starts, so that function is replaced while the context is open.
         """
         serve = websockets.asyncio.server.serve
 
@@ -173,7 +173,7 @@ class Gate:
                 if path.startswith('/scene/'):
                     request.path = '/'
                     return process_request(connection, request)
-                # a page of another site may not even learn which pictures there are
+                # pages of other sites must not even find out which pictures exist
                 is_foreign = request.headers.get('Sec-Fetch-Site') == 'cross-site'
                 found = _file(path) or (None if is_foreign else
                                         await asyncio.to_thread(answer, path))
@@ -191,7 +191,7 @@ class Gate:
 
 
 def _file(path: str) -> Content | None:
-    """Return one of the page's own files."""
+    """Return a file of the page; None for other paths."""
     name = path.lstrip('/') or 'studio.html'
     if name not in ('studio.html', 'studio.css', 'studio.js'):
         return None

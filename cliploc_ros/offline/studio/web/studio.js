@@ -1,15 +1,15 @@
 // SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 // SPDX-License-Identifier: Apache-2.0
-// The page of the studio. It shows the parts that the server sends, and sends what a person does.
-// Texts of the map only ever become text nodes.
+// The page of the studio. It shows the parts that the server sends, and sends the user's actions.
+// Texts of the map are inserted only as text nodes, never as HTML.
 'use strict';
 
 const $ = id => document.getElementById(id);
 const SVG = 'http://www.w3.org/2000/svg';
 const MODES = ['review', 'edit', 'create', 'test'];
-// Rows that the browser lays out at once; a search finds the others.
+// Greatest number of rows in the list; the others are found by a search.
 const MOST_ROWS = 300;
-// Between the pictures of the film; the server knows how many views these are.
+// Time between the pictures of the film; the server sends the number of views between them.
 const PICTURE_MS = 200;
 const STEPS_M = [0.01, 0.05, 0.1, 0.5];
 const person = Array.from(crypto.getRandomValues(new Uint8Array(12)),
@@ -18,14 +18,14 @@ const base = location.pathname.replace(/[^/]*$/, '');
 const state = {file: {}, rows: [], selection: {ids: [], one: null}, review: {}, log: {lines: []}, test: {}, layers: {},
                view: null, new: null};
 let mode = 'review', socket = null, followed = null, step = 0.1, gesture = 0, wantsCheck = true, follows = false, film = null, isFlat = false;
-// What the image shows, in its pixels; null: all of it. A goal waits for its view.
+// Visible part of the image, in its pixels; null: the whole image. A goal is applied once its view is shown.
 let zoom = null, goal = null, shownView = -1, drag = null, typedNew = {};
 const shares = {review: 0.6, edit: 0.5, create: 0.72, test: 0.5};
 
 // ---- to and from the server
 
 function send(name, values = {}) {
-  // A view that a person chooses stays when the selection's views are found later.
+  // A view chosen by the user is kept when the views of the selection arrive later.
   if (name === 'show_view' && state.selection?.one) followed = state.selection.one.id;
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({do: name, ...values}));
 }
@@ -77,8 +77,8 @@ const capital = text => text[0].toUpperCase() + text.slice(1);
 const buttons = (...children) => el('div', {className: 'buttons'}, ...children);
 const note = text => text ? el('p', {className: 'note'}, text) : null;
 
-// A text or numbers; what a person types is left alone until it is sent. Numbers are shown rounded,
-// and those that are not typed stay as exact as they were.
+// An input for a text or numbers. Typed input is not overwritten until it is sent. Numbers are shown
+// rounded, and keep their exact values unless they are edited.
 function field(name, values, apply, {isText = false, isOff = false, digits = 3, list = '', of = ''} = {}) {
   const shown = values.map(value => isText ? value : String(Number(value.toFixed(digits))));
   const inputs = values.map((value, place) => el('input', {
@@ -86,19 +86,19 @@ function field(name, values, apply, {isText = false, isOff = false, digits = 3, 
     disabled: isOff, 'data-of': of,
     'aria-label': name + (values.length > 1 ? ` ${'xyz'[place]}` : ''),
     onchange: () => apply(isText ? inputs[0].value : inputs.map(
-      (one, row) => one.value === shown[row] ? values[row] : Number(one.value))),
+      (input, row) => input.value === shown[row] ? values[row] : Number(input.value))),
     onkeydown: event => { if (event.key === 'Enter') event.target.blur(); }}));
   if (list) inputs[0].setAttribute('list', list);
   return el('label', {className: `field${values.length > 1 ? ' three' : ''}`},
             el('span', {}, name), ...inputs);
 }
 
-// Replaces children; a field with the focus keeps it, and what is typed in it for the same landmark.
+// Replaces children. A focused field keeps the focus, and for the same landmark also its typed input.
 function fill(where, children) {
   const active = document.activeElement;
   const name = where.contains(active) && active.tagName === 'INPUT' ? active.ariaLabel : null;
   where.replaceChildren(...children.filter(child => child !== null));
-  const again = name && [...where.querySelectorAll('input')].find(one => one.ariaLabel === name);
+  const again = name && [...where.querySelectorAll('input')].find(input => input.ariaLabel === name);
   if (!again) return;
   again.focus();
   if (again.dataset.of !== active.dataset.of) { again.select(); return; }
@@ -108,7 +108,7 @@ function fill(where, children) {
   again.addEventListener('blur', () => { if (again.isConnected && again.value !== shown) again.dispatchEvent(new Event('change')); }, {once: true});
 }
 
-// ---- what is shown
+// ---- showing the parts
 
 function show(changed) {
   const has = (...names) => names.some(name => changed.has(name));
@@ -173,7 +173,7 @@ function showFile() {
   $('slider').max = Math.max(0, file.views - 1);
 }
 
-// A landmark that is selected brings its best view, except where a person draws.
+// Shows the best view of a newly selected landmark, except in create mode.
 function follow() {
   const one = state.selection.one;
   if (one?.id === followed) return;
@@ -231,7 +231,7 @@ const PANELS = {
     const busy = state.review.running?.includes('check');
     if (!total) {
       return [note(busy ? 'The check compares the map with the recording.'
-                        : 'The check puts the worst landmarks first.'),
+                        : 'The check sorts the landmarks, worst first.'),
               buttons(button('Check the map', doing('check'), {kind: 'main', off: busy}))];
     }
     const done = accepted + fixed + deleted;
@@ -240,26 +240,26 @@ const PANELS = {
       note(`${done} of ${total}: ${accepted} accepted, ${fixed} fixed, ${deleted} deleted`),
       buttons(button('Accept', doing('accept'), {key: 'A', kind: 'main', off: !one}),
               button('Fix', doing('fix'), {key: 'F', off: !one || !state.file.has_boxes,
-                                           hint: 'merge a duplicate, fit others to their boxes'}),
+                                           hint: 'merge a duplicate, or fit a landmark to its boxes'}),
               button('Delete', doing('discard'), {key: 'D', kind: 'danger', off: !one}),
               button('Skip', doing('step', {count: 1}), {key: 'N'})),
       one && one.decision ? el('p', {className: 'note done'}, one.decision) : null,
       one && one.is_checked ? (one.faults.length
         ? el('ul', {className: 'faults'}, ...one.faults.map(text => el('li', {}, text)))
         : el('p', {className: 'note done'}, 'no fault found')) : note(one && 'new since the check'),
-      one?.support != null ? note(`in ${one.support} ${one.support === 1 ? 'frame' : 'frames'}`
-        + (one.ratio === null ? '' : `, ${Math.round(100 * one.ratio)} % of those that should show it`)) : null,
+      one?.support != null ? note(`detected in ${one.support} ${one.support === 1 ? 'frame' : 'frames'}`
+        + (one.ratio === null ? '' : `, ${Math.round(100 * one.ratio)} % of the frames that should show it`)) : null,
       done === total ? buttons(button('Check again', doing('check'), {off: busy})) : null];
   },
   edit() {
     const {ids, one} = state.selection, boxes = state.file.has_boxes;
     const by = value => () => send('edit', {field: 'by', value, gesture: 'by'});
-    if (!ids.length) return [note('Select a landmark: in the list, the image or the scene. Shift selects several.')];
+    if (!ids.length) return [note('Select a landmark in the list, the image or the scene. Use Shift to select several.')];
     return [
       one ? el('div', {className: 'buttons nudge'}, ...['x', 'y', 'z'].flatMap((axis, place) =>
         [-1, 1].map(sign => button(`${axis}${sign < 0 ? '−' : '+'}`, by(axisStep(place, sign)),
                                    {off: one.is_locked, hint: 'move'}))),
-        el('select', {title: 'Step of a move; arrow keys and page keys move, too',
+        el('select', {title: 'Step of a move; arrow keys and page keys also move the landmark',
                       onchange: event => { step = Number(event.target.value); showPanel(); }},
            ...STEPS_M.map(value => el('option', {value, selected: value === step}, `${100 * value} cm`)))) : null,
       buttons(ids.length > 1 ? button('Merge', doing('merge'), {key: 'M', kind: 'main'})
@@ -275,8 +275,8 @@ const PANELS = {
     const input = (name, text, list) => field(text, [value(name)], typed => { typedNew[name] = typed; showPanel(); }, {isText: true, list});
     return [
       note(['Draw a box around the object, or click a box of the detector.',
-            'The dashed line is where the object lies in other views. Draw its box there.',
-            'The dashed ellipse is the fit. A third box makes it better.'][Math.min(count, 2)]),
+            'In other views, the object lies on the dashed line. Draw its box there.',
+            'The dashed ellipse is the fit. A third box improves it.'][Math.min(count, 2)]),
       made.doubt ? el('p', {className: 'note', style: 'color:var(--bad)'}, made.doubt) : null,
       el('div', {className: 'chips'}, ...made.boxes.map(([view]) => button(
         `view ${view}`, doing('show_view', {view}), {hint: 'show it'}))),
@@ -295,7 +295,7 @@ const PANELS = {
               is('search_places') ? button('Stop', doing('stop_search'), {kind: 'danger'})
                 : button('Coverage and look-alikes', doing('search_places'), {hint: 'simulated views all over the map, up to a minute'})),
       is('search_places') ? el('progress', {max: 1, value: test.share}) : null,
-      test.is_stale ? note('of the map before the last edits: search again') : null,
+      test.is_stale ? note('Results of the map before the last edits: search again.') : null,
       ...test.lines.map(note),
       ...test.legend.map(([color, text]) => el('div', {}, el('span', {style: `color:${color}`}, '■ '), text)),
       ...['Coverage', 'Look-alikes'].filter(name => name in state.layers).map(layerBox),
@@ -303,16 +303,16 @@ const PANELS = {
         button(`view ${view}: ${verdict}${error === null ? '' : `, off by ${error} m`}${reason ? `; ${reason}` : ''}`, doing('show_view', {view})))) : null,
       ...(test.robot ? [el('hr'), ...test.robot.map(note),
         buttons(button('Relocalize the robot', doing('relocalize_robot'), {off: isAsked}),
-                button('Let it reload its map', doing('reload_robot'), {off: isAsked}),
-                button('Look at its pose', doing('look_at_robot')))] : [])];
+                button('Reload the map of the robot', doing('reload_robot'), {off: isAsked}),
+                button('Show the robot', doing('look_at_robot')))] : [])];
   }};
 
-function axisStep(place, sign) { return [0, 1, 2].map(one => one === place ? sign * step : 0); }
+function axisStep(place, sign) { return [0, 1, 2].map(axis => axis === place ? sign * step : 0); }
 
 function create() {
   document.activeElement.blur?.();
   const made = state.new, [label, name] = ['label', 'class_id'].map(
-    one => typedNew[one] ?? (made.class_id && (one === 'label' ? `a ${made.class_id}` : made.class_id)));
+    field => typedNew[field] ?? (made.class_id && (field === 'label' ? `a ${made.class_id}` : made.class_id)));
   send('create', {label, class_id: name});
   typedNew = {};
 }
@@ -341,7 +341,7 @@ function showRows() {
       side(isHidden ? 'unseen' : 'seen', isHidden ? 'Show' : 'Hide', isHidden, 'hide'),
       side(isLocked ? 'locked' : 'open', isLocked ? 'Unlock' : 'Lock', isLocked, 'lock'));
   }));
-  if (found.length > MOST_ROWS) $('rows').append(note(`${found.length - MOST_ROWS} more: search`));
+  if (found.length > MOST_ROWS) $('rows').append(note(`${found.length - MOST_ROWS} more: use Find`));
   $('rows').scrollTop = top;
   $('rows').querySelector('[aria-selected=true]')?.scrollIntoView({block: 'nearest'});
 }
@@ -358,7 +358,7 @@ function showView() {
   applyZoom();
   if (document.activeElement !== $('slider')) $('slider').value = view.view;
   $('where').textContent = `view ${view.view}${view.camera ? ` camera ${view.camera}` : ''}`;
-  $('empty').textContent = state.file.images ? '' : 'No images: give --images, or look at the boxes';
+  $('empty').textContent = state.file.images ? '' : 'No images: start the studio with --images; the boxes are shown';
   const colors = Object.fromEntries(state.rows.map(row => [row[0], row[7]]));
   const chosen = new Set(state.selection.ids), scale = pixel();
   const ellipse = ([cx, cy, rx, ry, turn], name, color) => drawn('ellipse', {
@@ -408,7 +408,7 @@ function applyZoom() {
   $('image').setAttribute('viewBox', `${one.x} ${one.y} ${one.w} ${one.h}`);
 }
 
-// Image pixels in one pixel of the screen.
+// Number of image pixels per screen pixel.
 function pixel() {
   const matrix = $('image').getScreenCTM();
   return matrix ? 1 / matrix.a : 1;
@@ -483,7 +483,7 @@ function pointerUp(event) {
 
 const smallest = (found, size) => found.sort((one, other) => size(one) - size(other))[0];
 
-// Whether an outline (id, centre, semi-axes, angle) is around a point.
+// Whether a point is inside an outline (id, centre, semi-axes, angle).
 function isAround([, cx, cy, rx, ry, turn], x, y) {
   const angle = turn * Math.PI / 180, dx = x - cx, dy = y - cy;
   return Math.hypot((dx * Math.cos(angle) + dy * Math.sin(angle)) / rx,
@@ -512,7 +512,7 @@ function showStrip() {
     el('small', {}, `${one[0]}${one[5] ? '' : ' ?'}`))));
 }
 
-// ---- the panel of the scene: its layers, where a person looks from, the recording as a film
+// ---- the panel of the scene: layers, viewpoints, the recording as a film
 
 const box = (text, isOn, apply) => el('label', {}, el('input', {
   type: 'checkbox', checked: isOn, onchange: event => apply(event.target.checked)}), ` ${text}`);
@@ -529,7 +529,7 @@ function showLayers() {
                             button(film ? 'Stop' : 'Play the recording', playOrStop)] : [])]);
 }
 
-// The cameras nearby would be in the way.
+// Hides the cameras, which would block the view.
 function followView(isOn) {
   follows = isOn;
   send('show_layer', {name: 'Cameras', is_shown: !isOn});
@@ -547,7 +547,7 @@ function playOrStop() {
 
 function showLog() {
   const lines = [...state.log.lines].reverse(), isOld = lines.length && state.log.is_old;
-  fill($('log'), (lines.length ? lines : [['', 'Ready. Press ? for the keys.']]).map(([kind, text], row) => el(
+  fill($('log'), (lines.length ? lines : [['', 'Ready. Press ? for keyboard shortcuts.']]).map(([kind, text], row) => el(
     'div', {className: row ? `${kind} old` : isOld ? 'past' : kind, title: text}, row || !isOld ? text : `earlier: ${text}`)));
   $('log').scrollTop = 0;
 }
@@ -557,15 +557,15 @@ function showLog() {
 const KEYS = {
   all: {'ctrl+z': ['undo', doing('undo')], 'ctrl+y': ['redo', doing('redo')], 'ctrl+s': ['save', doing('save')],
         ',': ['previous view', () => stepView(-1)], '.': ['next view', () => stepView(1)],
-        v: ['best views of the landmark', bestView], t: ['put the scene\'s camera into the view', doing('look_through')],
-        g: ['fly to the landmark', doing('fly')], o: ['see everything', doing('overview')],
-        b: ['see the map from above', doing('from_above')], l: ['lock, unlock', () => send('lock')],
+        v: ['best views of the landmark', bestView], t: ['move the scene\'s camera to the view', doing('look_through')],
+        g: ['fly to the landmark', doing('fly')], o: ['show everything', doing('overview')],
+        b: ['show the map from above', doing('from_above')], l: ['lock, unlock', () => send('lock')],
         h: ['hide, show', () => send('hide', {ids: state.selection.ids})], 0: ['whole image', () => { zoom = null; showView(); }],
         '/': ['find', () => $('find').focus()], '?': ['keys', () => showKeys()], n: ['next landmark', doing('step', {count: 1})],
         p: ['previous landmark', doing('step', {count: -1})],
         ...Object.fromEntries(MODES.map((name, row) => [row + 1, [name, () => setMode(name)]]))},
-  review: {a: ['accept, and go on', doing('accept')], f: ['fix: merge a duplicate, fit others', doing('fix')],
-           d: ['delete, and go on', doing('discard')], delete: ['delete, and go on', doing('discard')],
+  review: {a: ['accept, select the next', doing('accept')], f: ['fix: merge a duplicate, or fit to boxes', doing('fix')],
+           d: ['delete, select the next', doing('discard')], delete: ['delete, select the next', doing('discard')],
            e: ['type a label', () => focusLabel()], arrowleft: ['previous view', () => stepView(-1)], arrowright: ['next view', () => stepView(1)]},
   edit: {delete: ['delete', doing('delete')], r: ['refit to boxes', doing('refit')], m: ['merge', doing('merge')],
          e: ['type a label', () => focusLabel()],
@@ -646,12 +646,11 @@ $('splitter').onpointerup = () => { document.body.classList.remove('dragging'); 
 document.addEventListener('click', event => { if (!$('menu').contains(event.target)) $('menu').open = false; });
 window.addEventListener('resize', () => { resize(); showView(); });
 window.addEventListener('keydown', keyDown, true);
-// keys work in the scene, too; there they come before viser's
+// keys also work in the scene, where they take precedence over those of viser
 $('frame').onload = () => {
   const scene = $('frame').contentWindow;
   scene.addEventListener('keydown', keyDown, true);
-  // the log has what viser's notices would say; its panel has switches for developers. Both cover
-  // the scene
+  // hide viser's notices, which repeat the log, and its panel for developers: both cover the scene
   const style = scene.document.createElement('style');
   style.textContent = '.mantine-Notifications-root, .mantine-Paper-root { display: none !important }';
   scene.document.head.append(style);
