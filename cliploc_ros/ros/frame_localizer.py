@@ -196,7 +196,7 @@ class FrameLocalizer:
         return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
 
     def _begin(self, relocalizer: Relocalizer, options: RelocalizerOptions) -> None:
-        """Use a relocalizer and its options from now on, to answer and to watch."""
+        """Use a relocalizer and its options for all further queries and checks of the watch."""
         self._options, self.watch = options, Watch(relocalizer)
         self.localizer = Localizer(
             relocalizer, None if self.keyframes is None else self.keyframes.localizer)

@@ -49,8 +49,8 @@ _POLL_S = 0.1
 _REPEAT_S = 1.0
 # With less time left, the localizer could not publish the pose even if it took it.
 _LEAST_S = 0.5
-# AMCL updates with its next scan; two calls before that scan count as one. Usual scanners publish
-# at 5 Hz or more.
+# AMCL updates with its next scan; two calls before that scan count as one. Laser scanners usually
+# publish at 5 Hz or more.
 _UPDATE_PERIOD_S = 0.2
 _UPDATE_PATIENCE_S = 2.0
 # Period of broadcasts. Each is stamped with the time of the next one, so that a lookup at the
@@ -357,7 +357,7 @@ class MapToOdom:
         self._transforms = transforms
         self._broadcaster: Any = None
         self._timer: Timer | None = None
-        # Set in the worker's thread, dropped in the threads of /clock and odometry.
+        # Set in the worker's thread, reset in the threads that receive /clock and odometry.
         self._lock = threading.Lock()
         self._transform: TransformStamped | None = None
         self._jumped_at = -math.inf

@@ -97,7 +97,7 @@ class DetectorParameters(CommonParameters):
     conf: float = parameter(0.1,
         'Drop detections below this confidence.', low=0.0, high=1.0)
     iou: float = parameter(0.7,
-        'Of two boxes of one class with a greater IoU, drop the less confident one.', low=0.0,
+        'If two boxes of one class have a greater IoU, drop the less confident box.', low=0.0,
         high=1.0)
     imgsz: int = parameter(640,
         "Longer side of the network's input. Memory grows with its square.", unit='px', low=32,

@@ -26,7 +26,7 @@ IMAGE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
 CAMERA_INFO = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
                          reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_IN = CAMERA_INFO
-# Buffers the messages of the fastest usual IMU or odometry while another callback runs.
+# Buffers the messages of a fast IMU or odometry while another callback runs.
 IMU = ODOM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
                         reliability=ReliabilityPolicy.BEST_EFFORT)
 DETECTIONS_OUT = POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,

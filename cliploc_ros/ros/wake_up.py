@@ -149,7 +149,7 @@ class WakeUp(Node):
     relocalizer : str
         Its name, relative to the namespace or absolute.
     timeout_s : float
-        No turn begins after this time. The request after the last turn may.
+        No turn begins after this time [s]. One more request may follow the last turn.
     turn_deg : float
         Angle of the turn between requests; 0: do not turn.
     watch : bool

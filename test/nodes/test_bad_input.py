@@ -92,5 +92,5 @@ def test_a_request_without_fresh_frames(relocalizer, tester, topics, reason):
     answer = tester.relocalize([messages[topic] for topic in topics])
     assert tester.set_parameter('timeout_s', 10.0).successful
     assert not answer.success
-    assert 'no fresh frame' in answer.message and reason in answer.message
+    assert 'no new frame' in answer.message and reason in answer.message
     assert tester.relocalize(make_frame(stamp_s=6.0)).success

@@ -122,7 +122,7 @@ def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surrou
 def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, working, late_s):
     process, ask = four_cameras
     missing = next(iter(late_s), None) or next(one for one in NAMES if one not in working)
-    ask_until(ask, f'none of {missing};', working, late_s)
+    ask_until(ask, f'no image of {missing};', working, late_s)
     assert 'Traceback' not in process.output()
 
 

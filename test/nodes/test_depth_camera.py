@@ -72,7 +72,7 @@ def test_compressed_depth(own_relocalizer, depth_camera):
 
 @pytest.mark.parametrize(('given', 'said'), [
     ({'encoding': '32FC1', 'frame_id': 'other'}, "'other'"),
-    ({'depths_m': 1.7 * DEPTHS_M}, 'is used no more')])
+    ({'depths_m': 1.7 * DEPTHS_M}, 'no longer used')])
 def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth_camera, given,
                                                           said):
     process = own_relocalizer(depth_transport='raw', **SEARCH)

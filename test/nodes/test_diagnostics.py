@@ -94,7 +94,7 @@ def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
         status.wait(WARN, 'no image on /image for')
         bad = make_frame()[0]
         bad.encoding = 'yuv422'
-        status.wait(WARN, "encoding 'yuv422' is none of", (bad,))
+        status.wait(WARN, "encoding 'yuv422' is not one of", (bad,))
         status.wait(OK, 'active', (image,))
     # it rests while nobody asks, although images come
     status.wait(OK, 'active', (image,), **{'listened to': 'False', 'image rate [Hz]': '0.0',

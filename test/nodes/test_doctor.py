@@ -22,7 +22,7 @@ from cliploc_ros.ros.qos import LATCHED
 LINE = re.compile('^(.{12}) (pass|fail|not checked|refused) +(.*)$', re.MULTILINE)
 WHOLE = {'parameters': 'valid', 'map': '12 landmarks', 'camera': '640 x 480 px',
          'clock': 'images come', 'calibration': '65 degrees wide', 'tf': '0.50 m above',
-         'odometry': 'the robot rests', 'detector': '12 boxes', 'localizer': 'amcl_pose',
+         'odometry': 'the robot is at rest', 'detector': '12 boxes', 'localizer': 'amcl_pose',
          'time': 'search', 'pose': 'accepted with'}
 # Upright, and half a metre above the robot.
 MOUNT = [0.0, 0.0, 0.5, -0.70710678, 0.0, 0.0, 0.70710678]
@@ -132,7 +132,7 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
     ('clock', ' /clock', {}, {'use_sim_time': True}),
     ('tf', 'base_from_camera', {}, {'base_from_camera': [0.0] * 7}),  # with and without tf2
     ('odometry', '1.00 m/s', {'speed_m_s': 1.0}, {}),
-    ('vertical', 'no message of /imu', {}, {'gravity': 'imu'}),
+    ('vertical', 'no message on /imu', {}, {'gravity': 'imu'}),
     ('detector', ' /detections', {'change': without(2)}, {}),
     ('detector', ' sofa', {'change': of_another_detector}, {}),
     ('depth', 'depth_tolerance_s', {}, {'depth_transport': 'raw'}),

@@ -49,5 +49,5 @@ def test_what_cannot_be_recorded_says_why(own_relocalizer, tester, tmp_path):
     full = tester.trigger('record')
     assert not full.success and 'record_limit_mb' in full.message
     assert len(list(folder.iterdir())) == 1
-    assert 'no fresh frame' in tester.answer(tester.ask()).message
+    assert 'no new frame' in tester.answer(tester.ask()).message
     assert not tester.trigger('record').success

@@ -47,6 +47,6 @@ def test_every_request_over_a_slow_link_is_answered_once(room_map):
     for answer, x in zip(answers, 0.3 + 0.05 * np.arange(REQUESTS), strict=True):
         # a request that no image reached fails; none gives a wrong pose
         assert answer['message'].startswith((f'accepted: x {x:.2f} y -0.20 z -0.50 m in map, ',
-                                             'no fresh frame'))
+                                             'no new frame'))
         assert answer['seconds'] < 21.0
     assert sum(answer['success'] for answer in answers) >= REQUESTS - 1

@@ -57,9 +57,9 @@ def zero(_):
 
 UNUSABLE = {
     'zero': (zero, 'stamp of the images on /image is 0'),
-    'constant': (lambda _: Time(sec=77, nanosec=5), 'is 77.000000 on several of them'),
+    'constant': (lambda _: Time(sec=77, nanosec=5), 'is 77.000000 for several of them'),
 
-    'whole seconds': (lambda number: Time(sec=right(number).sec), 'on several of them'),
+    'whole seconds': (lambda number: Time(sec=right(number).sec), 'for several of them'),
 }
 
 

@@ -52,7 +52,7 @@ def test_a_relocalizer_of_another_name_is_told(own_relocalizer):
                 live.relocalize()
             return str(refused.value)
 
-        wait_for(lambda: ' would find another' in refusal(), 'discovery')
+        wait_for(lambda: 'for another relocalizer' in refusal(), 'discovery')
 
 
 def test_answers_one_request_at_a_time(live, own_relocalizer, tester):
@@ -61,7 +61,7 @@ def test_answers_one_request_at_a_time(live, own_relocalizer, tester):
     assert live.state.is_heard and live.state.base_frame == ''
     with in_a_thread(live.relocalize) as outcome:
         wait_for(lambda: live.is_busy, 'the request')
-        with pytest.raises(LiveError, match='a request waits'):
+        with pytest.raises(LiveError, match='another request is waiting'):
             live.relocalize()
         tester.feed_until(lambda: outcome, make_frame(stamp_s=31.5))
     assert outcome[0].startswith('accepted: x 0.3')

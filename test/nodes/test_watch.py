@@ -110,7 +110,7 @@ def test_a_right_localizer_stays_localized_and_a_kidnapped_robot_is_only_reporte
     watched.kidnap()
     assert watched.flags[-1] is False
     watched.robot.speed_m_s = 0.0
-    watched.until(lambda: watched.values.get('on lost') == 'the robot stands', 'rest')
+    watched.until(lambda: watched.values.get('on lost') == 'the robot is at rest', 'rest')
     watched.looks(3)
     assert not watched.tester.initial_poses
     assert 'watch: lost' in watched.message

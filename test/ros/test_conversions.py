@@ -72,7 +72,7 @@ def test_colour_images(encoding, padding):
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
-    ({'encoding': 'bayer_rggb8'}, "'bayer_rggb8' is none of"), ({'width': 0}, 'size 0x2'),
+    ({'encoding': 'bayer_rggb8'}, "'bayer_rggb8' is not one of"), ({'width': 0}, 'size 0x2'),
     ({'width': 2**32 - 1, 'height': 2**32 - 1}, 'size 4294967295x'), ({'step': 8}, 'step 8 is'),
     ({'data': b'\0' * 17}, '17 bytes, but 2 rows')])
 def test_images_that_cannot_be(changes, message):

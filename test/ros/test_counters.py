@@ -17,7 +17,7 @@ def test_counts_add_up():
     counters = RequestCounters()
     counters.add(Answer(Verdict.ACCEPTED, 'x 1.00'), 0.5)
     counters.add(Answer(Verdict.REFUSED, 'a reason', kind=RefusalKind.AMBIGUOUS), 2.0)
-    counters.add(Answer(Verdict.FAILED, 'no fresh frame'), 1.0)
+    counters.add(Answer(Verdict.FAILED, 'no new frame'), 1.0)
     values = counters.values()
     assert values['requests'] == 3
     assert [values[f'requests {verdict}'] for verdict in Verdict] == [1, 1, 0, 1]

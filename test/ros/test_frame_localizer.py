@@ -147,9 +147,9 @@ def test_depth_of_another_camera_is_registered(localizer, values, caplog):
     assert known.sum() >= 9  # the others are small
     np.testing.assert_allclose(found[known], 4.0)
     for wrong, pose, said in (
-            (None, left, "image in 'camera', without depth_camera_info"),
-            (info, None, "image in 'camera', without tf"),
-            (CameraInfo(k=info.k, d=[0.1] * 5, distortion_model='plumb_bob'), left, 'distorted'),
+            (None, left, 'and depth_camera_info is missing'),
+            (info, None, 'and tf is missing'),
+            (CameraInfo(k=info.k, d=[0.1] * 5, distortion_model='plumb_bob'), left, 'rectified'),
             (CameraInfo(k=info.k, width=9, height=9), left, 'camera_info is for 9x9 px'),
             (CameraInfo(), left, 'camera_info: K')):
         assert depths(wrong, pose) is None

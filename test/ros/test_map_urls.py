@@ -31,8 +31,8 @@ def test_paths_and_urls(prefix):
 
 
 @pytest.mark.parametrize(('url', 'message'), [
-    ('package://nowhere/office.yaml', "no package 'nowhere'"),
-    ('package://no such name!/office.yaml', 'no package'),
+    ('package://nowhere/office.yaml', "package 'nowhere' is not found"),
+    ('package://no such name!/office.yaml', 'is not found'),
     ('package:///office.yaml', 'PACKAGE/PATH'),
     ('package://my_maps', 'PACKAGE/PATH'),
     ('package://my_maps/', 'PACKAGE/PATH')])

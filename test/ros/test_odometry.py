@@ -73,7 +73,7 @@ def test_it_knows_the_way_driven_until_the_image(robot, source):
 def test_a_body_that_nobody_places_links_nothing(robot, source, capfd):
     talk(source, 10.0, child_frame='wheels')
     assert place(robot, 10.0) is None
-    assert 'one frame alone: ' in capfd.readouterr().err
+    assert 'localizing without odometry: ' in capfd.readouterr().err
 
 
 def test_an_image_waits_for_the_message_after_it(robot, source):

@@ -86,7 +86,7 @@ def test_memory_is_bounded():
 
 @pytest.mark.parametrize(('moment', 'named'), [
     (4.0, '1.000 s newer'), (8.5, '0.600 s older'),
-    (6.5, 'paused for 1.100 s')])
+    (6.5, 'has a gap of 1.100 s')])
 def test_what_is_not_known_is_said(moment, named):
     window = OdometryWindow(10.0)
     drive(window, (5.0, 6.0))

@@ -284,4 +284,4 @@ def test_a_failing_start_is_logged_once_and_retried_by_requests(node, capfd, wai
                for line in capfd.readouterr().err.splitlines()) == 1
     node.loads = lambda: 'a map'
     set_values(node, timeout_s=0.2)
-    assert 'no fresh frame' in node.requests.answer().message
+    assert 'no new frame' in node.requests.answer().message

@@ -56,7 +56,7 @@ def test_the_time_is_bounded(studio):
     places = find_places(studio.document.landmarks, None, None, silent, limit_s=0.0)
     assert len(places.check.positions) == 1 < len(places.grid.positions)
     assert len(places.check.trials) == places.check.headings
-    assert any(line.startswith('time ran out') for line in places.lines(None))
+    assert any(line.startswith('time is up') for line in places.lines(None))
 
 
 def test_positions_that_only_keyframes_reach_are_told_apart(studio):

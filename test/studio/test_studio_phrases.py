@@ -33,7 +33,7 @@ def wait_for_phrases(studio):
     deadline, notes = time.monotonic() + PATIENCE_S, set()
     while True:
         found, note = studio.phrases('bowl_1')
-        if 'CLIP looks' not in note:
+        if 'CLIP is searching' not in note:
             return found, notes
         notes.add(note)
         assert time.monotonic() < deadline, f'no answer to {found}'

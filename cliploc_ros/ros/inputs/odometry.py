@@ -281,9 +281,10 @@ def _lengths(step: NDArray[np.float64]) -> NDArray[np.float64]:
 def _is_explained(poses: Sequence[_Pose], pose: _Pose, twists_fit: NDArray[np.bool_]) -> bool:
     """Return whether a robot can have moved from the newest of `poses` to a later pose.
 
-    The motion is predicted by the twists if they match the poses of this run; `twists_fit` (2,)
-    tells this for moves and turns. Many drivers leave the twist empty or fill it with other
-    values. Then the robot is expected to continue at the speed of its poses, or to stop.
+    The motion is predicted by the twists if they match the poses of this run. `twists_fit` (2,) is
+    the result of that comparison for moves and turns. Many drivers leave the twist empty or fill
+    it with other values. Then the robot is expected to continue at the speed of its poses, or to
+    stop.
 
     After a silence only this second prediction is used: the driver may have restarted at another
     origin that the robot could also have reached by driving.

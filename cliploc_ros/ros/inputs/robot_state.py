@@ -49,7 +49,7 @@ _MIN_MEAN_LENGTH = 0.95
 _MAX_CONTRADICTION_DEG = 5.0
 #: Samples within this time of an image are averaged [ns]: vibration is faster, robots turn slower.
 WINDOW_NS = 100_000_000
-# Number of messages of the fastest usual IMU in one second.
+# Number of messages of a fast IMU in one second.
 _MAX_SAMPLES = 1000
 # sensor_msgs/Imu: the first element of the covariance of a field that is not measured.
 _NOT_MEASURED = -1.0

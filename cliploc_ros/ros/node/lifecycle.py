@@ -387,7 +387,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         service.callback = answer
 
     def destroy_node(self) -> None:
-        """Destroy the node and the services of its state machine, which rclpy forgets."""
+        """Destroy the node, and the services of its state machine, which rclpy would leave."""
         _PACKAGE_LOGGER.removeHandler(self._log_handler)
         self._starting.shutdown(wait=False, cancel_futures=True)
         self._state_machine.destroy_when_not_in_use()
