@@ -11,12 +11,12 @@ from cliploc_ros.command import needs_ros, option, run_main, running_ros
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 
 EPILOG = """\
-It loads what detector and relocalizer load with these parameters: networks are downloaded and
-compiled, the map's labels embedded, and kernels compiled.
-It answers a request for one picture, and prints what that costs on this machine.
+It loads everything that detector and relocalizer load with these parameters: it downloads and
+compiles networks, embeds the map's labels, and compiles kernels.
+It answers a request for one picture, and prints its cost on this machine.
 
-With --cache-dir, what was downloaded and computed lies in a folder. Copy it to a robot, and set
-its parameter cache_dir to the copy.
+With --cache-dir, everything that was downloaded and computed is in one folder. Copy it to a robot,
+and set its parameter cache_dir to the copy.
 
 examples:
   prepare --params-file robot.yaml
@@ -42,15 +42,15 @@ def make_parser() -> argparse.ArgumentParser:
            'drawn one)')
     option(parser, '--cache-dir DIR', 'keep everything in this folder, to copy it to a robot '
            '(default: where the parameters say)')
-    option(parser, '--without-detector', 'the robot has a detector of its own: load no YOLO, and '
-           'draw boxes instead')
+    option(parser, '--without-detector', 'the robot has another detector: load no YOLO, and draw '
+           'boxes instead')
     return parser
 
 
 def prepare(options: argparse.Namespace) -> int:
     """Load both nodes as they start on the robot, and answer a request; return the exit code.
 
-    CliplocError: the message names the file, parameter or download to mend.
+    CliplocError: the message names the file, parameter or download to correct.
     """
     for file in options.params_file:
         read_parameter_file(file)  # its messages name the line

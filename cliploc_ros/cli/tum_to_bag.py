@@ -56,8 +56,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def convert(options: argparse.Namespace) -> int:
-    """Convert, and print what was written and how many images lack something."""
-    # Late, so that --help is fast.
+    """Convert a folder; print what was written, and how many images have no pose or detections."""
+    # Imported late, so that --help is fast.
     from tqdm import tqdm
 
     from cliploc_ros.offline.datasets import tum_conversion

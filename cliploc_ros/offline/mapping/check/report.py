@@ -98,7 +98,7 @@ class RecordingCheck:
 
     @property
     def can_judge_boxes(self) -> bool:
-        """Return whether the landmarks of most boxes also appear in other parts of the recording."""
+        """Return whether other parts of the recording show the landmarks of most boxes, too."""
         return 2 * self.held_out.boxes >= self.as_given.boxes
 
     def as_dict(self) -> dict[str, Any]:
