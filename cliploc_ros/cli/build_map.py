@@ -64,7 +64,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--out YAML', 'the map to write', required=True)
     option(parser, '--update YAML', 'bring this map up to date; --out may be the same file')
     option(parser, '--report JSON', 'also write what was found and left out, and why')
-    option(parser, '--frame-id', 'of the map (%(default)s)', default='map')
+    option(parser, '--frame-id', 'coordinate frame of the map (%(default)s)', default='map')
     option(parser, '--every N', 'use only every N-th frame (%(default)s)', command.positive_int, 1)
     option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
     option(parser, '--check', 'at the end, check the map as check_map does, with fewer views, '

@@ -53,7 +53,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--class-names FILE', 'a file with one class name per line, for formats with '
            'class indices (COCO)')
     place = parser.add_argument_group('coordinate frame and errors of the map')
-    option(place, '--frame-id', 'of the map (%(default)s)', default='map')
+    option(place, '--frame-id', 'coordinate frame of the map (%(default)s)', default='map')
     option(place, '--scale METRES', 'length of a unit of the file in metres (%(default)s)',
            positive, 1.0)
     option(place, '--transform V', "x y z [m] qx qy qz qw of the file's coordinate frame in the "

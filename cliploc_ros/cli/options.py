@@ -11,7 +11,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
 
-# Options of folders only.
+# Options for folders only.
 _PLACING = ('images', 'axes', 'scale', 'known_distance')
 
 

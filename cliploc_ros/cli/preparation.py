@@ -30,7 +30,7 @@ from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters, map_files
 
-# Number of boxes of a measured request: that of a picture of a furnished room.
+# A request is measured with this number of boxes, typical of a picture of a furnished room.
 _BOXES = 12
 _ROWS, _COLUMNS = 3, 4
 _REQUESTS = 3

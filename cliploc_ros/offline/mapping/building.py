@@ -115,7 +115,7 @@ class MappingReport:
     pose_change_m: float
     pose_change_deg: float
     left_out: tuple[LeftOut, ...]  #: Those with the greatest support first
-    notes: tuple[str, ...]  #: Problems of the input, and what to do about them
+    notes: tuple[str, ...]  #: Problems with the input, and what to do about them
 
     @staticmethod
     def of_nothing(detections: PosedDetections, error: MappingError) -> 'MappingReport':
@@ -160,7 +160,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
               progress: Progress | None = None) -> BuiltMap:
     """Build a map from posed detections.
 
-    MappingError: no map can be made of this input; the message says what to correct.
+    MappingError: no map can be made from this input; the message says what to correct.
     """
     options = options or MappingOptions()
     if options.refine_mount and len(detections.cameras) > 1:

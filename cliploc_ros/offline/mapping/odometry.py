@@ -110,7 +110,7 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
     note = f'odometry joins {np.count_nonzero(kept)} of {len(given.rotations) - 1} pairs of frames'
     if not kept.all():
         first_s = given.stamps_s[frames[before[~kept][0]]]
-        note += f'; {np.count_nonzero(~kept)} jumps are left out, the first at {first_s:.2f} s'
+        note += f'; jumps left out: {np.count_nonzero(~kept)}, the first at {first_s:.2f} s'
     return Steps(frames[before[kept]], pairs.shifts[kept], pairs.turns[kept],
                  1.0 / pairs.sigmas[kept]), note
 

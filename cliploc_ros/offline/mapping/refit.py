@@ -52,7 +52,7 @@ class RefitMap:
     reasons: tuple[str | None, ...]
     #: (L,): the landmark that is the same object as each one; its own row if there is none
     part_of: NDArray[np.int64]
-    notes: tuple[str, ...]  #: Problems of the recording
+    notes: tuple[str, ...]  #: Problems with the recording
     #: Share of the boxes of the map's classes that a landmark explains
     explained_before: float
     explained: float

@@ -203,7 +203,7 @@ def _where_cameras_can_be(recorded: NDArray[np.float64] | None) -> str:
 
 
 def _notes_on(recording: RecordingCheck) -> list[str]:
-    """Return notes on figures of a recording that do not count."""
+    """Return notes on the figures that cannot be judged by this recording."""
     notes = []
     if not recording.can_judge_boxes:
         notes.append('cross-validation cannot judge boxes: other parts of the recording show the '

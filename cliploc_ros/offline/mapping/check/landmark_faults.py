@@ -201,7 +201,7 @@ def _class_of_label(label: str, class_id: str, by_words: Mapping[tuple[str, ...]
 
 
 def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> dict[str, Any]:
-    """Return the numbers of a landmark's support: from a recording, or from the map itself."""
+    """Return the support of a landmark by field, from a recording or from the map itself."""
     given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
     if witness is None:
         return {'support': given.support, 'seen_ratio': given.seen_ratio,

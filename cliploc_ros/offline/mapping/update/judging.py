@@ -92,7 +92,7 @@ class Finds(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """The evidence of the recording on L old landmarks and m finds, with n boxes."""
+    """What a recording with n boxes shows about L old landmarks and m finds."""
 
     #: (n,): the old landmark that each box shows in its place, L + the find, or -1 for none
     shown: NDArray[np.int64]
