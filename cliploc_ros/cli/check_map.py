@@ -50,9 +50,9 @@ def make_parser() -> argparse.ArgumentParser:
         'check.json. Without observations the report is shorter. Needs no sourced ROS.')
     option(parser, 'map MAP', 'a map file')
     option(parser, '--observations NPZ', 'boxes and poses of a recording of the place (default: '
-           'those that the map was built from, if NAME.recording.json next to the map names them)')
-    option(parser, '--images BAG|DIR', 'the images of this recording (default: those that '
-           'NAME.recording.json names, or that the observations lie next to)')
+           'those that the map was built from, as named by NAME.recording.json next to the map)')
+    option(parser, '--images BAG|DIR', 'the images of this recording (default: those named by '
+           'NAME.recording.json, or those next to the observations)')
     option(parser, '--queries NPZ', 'a query file of this map: frames with similarities')
     option(parser, '--out DIR', 'folder of check.html and check.json (NAME_check next to the map)')
     option(parser, '--every N', 'use only every N-th frame of the observations (%(default)s)',
@@ -128,7 +128,7 @@ def check(options: argparse.Namespace) -> int:
     image_of = views = None
     if detections is not None and images is not None:
         views = page.ViewPainter(landmark_map, detections, images.near)
-        if options.observations is None:  # the layer's recording: other times only
+        if options.observations is None:  # keyframes of nearly the same time are excluded
             image_of = partial(images.of, detections)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):
         print(f'note: {note}', flush=True)
@@ -171,8 +171,8 @@ def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections
         reached = in_reach(layer, poses[:, :3, 3], poses[:, :3, 2])
         print(f'recorded frames within reach of a keyframe: {reached.mean():.0%} of '
               f'{len(reached)}')
-    print('what to do:\n  record objects from several sides: they localize a robot away from the '
-          'recorded views, too, and after changes of the place')
+    print('what to do:\n  record objects from several sides: they also localize a robot away from '
+          'the recorded views, and after the place has changed')
     return 1
 
 
@@ -194,7 +194,7 @@ def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Imag
     elif options.images is not None:
         raise OptionsError('--images needs --observations: no recording of this map is known')
     else:
-        print('no recording of this map is known: the map alone is checked, in simulation; give '
+        print('no recording of this map is known: the map is checked by simulation only; give '
               '--observations', flush=True)
         return None
     images = None

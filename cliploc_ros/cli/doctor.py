@@ -33,7 +33,7 @@ def make_parser() -> argparse.ArgumentParser:
         prog='doctor', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         usage='doctor [options] [--ros-args ...]',
         description='Check parameters, map, camera, calibration, clock, tf, odometry, detector, '
-        'localizer and the time of a request, and say what to do about failures.')
+        'localizer and the time of a request. Each failure comes with its remedy.')
     option(parser, '--relocalizer NAME', 'its name, absolute or in the namespace of this node '
            '(%(default)s)', default='relocalizer')
     option(parser, '--params-file FILE', 'check with these parameters; repeat it as on the '

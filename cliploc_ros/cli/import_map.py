@@ -59,7 +59,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(place, '--transform V', "x y z [m] qx qy qz qw of the file's coordinate frame in the "
            "map's", finite, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), nargs=7)
     option(place, '--errors METRES DEGREES', 'errors of the landmarks on each axis, both '
-           'independent and common, if the file has no position_sigma (0.05 1)', positive,
+           'independent and shared, if the file has no position_sigma (0.05 1)', positive,
            _ERRORS)
     refit = parser.add_argument_group('fit to a recording')
     option(refit, '--refit NPZ', 'fit each landmark to the boxes of these observations')
@@ -121,7 +121,7 @@ def import_map(options: argparse.Namespace) -> int:
 
 
 def _check_paths(options: argparse.Namespace) -> None:
-    """Refuse outputs that cannot be written, or are an input, before the work is done."""
+    """Refuse outputs that cannot be written, or are also inputs, before any work is done."""
     for name in ('out', 'report'):
         path = getattr(options, name)
         if path is None:
@@ -133,7 +133,7 @@ def _check_paths(options: argparse.Namespace) -> None:
 
 
 def _read(options: argparse.Namespace) -> 'GivenMap':
-    """Return the content of the input."""
+    """Read the input file in its format."""
     from cliploc_ros.offline.datasets.map_formats import given_map
     from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
 

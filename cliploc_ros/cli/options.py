@@ -95,9 +95,10 @@ def add_topic_options(group: Any) -> None:
     """Add the options that name the images of a bag to a parser or a group of it."""
     option(group, '--cameras NAME', 'several cameras of the recording, by the namespaces of their '
            'topics: /NAME/image, /NAME/camera_info and so on', default=[''], nargs='+')
-    option(group, '--image TOPIC', "(the recording's only colour image; /image of --cameras)")
-    option(group, '--camera-info TOPIC', '(the one beside the image)')
-    option(group, '--rectified', 'the bag has rectified images')
+    option(group, '--image TOPIC', "image topic (the recording's only colour image; /image "
+           'of --cameras)')
+    option(group, '--camera-info TOPIC', 'topic of the camera_info (the one beside the images)')
+    option(group, '--rectified', 'the images of the bag are rectified')
 
 
 def add_network_options(group: Any) -> None:
@@ -107,11 +108,12 @@ def add_network_options(group: Any) -> None:
            default='auto', choices=PROFILE_NAMES)
     add_weights_options(group)
     option(group, '--device', '(%(default)s)', default='auto')
-    option(group, '--inference', '(%(default)s: OpenVINO on a CPU where it is installed)',
+    option(group, '--inference', '(%(default)s: OpenVINO on a CPU if it is installed)',
            default='auto', choices=INFERENCES)
     option(group, '--no-clip', 'run no CLIP: boxes and classes only', dest='clip',
            action='store_false')
-    option(group, '--scheduler ADDRESS', 'of a Dask cluster, instead of local processes',
+    option(group, '--scheduler ADDRESS', 'address of a Dask cluster, used instead of local '
+           'processes',
            default='')
 
 

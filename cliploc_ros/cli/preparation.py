@@ -34,7 +34,7 @@ from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters, 
 _BOXES = 12
 _ROWS, _COLUMNS = 3, 4
 _REQUESTS = 3
-# Parameters that name files of the user, which are not copied.
+# Parameters that name the user's files, which are not in the cache.
 _FILES = ('model', 'map_file', 'keyframes_file', 'clip_model', 'clip_pretrained',
           'clip_checkpoint_path')
 

@@ -41,7 +41,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--image FILE', "picture of the robot's camera for the request (default: a "
            'drawn one)')
     option(parser, '--cache-dir DIR', 'keep everything in this folder, to copy it to a robot '
-           '(default: where the parameters say)')
+           '(default: as the parameters say)')
     option(parser, '--without-detector', 'the robot has another detector: load no YOLO, and draw '
            'boxes instead')
     return parser

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``wake_up``: request the pose until it is accepted, turning in between."""
+"""The executable ``wake_up``: request the pose until it is accepted, turning between requests."""
 
 import argparse
 import signal

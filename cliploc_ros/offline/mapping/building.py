@@ -47,7 +47,7 @@ _FRAMES_PER_VIEWPOINT = 8
 # merging and fitting after each search.
 _DISCOVERY_ROUNDS = 2
 SETTLING_ROUNDS = 3
-# Number of times the map is rebuilt with refined poses; number of joint refinements of poses and
+# Number of rebuilds of the map with refined poses; number of joint refinements of poses and
 # landmarks before each rebuild, and after the last one.
 _REBUILDS = 1
 REFINEMENTS = 3
@@ -114,7 +114,7 @@ class MappingReport:
     #: Root mean square by which joint refinement moved the poses
     pose_change_m: float
     pose_change_deg: float
-    left_out: tuple[LeftOut, ...]  #: Those with the greatest support first
+    left_out: tuple[LeftOut, ...]  #: The landmarks with the greatest support first
     notes: tuple[str, ...]  #: Problems with the input, and what to do about them
 
     @staticmethod
@@ -199,14 +199,14 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
         notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are not landmarks: '
                      'they move')
     if len(draft.landmarks.centers) == 0:
-        why = ('no boxes of one class meet in space; check that poses and stamps belong to these '
-               'images, that the poses are of the camera (z forward), and the intrinsics')
+        why = ('boxes of one class do not meet in space; check that poses and stamps belong to '
+               'these images, that the poses are of the camera (z forward), and the intrinsics')
         if draft.left_out:
             kinds = Counter(landmark.reason.partition(':')[0] for landmark in draft.left_out)
             counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
             why = (f'no landmark is good enough for a map; {len(left_out)} were left out '
                    f'({counts}); the first: {draft.left_out[0].reason}. Move the camera past the '
-                   'objects while recording, do not only turn it, or map images with depth')
+                   'objects instead of only turning it, or map images with depth')
         raise NothingFoundError(why, left_out)
     landmarks, shown = _one_of_each(views, draft.landmarks)
     quality = explained_boxes(views, landmarks, shown)
@@ -275,7 +275,8 @@ class _Builder(NamedTuple):
                             self.options.min_viewpoints, self.rng)
                 for number in np.unique(window.classes[left]))))
         all_found = Landmarks.joined(*found)
-        # moving classes are found, then dropped, so that the others always draw the same numbers
+        # searched before they are dropped, so that moving_classes does not change the random
+        # numbers
         return all_found.select(~np.isin(all_found.classes, moving))
 
     def _settle(self, views: Views, landmarks: Landmarks) -> tuple[Landmarks, NDArray[np.int64]]:

@@ -37,7 +37,7 @@ _FEW_BOXES = 20
 _LEAST_QUANTILE = 0.1
 # Frames are processed in windows of this size: a table of all frames and places would be large.
 _WINDOW = 1000
-# Points of a box that are tested for occlusion: a 5 x 5 grid, as far as it lies in the ellipse.
+# Points of a box that are tested for occlusion: those of a 5 x 5 grid within the ellipse.
 _GRID = np.array([(x, y) for x in (-0.8, -0.4, 0.0, 0.4, 0.8) for y in (-0.8, -0.4, 0.0, 0.4, 0.8)
                   if x * x + y * y < 1.0])
 
@@ -131,7 +131,7 @@ def is_expected(views, cameras, center, basis, reach):
 def reasons_against(landmarks: Landmarks, evidence: Evidence, options: MappingOptions
                     ) -> list[str | None]:
     """Return for each landmark why it is left out of the map; None if it is good enough."""
-    # the size is that of its volume: an ellipsoid stretched along the rays is uncertain, not large
+    # size by volume: an ellipsoid that is stretched along the rays is uncertain, not large
     sizes_m = np.sqrt(3.0) * np.cbrt(np.abs(np.linalg.det(landmarks.bases)))
     return [_reason(evidence, number, size_m, options)
             for number, size_m in enumerate(sizes_m.tolist())]

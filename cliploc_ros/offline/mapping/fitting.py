@@ -204,7 +204,7 @@ def add_depth(views, row, center, share, information, gradient):
 
 @compiled
 def edge_residual(views, row, edge, box):
-    """Return how far a projected edge is off, in standard deviations."""
+    """Return the residual of a projected edge, in standard deviations."""
     residual = (box[edge] - views.edges[row, edge]) * views.stiffness[row, edge]
     if views.is_open[row, edge]:
         return max(0.0, residual) if edge < 2 else min(0.0, residual)

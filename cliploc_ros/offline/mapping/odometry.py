@@ -8,9 +8,9 @@ into the map and centres c_k, its residuals in the map's axes are
     p = c_k+1 - c_k - R_k t,   q = log(R_k+1 (R_k R)'),
 
 whose errors are those of a random walk: their variances grow with the distance. The loss is
-Huber's. It is convex, which helps as long as the given poses, with independent errors, contradict
-odometry. It also bounds the effect of slipping wheels. Steps that contradict the given poses by
-more than the errors of both are left out.
+Huber's. It is convex, because the given poses, with independent errors, contradict odometry at
+first. It also bounds the effect of slipping wheels. Steps that contradict the given poses by more
+than the errors of both are left out.
 """
 
 from typing import NamedTuple

@@ -93,7 +93,7 @@ class MappingOptions:
     pose_errors: PoseErrors | None = None
     #: Without pose_errors, estimate them, and refine the poses if they are significant
     estimate_pose_errors: bool = False
-    #: Of odometry between frames, which joins the poses while they are refined
+    #: Errors of the odometry between frames, which constrains the poses in their refinement
     odometry_errors: OdometryErrors = _ODOMETRY_ERRORS
     refine_mount: bool = False  #: Correct the mount of the camera, which all poses share
     #: The coordinate frame and the origin that the map file names

@@ -94,7 +94,7 @@ class PosedDetections:
     def every(self, step: int, first: int = 0) -> NDArray[np.int64]:
         """Return every n-th frame of each camera, in the order of time.
 
-        Every n-th of all interleaved frames could belong to one and the same camera.
+        Taking every n-th of the interleaved frames could select the frames of a single camera.
         """
         return np.sort(self.by_camera[first::step])
 

@@ -35,7 +35,7 @@ _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight'
 
 
 def give_advice(report: CheckReport) -> list[Advice]:
-    """Return advice, in one or two sentences each."""
+    """Return pieces of advice, each of one or two sentences."""
     advice = [*_on_scale(report), *_on_look_alikes(report), *_on_landmarks(report),
               *_on_corrections(report),
               *_on_misled(report), *_on_spans(report), *_on_grid(report)]
@@ -184,8 +184,8 @@ def _on_grid(report: CheckReport) -> Iterator[Advice]:
                          'from there', view=grid.trials[fullest])
     if report.keyframes is not None:
         yield from _some([
-            Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when the '
-                   'layer is made again, or rely on the landmarks')
+            Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when you '
+                   'record again, or rely on the landmarks')
             for rows in _areas(grid, report.keyframes.without)], 'areas that no keyframe reaches')
 
 

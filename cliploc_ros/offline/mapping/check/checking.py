@@ -113,7 +113,7 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
             None if layer is None or image_of is None else RecordedKeyframes(layer, image_of))
         notes += _notes_on(recording)
     tilt = '' if detections is None else tilt_note(detections.map_from_camera)
-    notes.append(tilt or _where_cameras_can_be(recorded))  # heights in a tilted map mean little
+    notes.append(tilt or _where_cameras_can_be(recorded))  # a tilted map has no true heights
     overlaps = find_map_overlaps(landmark_map, witness, views)
     places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
                        options)
@@ -151,7 +151,7 @@ def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headin
 
 
 def _told(trials: Iterator[Trial], count: int, tell: Tell) -> list[Trial]:
-    """Collect an expected number of trials, and tell the share that is done."""
+    """Collect `count` trials and report progress."""
     done = []
     for trial in trials:
         done.append(trial)

@@ -79,7 +79,7 @@ class LandmarkCheck:
 
 
 class Witness(NamedTuple):
-    """The evidence of a recording about a map."""
+    """The evidence that a recording gives on a map."""
 
     class_names: tuple[str, ...]  #: Of the recording
     landmarks: Landmarks  #: Of the map, with the recording's classes
@@ -92,7 +92,7 @@ class Witness(NamedTuple):
 
 
 def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...]) -> Witness:
-    """Return the evidence of a recording about a map."""
+    """Return the evidence that a recording gives on a map."""
     landmarks = landmarks_of_map(landmark_map, class_names)
     shown = associate(views, landmarks)
     evidence = gather_evidence(views, landmarks, shown)
@@ -166,8 +166,8 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             faults.append((0.3, f'is a sheet: its axes have the ratio {check.thinness:.3f}; '
                                 'record it from another side, or give it thickness'))
         if other := _class_of_label(check.label, check.class_id, by_words):
-            faults.append((0.6, f"is labelled '{check.label:.60}', so a {other}, but has the "
-                                f'class {check.class_id}: correct the wrong one'))
+            faults.append((0.6, f"is labelled '{check.label:.60}', which names a {other}, but "
+                                f'its class is {check.class_id}: correct the wrong one'))
         faults.sort(key=lambda fault: -fault[0])
         checks.append(replace(
             check, faults=tuple(text for _, text in faults),
@@ -183,9 +183,9 @@ def _words(text: str) -> list[str]:
 
 def _class_of_label(label: str, class_id: str, by_words: Mapping[tuple[str, ...], str]
                     ) -> str | None:
-    """Return a class that a label names, in singular or plural, unless it names its own, too.
+    """Return a class that a label names, in singular or plural, unless it also names its own.
 
-    `by_words` has the classes of the map by their words.
+    `by_words` maps the words of a class name to the class.
     """
     if any(word in label.casefold() for word in _words(class_id)):
         return None

@@ -21,9 +21,9 @@ _GUESSED_PITCH_DEG = -10.0
 _OUTLYING = 0.03
 # Positions within this distance of the recording's path are near it [m].
 _NEAR_M = 1.0
-#: Radius of a place, which is the surroundings of a landmark [m].
+#: A place is the area within this radius of a landmark [m].
 RADIUS_M = 2.0
-# Places in which a smaller share of the landmarks is alike are so by chance, and labels tell them
+# Places that share fewer landmarks look alike by chance, and labels tell them
 # apart. With the share of find_alike, which only proposes rivals of a pose, most offices and shops
 # would be reported.
 _LEAST_SHARE = 0.6
@@ -42,7 +42,7 @@ class Grid:
 
 def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
               options: CheckOptions) -> Grid:
-    """Return the grid of a map.
+    """Return the grid of camera positions for a map.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class LookAlike:
 def find_look_alikes(landmark_map: LandmarkMap) -> list[LookAlike]:
     """Return the pairs of places that look alike, the most alike first.
 
-    A place that looks the same after a turn by more than 45 degrees counts as well.
+    A place that looks the same after a rotation by more than 45 degrees counts as well.
     """
     ids, labels = landmark_map.landmark_ids, landmark_map.labels
     found: list[LookAlike] = []

@@ -86,8 +86,8 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
 
     The folds take turns with blocks of time, at least one block each. A landmark that fits its
     boxes is fitted again, to the boxes outside the fold; it is left out if they are too few. A
-    landmark that does not fit its boxes, or has none, is unchanged, as a robot would use it that
-    way.
+    landmark that does not fit its boxes, or has none, is unchanged,
+    as a robot would use it.
     """
     stamps_s = views.stamps_s
     elapsed = stamps_s - stamps_s[0]
@@ -164,7 +164,7 @@ class PosedObservation(NamedTuple):
 
 @dataclass(frozen=True)
 class Trial:
-    """One relocalization and its verdict."""
+    """One relocalization attempt and its verdict."""
 
     #: 'accepted' (a right pose), 'refused', or 'misled' (a wrong pose was accepted)
     verdict: Verdict
@@ -209,7 +209,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     """Relocalize recorded frames in maps fitted to other frames; return the trials by time.
 
     Boxes, poses and images are those of the recording, similarities are simulated. shown (n,) is
-    the landmark of each box, -1 for none. tell is called with the share that is done.
+    the landmark of each box, -1 for none. tell is called with the progress, 0 to 1.
     """
     labels = LabelModel.of(landmark_map)
     chosen = set(sample_frames(detections, options.frames).tolist())

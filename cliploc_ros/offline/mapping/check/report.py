@@ -22,7 +22,7 @@ from cliploc_ros.offline.mapping.evidence import BoxQuality
 from cliploc_ros.offline.mapping.options import Thresholds
 from cliploc_ros.offline.mapping.systematic import Correction
 
-#: The measure that tells a map of keyframes only: too few positions are accepted by objects.
+#: If a map misses this measure alone, its verdict is "keyframes only".
 BY_OBJECTS = 'positions with a heading accepted by objects alone'
 #: A landmark of this severity has a serious fault.
 SERIOUS = 1.0
@@ -198,14 +198,14 @@ class Carried(NamedTuple):
     not_at_all: int
 
     def __str__(self) -> str:
-        """Return the numbers in words."""
-        return (f'by objects {self.by_objects}, only by keyframes {self.by_keyframes}, not at all '
-                f'{self.not_at_all} of {sum(self[1:])} {self.what}')
+        """Describe the numbers in words."""
+        return (f'{sum(self[1:])} {self.what}: {self.by_objects} localized by objects, '
+                f'{self.by_keyframes} by keyframes only, {self.not_at_all} not localized')
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """The result of a check."""
+    """The result of a check of a map."""
 
     landmarks: tuple[LandmarkCheck, ...]  #: The worst first
     overlaps: tuple[Overlap, ...]
@@ -214,9 +214,9 @@ class CheckReport:
     recording: RecordingCheck | None = None
     #: Recorded queries with recorded similarities; empty without any
     queries: tuple[Trial, ...] = ()
-    measures: tuple[Measure, ...] = ()  #: The figures that decide the verdict
+    measures: tuple[Measure, ...] = ()  #: The figures that determine the verdict
     to_do: tuple[Advice, ...] = ()  #: Advice, the most urgent first
-    notes: tuple[str, ...] = ()  #: Assumptions of the figures
+    notes: tuple[str, ...] = ()  #: Assumptions behind the figures
     #: Coverage by the keyframes next to the map; None without keyframes
     keyframes: KeyframeCheck | None = None
     map_ids: tuple[str, ...] = ()  #: Ids in the map's order, which overlaps refer to
@@ -292,8 +292,8 @@ class CheckReport:
     def faulty(self) -> float:
         """Return the share of the landmarks with a serious fault.
 
-        Each landmark is weighted by its number of frames: a rarely seen one has little effect on a
-        robot.
+        Each landmark is weighted by its number of frames: a landmark of few frames will rarely be
+        seen again.
         """
         return sum(landmark.weight for landmark in self.landmarks
                    if landmark.severity >= SERIOUS) / sum(
