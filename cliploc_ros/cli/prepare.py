@@ -60,11 +60,11 @@ def prepare(options: argparse.Namespace) -> int:
     if options.cache_dir is not None:
         options.cache_dir = options.cache_dir.expanduser().absolute()
         arguments += ['-p', f'cache_dir:={options.cache_dir}']
-        # Weights in the hub's own cache would be found here, and missing on the robot.
+        # Weights in the hub's default cache would be found here, but be missing on the robot.
         os.environ['HF_HUB_CACHE'] = str(options.cache_dir / 'weights')
-    # As the nodes run, see run_node; PyTorch reads it when it is loaded.
+    # As in run_node, which runs the nodes; PyTorch reads the variable when it is loaded.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
-    # The nodes here must not meet those of a running robot.
+    # The nodes here must not communicate with those of a running robot.
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
     os.environ.pop('ROS_LOCALHOST_ONLY', None)
     with needs_ros('prepare'):

@@ -35,7 +35,7 @@ from cliploc_ros.units import NS_PER_S
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
-# Options on the meaning of the poses of a folder.
+# Options that define the poses of a folder.
 _PLACING = ('axes', 'scale', 'known_distance', 'level')
 # Further such options that were added later: at their defaults, older observation files stay
 # valid.
@@ -116,8 +116,8 @@ def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeO
                       *more: object) -> recorder.RecordingOptions:
     """Return the options for running detector and CLIP on the images that the command line names.
 
-    They include a text of all options that affect reading, and of `more` that the program adds.
-    Each text gets a separate observation file.
+    They include a text with all options that affect reading, and with `more` from the program.
+    Each text has its own observation file.
     """
     reading = [*(str(getattr(options, name)) for name in _READING),
                *(options.cameras if options.cameras != [''] else []), *map(str, more),
@@ -267,8 +267,8 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.floa
              if getattr(options, name) is not None]
     max_gap_ns = round(options.max_gap * NS_PER_S)
     if len(given) > 1:
-        raise OptionsError(f'{", ".join("--" + name.replace("_", "-") for name in given)}: poses '
-                           'come from one of them')
+        raise OptionsError(f'{", ".join("--" + name.replace("_", "-") for name in given)}: '
+                           'give only one source of poses')
     if not given:
         if mount is not None:
             raise OptionsError('--mount is for --pose-topic and --trajectory: name one of them')
@@ -287,7 +287,7 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.floa
     if mount is not None:
         raise OptionsError('--mount is not for --map-frame: tf has the mount')
     if options.camera_frame is not None and len(options.cameras) > 1:
-        raise OptionsError('--camera-frame is for one camera: with several, their images name the '
+        raise OptionsError('--camera-frame is for one camera: with several, the images name the '
                            'frames')
     return bag_poses.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns, options.tf)
 

@@ -205,8 +205,8 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
             kinds = Counter(landmark.reason.partition(':')[0] for landmark in draft.left_out)
             counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
             why = (f'no landmark is good enough for a map; {len(left_out)} were left out '
-                   f'({counts}); the first: {draft.left_out[0].reason}. Move the camera past the '
-                   'objects instead of only turning it, or map images with depth')
+                   f'({counts}); for the first one: {draft.left_out[0].reason}. Move the camera '
+                   'past the objects instead of only turning it, or map images with depth')
         raise NothingFoundError(why, left_out)
     landmarks, shown = _one_of_each(views, draft.landmarks)
     quality = explained_boxes(views, landmarks, shown)

@@ -3,7 +3,7 @@
 """Measure how well the frames support each landmark, and which of them show its place.
 
 Maps have no walls. A place therefore counts as in view only if the frame also shows another
-landmark close to its direction that is no nearer.
+landmark in nearly the same direction that is no nearer.
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from cliploc_ros.offline.mapping.views import Views
 
 #: A landmark is expected up to this multiple of the greatest distance at which it was detected.
 REACH = 1.2
-#: Least median IoU of a landmark in a map with its boxes.
+#: Least median IoU with its boxes that a landmark of a map needs.
 MIN_MEDIAN_IOU = 0.5
 #: The centre of a large landmark may deviate by this share of its size.
 MAX_SIGMA_SHARE = 0.2
@@ -64,7 +64,7 @@ class Evidence(NamedTuple):
         return np.asarray(np.minimum(1.0, self.support / np.maximum(1, self.expected)))
 
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Evidence':
-        """Return the evidence for some of the landmarks."""
+        """Return the evidence for the given landmarks."""
         return self._replace(**{name: column[rows] for name, column in self._asdict().items()})
 
     def details(self, row: int, given: LandmarkDetails) -> LandmarkDetails:
@@ -157,7 +157,7 @@ def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOpti
 
 
 def _floor(value: float) -> str:
-    """Return one decimal, never rounded up: 19.97 stays below 20."""
+    """Format a value with one decimal, rounded down: 19.97 stays below 20."""
     return f'{np.floor(10.0 * value) / 10.0:.1f}'
 
 
@@ -212,7 +212,7 @@ class Sight(NamedTuple):
                 f'{self.seen_frames[place]}')
 
     def select(self, rows: slice | NDArray[np.int64]) -> 'Sight':
-        """Return some of the places."""
+        """Return the counts of the given places."""
         return Sight(*(column[rows] for column in self))
 
 
@@ -220,7 +220,7 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
              is_solid: NDArray[np.bool_]) -> Sight:
     """Count the viewpoints and frames with each place in view, and with its landmark detected.
 
-    No box has the class of a place of class -1. Solid places contain an object, which may hide
+    A place of class -1 has a class without boxes. Solid places contain an object, which may hide
     others.
     """
     count = len(places.centers)

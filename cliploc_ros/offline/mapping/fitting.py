@@ -247,7 +247,7 @@ def add_axis_prior(basis, size, information, gradient):
         logs[k] = log(sqrt(basis[0, k] ** 2 + basis[1, k] ** 2 + basis[2, k] ** 2))
     mean = logs.mean()
     cost = 0.0
-    diagonal = (3, 6, 8)  # of D among a landmark's numbers
+    diagonal = (3, 6, 8)  # indices of D's diagonal among the numbers of a landmark
     for k in range(3):
         residual = (logs[k] - mean) / _AXIS_SPREAD
         cost += 0.5 * residual * residual

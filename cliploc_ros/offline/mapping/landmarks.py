@@ -217,7 +217,7 @@ class Landmarks(NamedTuple):
         return semi_axes, Rotation.from_matrix(rotations).as_quat()
 
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Landmarks':
-        """Return some of the landmarks."""
+        """Return the landmarks in the given rows."""
         places = np.full(len(self.classes), -1, dtype=np.int64)
         places[rows] = np.arange(len(places[rows]))
         others = np.stack([places[self.others[:, 0]], self.others[:, 1]], axis=1)

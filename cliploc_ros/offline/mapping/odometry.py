@@ -69,7 +69,7 @@ class Steps(NamedTuple):
         jacobian = np.zeros((len(firsts), POSE_SIZE, 2 * POSE_SIZE))
         axes = np.arange(POSE_SIZE)
         jacobian[:, axes, axes], jacobian[:, axes, POSE_SIZE + axes] = -1.0, 1.0
-        # a rotation of the rig moves the predicted camera, and both cameras
+        # rotating the rig displaces both cameras, and the predicted position of the second one
         ahead = np.einsum('fji,fj->fi', views.rotations[firsts], self.shifts)
         for column, arms in ((3, ahead + views.levers[firsts]),
                              (POSE_SIZE + 3, -views.levers[seconds])):
@@ -99,7 +99,7 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
     before = np.nonzero(np.diff(frames) == 1)[0]
     if len(before) == 0:
         return None, 'odometry is left out: no two successive frames have it'
-    with np.errstate(over='ignore', invalid='ignore'):  # NaN contradicts the poses, too
+    with np.errstate(over='ignore', invalid='ignore'):  # NaN counts as a contradiction
         known = _Known(given, frames, odom_from_camera[frames], errors, noise)
         if complaint := known.of_one_camera.contradiction():
             return None, complaint
@@ -159,7 +159,7 @@ class _Known:
                       self._noise)
 
     def contradiction(self) -> str:
-        """Return how the whole of odometry contradicts the poses; '' if it does not."""
+        """Return how odometry contradicts the poses overall; '' if it does not."""
         starts = np.arange(len(self._frames) - 1)
         ends = np.searchsorted(self._stamps_s, self._stamps_s[:-1] + _WINDOW_S)
         windows = self.compare(starts, np.clip(ends, starts + 1, len(starts)))
@@ -194,7 +194,7 @@ class _Known:
         kept = errors.kept(seconds_s)
         sigma_m, sigma_rad = errors.sigmas[[0, 3]]
         of_turns = np.square(sigmas[:, 1]) + 2.0 * sigma_rad ** 2 * (1.0 - kept)
-        # an error of rotation displaces distant points
+        # errors of rotation grow with distance
         of_shifts = (np.square(sigmas[:, 0]) + 2.0 * sigma_m ** 2 * (1.0 - kept)
                      + np.square(far_m) * (np.square(sigmas[:, 1]) + sigma_rad ** 2))
         of_both = np.sqrt(np.column_stack([of_shifts, of_turns]))

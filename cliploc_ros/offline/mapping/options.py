@@ -32,7 +32,7 @@ class PoseErrors:
         return np.repeat([self.sigma_m, np.radians(self.sigma_deg)], 3)
 
     def kept(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the share of an error that is left after times (n,) [s].
+        """Return the share of an error that remains after times (n,) [s].
 
         Simultaneous frames are from several cameras of one robot, so they share their errors.
         """
@@ -120,7 +120,8 @@ class CheckOptions:
     #: Of the relocalizer that will use the map
     relocalizer: RelocalizerOptions = field(default_factory=RelocalizerOptions)
     folds: int = 5  #: Cross-validation: each fold is judged with landmarks fitted to the others
-    #: The folds take turns with blocks of this length [s]; frames within the gap of a judged frame
+    #: Blocks of this length are assigned to the folds in turn [s]; frames within the gap of a
+    #: judged frame
     #: are not used to fit the landmarks that judge it [s]
     block_s: float = 4.0
     gap_s: float = 1.0
@@ -157,7 +158,8 @@ class Thresholds:
     max_misled: float = 0.01
     #: Share of the grid positions near the recording with an accepted heading
     min_positions: float = 0.4
-    #: The same share by objects alone, for maps with keyframes; below it, only keyframes count
+    #: The same share by objects alone, for maps with keyframes; below it, a map is "keyframes
+    #: only"
     min_by_objects: float = 0.1
     #: Share of the landmarks with a serious fault, each counted as often as it was seen
     max_faulty: float = 0.15

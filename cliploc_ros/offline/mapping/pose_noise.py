@@ -176,8 +176,9 @@ def left_by_poses(views: Views, changes: NDArray[np.float64], shown: NDArray[np.
                   count: int) -> NDArray[np.float64]:
     """Return the displacement of each landmark by errors of the poses, on each axis (count,) [m].
 
-    The mean error of a landmark's frames remains: errors are independent between the spans of time
-    in which it was seen. Changes (F, 6) are the squares of the changes by refinement; 0 where the
+    The mean error over the frames of a landmark remains. Errors are independent between the spans
+    of time in which it was seen. Changes (F, 6) are the squares of the changes by refinement; 0
+    where the
     poses were not refined.
     """
     squares = np.zeros(count)

@@ -28,7 +28,7 @@ class PosedDetections:
     """
 
     cameras: tuple[Camera, ...]  #: Of the undistorted images
-    map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses to map with
+    map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses used for mapping
     stamps_s: NDArray[np.float64]  #: (F,): times of the images [s], ascending
     #: (F + 1,): frame f has the boxes from frame_offsets[f] up to frame_offsets[f + 1]
     frame_offsets: NDArray[np.int64]

@@ -48,7 +48,7 @@ class RefitMap:
     """A map fitted to a recording: L landmarks in the order of the given map."""
 
     landmark_map: LandmarkMap  #: All L landmarks; those with a reason are unchanged
-    #: Why a landmark could not be fitted; None where it was fitted, or was not chosen
+    #: Why a landmark could not be fitted; None if it was fitted, or was not chosen
     reasons: tuple[str | None, ...]
     #: (L,): the landmark that is the same object as each one; its own row if there is none
     part_of: NDArray[np.int64]
@@ -114,8 +114,8 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
             'frame, and to metres, first')
     if not (is_fitted | ~chosen).any():
         raise MappingError(
-            f'no landmark can be fitted; the first: {reasons[0]}; as given, the map explains '
-            f'{share_before:.0%} of the boxes: check its coordinate frame')
+            f'no landmark can be fitted; for the first one, {reasons[0]}; as given, the map '
+            f'explains {share_before:.0%} of the boxes: check its coordinate frame')
     # boxes of landmarks that were not fitted may belong to fitted ones
     landmarks = settled._replace(
         centers=np.where(is_fitted[:, None], settled.centers, given.centers),

@@ -48,7 +48,7 @@ def outlines_in_view(detections: PosedDetections, view: int, centers: NDArray[np
 def find_sightings(detections: PosedDetections, rows: NDArray[np.int64],
                    center: NDArray[np.float64], shape: NDArray[np.float64], limit: int = 6,
                    sharpness: Callable[[Sighting], float] | None = None) -> list[Sighting]:
-    """Return the views that show a landmark best, the best one first.
+    """Return the views that show a landmark best, best first.
 
     Detected boxes come first. If there are fewer than three, views that should show the landmark
     are added.

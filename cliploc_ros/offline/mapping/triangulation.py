@@ -221,7 +221,7 @@ def _settle(views: Views, free_rows: NDArray[np.int64], support: NDArray[np.int6
 
 @compiled
 def _pair_hypotheses(views, rows, seeds, draws):
-    """Return centres (h, 3) and bases (h, 3, 3) from pairs of each seed with a random partner."""
+    """Return centres (h, 3) and bases (h, 3, 3) of pairs, each of a seed and a random partner."""
     centers, bases = np.empty((len(seeds), 3)), np.empty((len(seeds), 3, 3))
     origins, rays, radii = _rays_of(views, rows)
     stamps = views.stamps_s[views.frames[rows]]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Posed detections as the kernels of mapping read them: boxes and poses on the plane z = 1."""
+"""Arrays of posed detections for the kernels of mapping: boxes and poses on the plane z = 1."""
 
 from typing import NamedTuple
 
@@ -40,7 +40,7 @@ class Views(NamedTuple):
     #: rig is rigid: an error of its rotation also displaces this camera.
     levers: NDArray[np.float64]
     #: (F,): number of the viewpoint of each frame, ascending for each camera: frames that a camera
-    #: took without moving share one
+    #: took without moving share a viewpoint
     viewpoints: NDArray[np.int64]
     #: (F,): one over the number of frames of the viewpoint, as the errors of their boxes are equal
     weights: NDArray[np.float64]
@@ -221,7 +221,7 @@ def check_input(detections: PosedDetections, views: Views,
     notes = []
     if len(jumps):
         notes.append(f'the poses jump {len(jumps)} times, first at {jumps[0]:.2f} s; check the '
-                     'localization that they come from')
+                     'localization that produced them')
     empty = float(np.mean(np.diff(detections.frame_offsets) == 0))
     if empty > _MAX_EMPTY_SHARE:
         notes.append(f'{empty:.0%} of the frames have no detections; check the detector')

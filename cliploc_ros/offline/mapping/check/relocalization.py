@@ -84,7 +84,8 @@ class RecordedKeyframes(NamedTuple):
 def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
     """Yield the folds of a recording, each with the map fitted to the other folds.
 
-    The folds take turns with blocks of time, at least one block each. A landmark that fits its
+    Blocks of time are assigned to the folds in turn, at least one to each. A landmark that fits
+    its
     boxes is fitted again, to the boxes outside the fold; it is left out if they are too few. A
     landmark that does not fit its boxes, or has none, is unchanged,
     as a robot would use it.

@@ -265,7 +265,7 @@ class CheckReport:
 
     @property
     def evidence(self) -> str:
-        """Return the evidence that counts for an accepted pose, in words."""
+        """Describe the evidence by which poses are accepted."""
         return 'by objects or keyframes' if self.keyframes is not None and self._by_images else (
             'by objects')
 
@@ -344,7 +344,7 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
                                  limits.min_explained, False),
                          Measure('held-out median IoU', recording.held_out.median_iou,
                                  limits.min_iou, False, 'number')]
-        # with too few judged frames (each object was passed only once), simulated boxes count
+        # with too few judged frames (each object was passed only once), simulated ones count
         how, trials = ((report.evidence, recording.judged) if recording.can_judge_frames else
                        ('with simulated boxes', recording.simulated))
         measures.append(Measure(f'recorded frames accepted {how}', share(trials, 'accepted'),

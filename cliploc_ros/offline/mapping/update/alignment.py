@@ -74,14 +74,14 @@ def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
 
 
 class Refits(NamedTuple):
-    """L landmarks fitted to the recording; unchanged if it does not suffice."""
+    """L landmarks fitted to the recording; unchanged if it has too few boxes."""
 
     landmarks: Landmarks
-    #: (L, 3, 3): of the centres [m^2]; infinite if the recording does not suffice
+    #: (L, 3, 3): of the centres [m^2]; infinite for unchanged landmarks
     covariances: NDArray[np.float64]
 
     def select(self, rows: NDArray[np.int64]) -> 'Refits':
-        """Return some of the landmarks."""
+        """Return the landmarks in the given rows."""
         return Refits(self.landmarks.select(rows), self.covariances[rows])
 
     @property
@@ -116,7 +116,7 @@ class Aligned(NamedTuple):
     """The recording in the coordinate frame of the map."""
 
     views: Views
-    #: Offset of the recording's coordinate frame, in the middle of the landmarks
+    #: Offset of the recording's coordinate frame, at the mean of the landmarks
     offset_m: float
     offset_deg: float
     #: Root mean square by which the poses were refined after that
@@ -195,7 +195,7 @@ def _refine(aligned: Views, known: OldMap, errors: PoseErrors, options: MappingO
 
 
 def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits) -> NDArray[np.bool_]:
-    """Return a mask of the landmarks (L,) that are so far off in the recording that they moved."""
+    """Return a mask of the landmarks (L,) that must have moved, as they are so far off."""
     offsets = found.landmarks.centers - old.centers
     far = found.is_known & (np.linalg.norm(offsets, axis=1) > _LEAST_MOVE_M)
     rows = np.nonzero(far)[0]

@@ -38,7 +38,7 @@ _MOST_SEEN_IF_MOVED = 0.05
 _AMBIGUOUS_GAIN = 1.0
 # Deviation of the logarithm of an object's size, and the greatest difference. Guesses.
 _SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.25, 0.8
-# Least number of objects in their place to learn the usual similarity of embeddings.
+# Least number of objects in their places from which to learn the similarity of embeddings.
 _FEWEST_LOOKS = 8
 # A landmark in its place is doubtful if its similarity is this many deviations below the usual.
 _DOUBT = 1.0
@@ -217,7 +217,7 @@ def _learn_looks(objects: Shown, looks: Likeness, groups: NDArray[np.int64]) -> 
         return None
     middle, elsewhere = float(np.median(same)), float(np.median(different))
     if middle <= elsewhere:
-        return None  # embeddings do not tell objects apart here
+        return None  # embeddings cannot distinguish objects here
     spreads = [1.4826 * float(np.median(np.abs(values - center)))
                for values, center in ((same, middle), (different, elsewhere))]
     return _LookModel(middle, elsewhere, max(*spreads, 1e-3))

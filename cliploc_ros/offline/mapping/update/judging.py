@@ -38,7 +38,7 @@ _FACTOR_RANGE = (0.3, 2.0)
 _RATIO_RANGE = (0.02, 0.95)
 # Least number of landmarks, and of viewpoints of each, to estimate the scatter of the ratios;
 # least weight of a usual ratio [views]. Guesses.
-_MEDIAN_SQUARE = 0.455  # of a standard normal variable
+_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
 _FEW_LANDMARKS, _FEW_VIEWS, _LEAST_WORTH = 5, 3, 0.5
 # Share of the objects that are usually still in their place; share of the views in which an object
 # is detected, if neither map nor recording give it; share of the views with a false detection in
@@ -128,7 +128,7 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     # a new object may be in the place of an old landmark that still has a false detection
     finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0)
     _, sight = _look(views, known, finds, is_gone)
-    # finds are seen about as often as the old landmarks, which come first
+    # finds should be seen about as often as the old landmarks, which come first in `sight`
     ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
     usual = float(np.median(ratios)) if len(ratios) else 1.0
     least = _MIN_NEW_SHARE * usual
@@ -167,7 +167,7 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
 
 def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
                ) -> NDArray[np.bool_]:
-    """Return a mask of the objects (L,) whose probability of being in their place is below limits.
+    """Return a mask of the objects (L,) whose probability of being in place is below the limits.
 
     Classes without a box are excluded: the detector may not know them, or not at these sizes.
     """
@@ -181,7 +181,7 @@ def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
 def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
     """Return for each place (L,) the probability that its object is there.
 
-    If it is, the recording shows it in a usual share of the views. This is the share of the old
+    If it is, the recording shows it in a usual share of the views. It is the share of the old
     recording, times the factor by which the new one shows all objects more often. Without an old
     recording, it is the share of the landmarks that this recording shows.
     """

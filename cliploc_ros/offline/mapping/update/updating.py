@@ -248,8 +248,8 @@ def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list
                      'landmarks of this class are kept: the detector may not know it')
     last_seen = max((detail.last_seen or 0.0 for detail in known.map.details), default=0.0)
     if last_seen > float(detections.stamps_s[-1]):
-        notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the map was '
-                     f'last seen at {last_seen:.0f} s: an older recording, or another clock')
+        notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the landmarks '
+                     f'were last seen at {last_seen:.0f} s: an older recording, or another clock')
     return notes
 
 
@@ -301,7 +301,7 @@ def _renew(known: OldMap, views: Views, objects: Shown, fates: Fates, judged: Ju
 def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], first_new: int,
                 class_names: tuple[str, ...]
                 ) -> tuple[LandmarkMap, NDArray[np.int64], int, list[str]]:
-    """Merge the landmarks of the new map that are the same object by the recording.
+    """Merge the landmarks of the new map that the recording shows to be the same object.
 
     The older landmark keeps its id and gets the labels and classes of the other one, and the
     ellipsoid with more boxes is kept. Two old landmarks are not merged if the recording shows only
