@@ -75,7 +75,7 @@ def make_layer(options: argparse.Namespace, frames: 'Frames | None', landmark_ma
         return None, ''
     if problem := _problem(options):
         return None, f'no keyframes with {problem}'
-    assert frames is not None  # only --observations has none
+    assert frames is not None  # only --observations comes without images
     distance_m, angle_deg = options.keyframes
     try:
         return build_layer(frames, landmark_map, LayerOptions(

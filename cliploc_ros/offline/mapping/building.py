@@ -196,8 +196,8 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     moving = Counter(name for name in np.array(detections.class_names)[detections.classes].tolist()
                      if options.moves(name))
     if moving:
-        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are not landmarks: '
-                     'they move')
+        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are not landmarks, '
+                     'as these classes move')
     if len(draft.landmarks.centers) == 0:
         why = ('boxes of one class do not meet in space; check that poses and stamps belong to '
                'these images, that the poses are of the camera (z forward), and the intrinsics')

@@ -3,8 +3,8 @@
 """Decide whether two landmarks are the same object.
 
 Building, refitting, updating and checking share this criterion. Overlapping landmarks are the same
-object, whatever their classes, unless the images show two objects. A detector gives one object
-several names, in different images or in the same one, and detects parts of it. Therefore boxes
+object, whatever their classes, unless the images show two objects. A detector may give one object
+several names, in different images or in the same one, and detect parts of it. Therefore boxes
 that overlap well show the same object, and so does a box within another one, unless it is small
 and usually present, like that of a cup on a table.
 """

@@ -74,7 +74,7 @@ class _Cause(NamedTuple):
     effects_px: tuple[float, ...]  # of one shown unit
     camera: Camera
     boxes: NDArray[np.bool_]  # (n,): those of the camera
-    # (F, 6, G): motion of the map in the cameras by each number; None: the numbers are intrinsics
+    # (F, 6, G): motion of the map in the cameras per unit of each number; None: intrinsics
     motions: NDArray[np.float64] | None
 
     def differentiate(self, views: Views, linear: Linear) -> NDArray[np.float64]:

@@ -92,7 +92,7 @@ class Finds(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """What a recording with n boxes shows about L old landmarks and m finds."""
+    """The evidence from a recording with n boxes for L old landmarks and m finds."""
 
     #: (n,): the old landmark that each box shows in its place, L + the find, or -1 for none
     shown: NDArray[np.int64]
@@ -218,7 +218,7 @@ def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> ND
 
 def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_]
           ) -> tuple[NDArray[np.int64], Sight]:
-    """Return the landmark or find that each box shows, and the sight of all places."""
+    """Return the old landmark or new find that each box shows, and the sight of all places."""
     places = Landmarks.joined(known.landmarks, finds.landmarks)
     is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
     shown = associate(views, places, among=is_solid)

@@ -248,8 +248,9 @@ def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list
                      'landmarks of this class are kept: the detector may not know it')
     last_seen = max((detail.last_seen or 0.0 for detail in known.map.details), default=0.0)
     if last_seen > float(detections.stamps_s[-1]):
-        notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the landmarks '
-                     f'were last seen at {last_seen:.0f} s: an older recording, or another clock')
+        notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the '
+                     f'landmarks were last seen at {last_seen:.0f} s: an older recording, or '
+                     'another clock')
     return notes
 
 
