@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Command-line tools, one small module an executable."""
+"""Command-line tools, one small module for each executable."""

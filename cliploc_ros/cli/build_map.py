@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``build_map``: posed detections become a map file."""
+"""The executable ``build_map``: build a map file from posed detections."""
 
 import argparse
 import json
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
     from cliploc_ros.offline.mapping.update.updating import UpdateReport
 
-# A check at the end of a build: it takes seconds, not the minute of all views.
+# Options of the check after a build: with fewer views, it takes seconds instead of a minute.
 _QUICK = ('--positions', '25', '--headings', '6', '--frames', '30')
 EPILOG = """\
 examples:
@@ -64,8 +64,8 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--out YAML', 'the map to write', required=True)
     option(parser, '--update YAML', 'bring this map up to date; --out may be the same file')
     option(parser, '--report JSON', 'also write what was found and left out, and why')
-    option(parser, '--frame-id', 'of the map (%(default)s)', default='map')
-    option(parser, '--every N', 'use each N-th frame only (%(default)s)', command.positive_int, 1)
+    option(parser, '--frame-id', 'coordinate frame of the map (%(default)s)', default='map')
+    option(parser, '--every N', 'use only every N-th frame (%(default)s)', command.positive_int, 1)
     option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
     option(parser, '--check', 'at the end, check the map as check_map does, with fewer views, '
            'into NAME_check; the exit code is that of the build (%(default)s)', default=True,
@@ -73,33 +73,33 @@ def make_parser() -> argparse.ArgumentParser:
     labels = parser.add_argument_group('labels')
     option(labels, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--object-size CLASS METRES', 'the longest extent of the objects of a class, '
-           'which says the scale of the poses')
+           'which gives the scale of the poses')
     map_layer.add_layer_options(parser)
     poses = parser.add_argument_group('poses with errors')
     option(poses, '--joint', 'refine the poses together with the landmarks (default: if '
-           '--pose-noise is given, or where the boxes tell that they are off)',
+           '--pose-noise is given, or the boxes show that the poses have errors)',
            action=argparse.BooleanOptionalAction)
     option(poses, '--pose-noise METRES DEGREES', 'standard deviations of the poses on each axis '
            '(0.02 0.5 with --joint)', command.positive)
-    option(poses, '--pose-correlation SECONDS', 'time after which a pose error is another one '
+    option(poses, '--pose-correlation SECONDS', 'time constant of the errors of the poses '
            '(%(default)s)', command.not_negative, 3.0)
     option(poses, '--odometry-noise METRES DEGREES', 'standard deviations of odometry on each '
-           'axis after a metre of the way (0.03 1.5)', command.positive)
+           'axis after one metre (0.03 1.5)', command.positive)
     option(poses, '--refine-mount', 'correct a mount of the camera that is off by centimetres or '
            'degrees')
-    limits = parser.add_argument_group('which landmarks belong into the map')
-    option(limits, '--min-viewpoints N', '10 cm or 5 degrees apart (%(default)s)',
-           command.positive_int, 3)
-    option(limits, '--moving CLASSES', "classes that move and never become landmarks, as 'person, "
-           "cat'; '' for none (persons, animals, balls and vehicles of COCO)")
-    option(limits, '--min-baseline DEG', 'angle between two of its directions (%(default)s)',
-           command.within(0.0, 180.0), 20.0)
+    limits = parser.add_argument_group('which landmarks are kept in the map')
+    option(limits, '--min-viewpoints N', 'least number of viewpoints, 10 cm or 5 degrees apart '
+           '(%(default)s)', command.positive_int, 3)
+    option(limits, '--moving CLASSES', "classes that move and never become landmarks, like "
+           "'person, cat'; '' for none (persons, animals, balls and vehicles of COCO)")
+    option(limits, '--min-baseline DEG', 'least angle between two directions to a landmark '
+           '(%(default)s)', command.within(0.0, 180.0), 20.0)
     return parser
 
 
 def build(options: argparse.Namespace) -> int:
-    """Build as the command line asks; return the exit code."""
-    # Late, so that --help is fast.
+    """Build or update the map that the command line names; return the exit code."""
+    # Imported late, so that --help is fast.
     from cliploc_ros.cli import sources
     from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -145,8 +145,8 @@ def build(options: argparse.Namespace) -> int:
             lines.append(_mount_option(options, made.mount.given_from_corrected))
     else:
         if layer_path(update).exists():
-            note = ('the new map has no keyframes, which need all images: objects alone localize; '
-                    'build a new map to have both')
+            note = ('the new map has no keyframes, which need all images: it localizes by objects '
+                    'alone; build a new map to have both')
         with _reporting_failure(options.report):
             made = update_map(update, detections, labeller, mapping)
         _write_report(options.report, made.report.as_dict())
@@ -163,7 +163,7 @@ def build(options: argparse.Namespace) -> int:
 
 
 def _tell_misspelt(moving: Sequence[str], seen: Sequence[str]) -> None:
-    """Say which names of --moving look misspelt: what they mean becomes landmarks."""
+    """Report names of --moving that look misspelt: their objects would become landmarks."""
     from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
     known = {name.lower() for name in (*seen, *shipped_classes())}
@@ -182,9 +182,10 @@ def _refuse(out: Path, written: Path) -> int:
 def _make(options: argparse.Namespace, detections: 'PosedDetections', labeller: 'Labeller',
           mapping: 'MappingOptions', frames: 'Frames | None'
           ) -> 'tuple[MadeMap, KeyframeLayer | None, str]':
-    """Return a new map, its keyframes, and a note where it has none.
+    """Return a new map, its keyframes, and a note if it has no keyframes.
 
-    Where no landmark is found, keyframes alone make a map. MappingError: there are none, either.
+    If no landmark is found, keyframes alone make a map. MappingError: there are no keyframes,
+    either.
     """
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.make_map import MadeMap, make_map
@@ -208,7 +209,7 @@ def _make(options: argparse.Namespace, detections: 'PosedDetections', labeller: 
 
 
 def _place_of(path: Path, report: 'MappingReport | UpdateReport') -> tuple[Path, bool]:
-    """Return where a map is written, and whether it is too poor to take the place of another."""
+    """Return the path to write a map to, and whether it is too poor to replace another one."""
     from cliploc_ros.offline.mapping.building import LEAST_EXPLAINED, MappingReport
 
     is_poor = isinstance(report, MappingReport) and report.landmarks > 0 and (
@@ -218,19 +219,20 @@ def _place_of(path: Path, report: 'MappingReport | UpdateReport') -> tuple[Path,
 
 @contextmanager
 def _reporting_failure(path: Path | None) -> Iterator[None]:
-    """Make a report of a MappingError: why there is no map, and what was left out of it."""
+    """Write a report of a MappingError, with its reason and the landmarks that were left out."""
     from cliploc_ros.offline.mapping.building import NothingFoundError
 
     try:
         yield
     except MappingError as error:
         left_out = error.left_out if isinstance(error, NothingFoundError) else ()
-        _write_report(path, {'failure': str(error), 'left_out': [asdict(one) for one in left_out]})
+        _write_report(path, {'failure': str(error),
+                             'left_out': [asdict(landmark) for landmark in left_out]})
         raise
 
 
 def _write_report(path: Path | None, report: dict[str, Any]) -> None:
-    """Write a report where one is wanted, and say so."""
+    """Write a report if a path is given, and print the path."""
     from cliploc_ros.files.storage import write_text
 
     if path is not None:
@@ -239,7 +241,7 @@ def _write_report(path: Path | None, report: dict[str, Any]) -> None:
 
 
 def _check_map(path: Path, wanted: bool) -> None:
-    """Check the map that was written; one that cannot be checked stays."""
+    """Check the map that was written; it is kept if it cannot be checked."""
     try:
         if wanted:
             check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]))
@@ -249,7 +251,7 @@ def _check_map(path: Path, wanted: bool) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse an output that cannot be written, and options, before the work is done."""
+    """Refuse an unwritable output and conflicting options, before any work is done."""
     command.check_output(options.out)
     map_layer.check_layer_options(options)
     if options.level and options.update is not None:
@@ -267,7 +269,7 @@ def _check(options: argparse.Namespace) -> None:
 def _placed(detections: 'PosedDetections', options: argparse.Namespace,
             mapping: 'MappingOptions'
             ) -> 'tuple[PosedDetections, float, NDArray[np.float64]]':
-    """Return detections in the map, and the scale and rotation (3, 3) that moved them there."""
+    """Level and scale detections; return them with the scale and the rotation (3, 3)."""
     import numpy as np
 
     from cliploc_ros.cli.sources import metres_of
@@ -275,7 +277,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
     from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 
     scale, rotation = 1.0, np.eye(3)
-    if folder_of(options) is None:  # whoever reads a folder levels it
+    if folder_of(options) is None:  # folders are levelled when they are read
         found, note = find_tilt(detections.map_from_camera), tilt_note(detections.map_from_camera)
         if options.level:
             if found is None:
@@ -294,7 +296,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
 
 
 def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
-    """Return how the poses may be off; None if that is unknown, or not to be refined."""
+    """Return the errors of the poses; None if unknown, or if the poses are not to be refined."""
     from cliploc_ros.offline.mapping.options import PoseErrors
 
     if options.joint is False:

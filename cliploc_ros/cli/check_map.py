@@ -49,13 +49,13 @@ def make_parser() -> argparse.ArgumentParser:
         'misled in it, places that look alike, and systematic errors. Writes check.html and '
         'check.json. Without observations the report is shorter. Needs no sourced ROS.')
     option(parser, 'map MAP', 'a map file')
-    option(parser, '--observations NPZ', 'boxes and poses of a recording of the place (those that '
-           'build_map made the map from, if NAME.recording.json next to the map names them)')
-    option(parser, '--images BAG|DIR', 'the images of this recording (found where '
-           'NAME.recording.json names them, or where the observations lie beside them)')
+    option(parser, '--observations NPZ', 'boxes and poses of a recording of the place (default: '
+           'those that the map was built from, as named by NAME.recording.json next to the map)')
+    option(parser, '--images BAG|DIR', 'the images of this recording (default: those named by '
+           'NAME.recording.json, or those next to the observations)')
     option(parser, '--queries NPZ', 'a query file of this map: frames with similarities')
     option(parser, '--out DIR', 'folder of check.html and check.json (NAME_check next to the map)')
-    option(parser, '--every N', 'use each N-th frame of the observations only (%(default)s)',
+    option(parser, '--every N', 'use only every N-th frame of the observations (%(default)s)',
            command.positive_int, 1)
     option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
     add_use_option(parser, 'report what the keyframes next to the map reach')
@@ -67,25 +67,25 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
-    option(group, '--frames N', 'the most recorded frames to relocalize (%(default)s)',
+    option(group, '--frames N', 'greatest number of recorded frames to relocalize (%(default)s)',
            command.positive_int, CheckOptions.frames)
-    option(group, '--folds N', 'of the cross-validation, 2 or more (%(default)s)',
+    option(group, '--folds N', 'folds of the cross-validation, 2 or more (%(default)s)',
            command.within(2, 10**6), CheckOptions.folds)
     option(group, '--grid METRES', 'spacing of the camera positions, larger in large maps '
            '(%(default)s)', command.positive, CheckOptions.spacing_m)
-    option(group, '--positions N', 'the most camera positions (%(default)s)', command.positive_int,
-           CheckOptions.max_positions)
+    option(group, '--positions N', 'greatest number of camera positions (%(default)s)',
+           command.positive_int, CheckOptions.max_positions)
     option(group, '--headings N', 'directions at each position (%(default)s)',
            command.positive_int, CheckOptions.headings)
-    option(group, '--camera-height METRES', 'of the grid (as recorded; else .3 m above the middle '
-           'landmark)', command.finite)
+    option(group, '--camera-height METRES', 'height of the grid (as recorded, otherwise .3 m '
+           'above the median landmark)', command.finite)
     option(group, '--gravity', 'the robot knows the vertical')
-    option(group, '--min-confidence', "the relocalizer's (%(default)s)", command.within(0.0, 1.0),
-           RelocalizerOptions().min_confidence)
+    option(group, '--min-confidence', 'min_confidence of the relocalizer (%(default)s)',
+           command.within(0.0, 1.0), RelocalizerOptions().min_confidence)
 
 
 def _add_thresholds(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('thresholds; beyond one of them, the exit code is 1')
+    group = parser.add_argument_group('thresholds; if the map misses one, the exit code is 1')
     share, count = command.within(0.0, 1.0), command.within(0, 10**9)
     for name, kind, text in (
             ('min_explained', share, 'share of held-out boxes that a landmark explains'),
@@ -102,8 +102,8 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
 
 
 def check(options: argparse.Namespace) -> int:
-    """Check as the command line asks; return the exit code."""
-    # Late, so that --help is fast.
+    """Check the map that the command line names; return the exit code."""
+    # Imported late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.datasets.observations import load_queries
@@ -128,7 +128,7 @@ def check(options: argparse.Namespace) -> int:
     image_of = views = None
     if detections is not None and images is not None:
         views = page.ViewPainter(landmark_map, detections, images.near)
-        if options.observations is None:  # the layer's own: judged by those of other times
+        if options.observations is None:  # keyframes of nearly the same time are excluded
             image_of = partial(images.of, detections)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):
         print(f'note: {note}', flush=True)
@@ -171,13 +171,13 @@ def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections
         reached = in_reach(layer, poses[:, :3, 3], poses[:, :3, 2])
         print(f'recorded frames within reach of a keyframe: {reached.mean():.0%} of '
               f'{len(reached)}')
-    print('what to do:\n  record objects from several sides, so that a robot is localized by them '
-          'elsewhere, too, and when the place has changed')
+    print('what to do:\n  record objects from several sides: they also localize a robot away from '
+          'the recorded views, and after the place has changed')
     return 1
 
 
 def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':
-    """Return the recording of the command line or of the map, and its images where they are."""
+    """Return the recording of the command line or of the map, and its images if they are found."""
     from cliploc_ros.offline.datasets.bag_frames import BagTopics
     from cliploc_ros.offline.datasets.images import images_of_recording, open_images
     from cliploc_ros.offline.datasets.map_recording import load_recording
@@ -192,10 +192,10 @@ def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Imag
         print(f'observations: {os.path.relpath(recording.observations)}', flush=True)
         detections, source = recording.load(), None
     elif options.images is not None:
-        raise OptionsError('--images needs --observations: no recording is known of this map')
+        raise OptionsError('--images needs --observations: no recording of this map is known')
     else:
-        print('no recording is known of this map: the check is of the map alone, and simulated; '
-              'give --observations', flush=True)
+        print('no recording of this map is known: the map is checked by simulation only; give '
+              '--observations', flush=True)
         return None
     images = None
     try:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``doctor``: check all that a request needs, and say what to do."""
+"""The executable ``doctor``: check everything that a request needs, and say what to do."""
 
 import argparse
 import sys
@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from cliploc_ros.command import needs_ros, option, positive, printable, run_main, running_ros
 
 EPILOG = """\
-It asks the running relocalizer for its parameters and topics, listens to the same topics, and
-localizes once. It changes nothing: no pose is handed over. Before the nodes run, give their
-parameter files, and remap the topics as for them.
+It reads the parameters and topics of the running relocalizer, listens to the same topics, and
+localizes once. It changes nothing, and sends no pose to a localizer. If the nodes are not running,
+give their parameter files and the same remappings.
 
-exit codes: 0 nothing failed, 1 something did
+exit codes: 0 no check failed, 1 a check failed
 
 examples:
   doctor
@@ -33,8 +33,8 @@ def make_parser() -> argparse.ArgumentParser:
         prog='doctor', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         usage='doctor [options] [--ros-args ...]',
         description='Check parameters, map, camera, calibration, clock, tf, odometry, detector, '
-        'localizer and the time of a request, each with what to do.')
-    option(parser, '--relocalizer NAME', 'its name, in the namespace of this node or absolute '
+        'localizer and the time of a request. Each failure comes with its remedy.')
+    option(parser, '--relocalizer NAME', 'its name, absolute or in the namespace of this node '
            '(%(default)s)', default='relocalizer')
     option(parser, '--params-file FILE', 'check with these parameters; repeat it as on the '
            'command line of the node (default: ask the running relocalizer)', default=[],
@@ -48,14 +48,14 @@ def run(options: argparse.Namespace) -> int:
     with needs_ros('doctor'):
         from cliploc_ros.ros.doctor import Report, State, doctor
 
-    report = Report(lambda one: print(
-        f'{one.what:<12} {one.state:<12} {printable(one.text)}', flush=True))
+    report = Report(lambda finding: print(
+        f'{finding.what:<12} {finding.state:<12} {printable(finding.text)}', flush=True))
     with running_ros(options.ros_args):
         doctor(options.params_file, options.relocalizer, options.timeout, report)
     failed = [finding.what for finding in report.findings if finding.state is State.FAIL]
     print(f'{len(failed)} of {len(report.findings)} failed: {", ".join(failed)}' if failed else
           f'nothing failed in {len(report.findings)} checks' + (
-              ', but no pose is found here' if any(
+              ', but no pose was accepted here' if any(
                   finding.state is State.REFUSED for finding in report.findings) else ''))
     return int(bool(failed))
 

@@ -16,8 +16,8 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.storage import MAKE_ROOM, make_folder
 
 EPILOG = """\
-It needs PyTorch (script/setup models). A robot runs the files without it: name them as its
-parameters model and clip_pretrained.
+Exporting needs PyTorch (script/setup models). A robot runs the files without it: name them in
+its parameters model and clip_pretrained.
 
 examples:
   export_network --model yolov8n.pt --out yolov8n.onnx
@@ -49,7 +49,7 @@ def make_parser() -> argparse.ArgumentParser:
 def export_network(options: argparse.Namespace) -> int:
     """Write the ONNX files of the network that the command line names; return the exit code.
 
-    CliplocError: the message names the option or file to mend.
+    CliplocError: the message names the option or file to correct.
     """
     is_clip = bool(options.clip_model or options.clip_pretrained)
     if is_clip == bool(options.model):
@@ -60,7 +60,7 @@ def export_network(options: argparse.Namespace) -> int:
     if options.out.exists() and (is_clip or options.out.is_dir()):
         raise OptionsError(f'{options.out} exists: name a new {"folder" if is_clip else "file"}')
     if not is_clip and options.out.suffix != '.onnx':
-        raise OptionsError(f'--out {options.out}: the name of a detector ends on .onnx')
+        raise OptionsError(f'--out {options.out}: the file name of a detector must end in .onnx')
     options.out = options.out.absolute()
     make_folder(options.out.parent)
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_export_') as desk:
@@ -73,7 +73,7 @@ def export_network(options: argparse.Namespace) -> int:
 
 
 def _place(export: Path, out: Path) -> None:
-    """Copy a file or folder to its place, where it appears as a whole."""
+    """Copy a file or folder atomically."""
     copy = shutil.copytree if export.is_dir() else shutil.copy
     try:
         with tempfile.TemporaryDirectory(dir=out.parent, prefix='.',

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``import_map``: a map of another system, or a table, becomes a map file."""
+"""The executable ``import_map``: convert a map of another system, or a table, to a map file."""
 
 import argparse
 import json
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 _FORMATS = ('msgloc', 'goreloc', 'oaslam', 'csv')
 _LEFT_OUT_SHOWN = 10
-# [m] [deg]. Chosen so that 0.95 of the poses lie in their 95 % ellipsoid on the map of TUM fr3,
-# displaced by 5 cm on each axis, landmark by landmark or as a whole, or with sizes 1.25 times.
+# [m] [deg]. Chosen so that 0.95 of the poses lie in their 95 % ellipsoid on the map of TUM fr3, if
+# the landmarks are displaced by 5 cm on each axis, independently or together, or enlarged by 1.25.
 _ERRORS = (0.05, 1.0)
 EPILOG = """\
 formats:
@@ -50,27 +50,27 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--from', 'its format', dest='format', choices=_FORMATS, required=True)
     option(parser, '--out YAML', 'the map to write', required=True)
     option(parser, '--report JSON', 'also write what was left out, and why')
-    option(parser, '--class-names FILE', 'a class name in each line, for formats with indices '
-           '(COCO)')
-    place = parser.add_argument_group('where the map lies')
-    option(place, '--frame-id', 'of the map (%(default)s)', default='map')
-    option(place, '--scale METRES', 'metres in a unit of length of the file (%(default)s)',
+    option(parser, '--class-names FILE', 'a file with one class name per line, for formats with '
+           'class indices (COCO)')
+    place = parser.add_argument_group('coordinate frame and errors of the map')
+    option(place, '--frame-id', 'coordinate frame of the map (%(default)s)', default='map')
+    option(place, '--scale METRES', 'length of a unit of the file in metres (%(default)s)',
            positive, 1.0)
     option(place, '--transform V', "x y z [m] qx qy qz qw of the file's coordinate frame in the "
            "map's", finite, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), nargs=7)
-    option(place, '--errors METRES DEGREES', 'how far landmarks are off on each axis, each on its '
-           'own and all together, where the file has no position_sigma (0.05 1)', positive,
+    option(place, '--errors METRES DEGREES', 'errors of the landmarks on each axis, both '
+           'independent and shared, if the file has no position_sigma (0.05 1)', positive,
            _ERRORS)
     refit = parser.add_argument_group('fit to a recording')
     option(refit, '--refit NPZ', 'fit each landmark to the boxes of these observations')
-    option(refit, '--keep-unsupported', 'keep landmarks that cannot be fitted, where the file has '
-           'them')
+    option(refit, '--keep-unsupported', 'keep landmarks that cannot be fitted, as they are in the '
+           'file')
     return parser
 
 
 def import_map(options: argparse.Namespace) -> int:
-    """Import as the command line asks; return the exit code."""
-    # Late, so that --help is fast.
+    """Import the map that the command line names; return the exit code."""
+    # Imported late, so that --help is fast.
     from cliploc_ros.core.keyframes.layer import layer_path, removed_layer
     from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.files.storage import write_text
@@ -95,7 +95,7 @@ def import_map(options: argparse.Namespace) -> int:
         raise DatasetError(f'{options.input}: {error}') from error
     result = refit(imported, options.refit, options.keep_unsupported) if options.refit else (
         imported._replace(notes=(
-            f'{len(imported.landmark_map)} landmarks as the file has them',
+            f'{len(imported.landmark_map)} landmarks, not fitted to a recording',
             *(f'note: {note}' for note in imported.notes),
             'note: maps of other systems localize better after --refit OBSERVATIONS')))
     of_map_before = recording_path(options.out), layer_path(options.out)
@@ -108,11 +108,11 @@ def import_map(options: argparse.Namespace) -> int:
     if options.report is not None:
         write_text(options.report, json.dumps({
             'landmarks': len(result.landmark_map), 'lines': result.notes,
-            'left_out': [one._asdict() for one in result.left_out]}, indent=1))
+            'left_out': [left_out._asdict() for left_out in result.left_out]}, indent=1))
     print('\n'.join(printable(line) for line in result.notes))
     print(f'left out: {len(result.left_out)}')
-    for one in result.left_out[:_LEFT_OUT_SHOWN]:
-        print(printable(f'  {one.landmark_id}: {one.reason}'))
+    for left_out in result.left_out[:_LEFT_OUT_SHOWN]:
+        print(printable(f'  {left_out.landmark_id}: {left_out.reason}'))
     if len(result.left_out) > _LEFT_OUT_SHOWN:
         print(f'  and {len(result.left_out) - _LEFT_OUT_SHOWN} more: see --report')
     print(f'wrote {options.out} with {len(result.landmark_map)} landmarks in '
@@ -121,7 +121,7 @@ def import_map(options: argparse.Namespace) -> int:
 
 
 def _check_paths(options: argparse.Namespace) -> None:
-    """Refuse outputs that cannot be written, or are an input, before the work is done."""
+    """Refuse outputs that cannot be written, or are also inputs, before any work is done."""
     for name in ('out', 'report'):
         path = getattr(options, name)
         if path is None:
@@ -133,7 +133,7 @@ def _check_paths(options: argparse.Namespace) -> None:
 
 
 def _read(options: argparse.Namespace) -> 'GivenMap':
-    """Return the content of the input."""
+    """Read the input file in its format."""
     from cliploc_ros.offline.datasets.map_formats import given_map
     from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The layer of keyframes next to a map: the options that write it, and those that read it."""
+"""The layer of keyframes next to a map: options to write it and to read it."""
 
 import argparse
 from pathlib import Path
@@ -23,21 +23,21 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the layer to a parser."""
     group = parser.add_argument_group('keyframes next to the map')
     option(group, '--keyframe-layer', 'write NAME.keyframes.npz: local features of the images of '
-           '--keyframes, with their places from depth or triangulated (default: where the source '
-           'has images, and a layer can be made of them)', action=argparse.BooleanOptionalAction)
-    option(group, '--keyframe-points N', 'the most points of a keyframe, 146 bytes each, or 82 '
-           'with xfeat (%(default)s)', positive_int, _DEFAULT_POINTS)
-    option(group, '--keyframe-features', 'what finds the features of the keyframes, and later '
-           'those of the images to localize; xfeat is a network of 2.7 MB, which is downloaded '
-           'once (%(default)s)', default=SIFT, choices=FEATURES)
+           '--keyframes, with 3D points from depth or triangulation (default: if the source has '
+           'images that suffice for a layer)', action=argparse.BooleanOptionalAction)
+    option(group, '--keyframe-points N', 'greatest number of points of a keyframe, 146 bytes '
+           'each, or 82 with xfeat (%(default)s)', positive_int, _DEFAULT_POINTS)
+    option(group, '--keyframe-features', 'kind of features of the keyframes, and later of the '
+           'images to localize; xfeat is a network of 2.7 MB, which is downloaded once '
+           '(%(default)s)', default=SIFT, choices=FEATURES)
     option(group, '--keyframe-images', 'also store small images of the keyframes, for the debug '
-           'image: anyone who has the file sees the place')
+           'image: anyone who has the file can see the place')
 
 
 def check_layer_options(options: argparse.Namespace) -> None:
-    """Refuse a layer that cannot be made, before the work is done.
+    """Refuse a layer that cannot be made, before any work is done.
 
-    OptionsError: the message names the options that do not go together. ModelError: the network of
+    OptionsError: the message names the conflicting options. ModelError: the network of
     the features is missing.
     """
     problem = _problem(options)
@@ -52,7 +52,7 @@ def check_layer_options(options: argparse.Namespace) -> None:
 
 
 def _problem(options: argparse.Namespace) -> str:
-    """Return the option that leaves no keyframes, and what to do; '' if there is none."""
+    """Return the option that prevents keyframes, and what to do; '' if there is none."""
     for name in ('observations', 'update'):
         if getattr(options, name) is not None:
             return (f'--{name}: keyframes need the images of the recording that the map is built '
@@ -65,9 +65,9 @@ def _problem(options: argparse.Namespace) -> str:
 
 def make_layer(options: argparse.Namespace, frames: 'Frames | None', landmark_map: 'LandmarkMap'
                ) -> 'tuple[KeyframeLayer | None, str]':
-    """Return the layer of a map, and a note where there is none though nobody declined it.
+    """Return the layer of a map, and a note if there is none although it was not declined.
 
-    MappingError: a layer is asked for, and the images give none.
+    MappingError: a layer was requested, but cannot be made from the images.
     """
     from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 
@@ -75,7 +75,7 @@ def make_layer(options: argparse.Namespace, frames: 'Frames | None', landmark_ma
         return None, ''
     if problem := _problem(options):
         return None, f'no keyframes with {problem}'
-    assert frames is not None  # only --observations has none
+    assert frames is not None  # only --observations comes without images
     distance_m, angle_deg = options.keyframes
     try:
         return build_layer(frames, landmark_map, LayerOptions(
@@ -103,10 +103,10 @@ def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:
 
 def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
                ) -> 'KeyframeLayer | None':
-    """Return the layer next to a map; None if there is none, or none is wanted.
+    """Return the layer next to a map; None if there is none, or it is not wanted.
 
-    With `wanted` None a bad layer is left out with a note, as the relocalizer does. MapError,
-    ModelError: the layer is wanted, and is missing or bad, or the network of its features is.
+    If `wanted` is None, an invalid layer is left out with a note, as in the relocalizer. MapError,
+    ModelError: the wanted layer, or the network of its features, is missing or invalid.
     """
     from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
     from cliploc_ros.models.xfeat import feature_kinds

@@ -11,7 +11,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
 
-# Options of folders only.
+# Options for folders only.
 _PLACING = ('images', 'axes', 'scale', 'known_distance')
 
 
@@ -24,12 +24,13 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
     add_reading_options(parser)
     group = parser.add_argument_group('odometry of --bag')
     odometry = group.add_mutually_exclusive_group()
-    option(odometry, '--odometry-topic TOPIC', 'of what --pose-topic or --trajectory is of: '
-           'Odometry, or another type of pose')
-    option(odometry, '--odometry-frame FRAME', 'take odometry from /tf: its coordinate frame')
+    option(odometry, '--odometry-topic TOPIC', 'odometry of the body that --pose-topic or '
+           '--trajectory describes: Odometry, or another type of pose')
+    option(odometry, '--odometry-frame FRAME', 'take odometry from /tf: the coordinate frame of '
+           'odometry')
     group = parser.add_argument_group('detector and CLIP, which run once on a recording')
-    option(group, '--keyframes METRES DEGREES', 'look at an image this far from the last one (0.1 '
-           '5; 0 0: at all)', not_negative, (0.1, 5.0))
+    option(group, '--keyframes METRES DEGREES', 'process an image this far from the last one (0.1 '
+           '5; 0 0: every image)', not_negative, (0.1, 5.0))
     add_network_options(group)
     option(group, '--conf', 'least confidence of a detection (%(default)s)', within(0.0, 1.0),
            0.25)
@@ -39,7 +40,7 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
 
 def add_folders(group: Any) -> None:
     """Add the options that name a folder of images to a group of a parser."""
-    option(group, '--tum DIR', 'a TUM RGB-D folder, no depth')
+    option(group, '--tum DIR', 'a TUM RGB-D folder, without its depth')
     option(group, '--rgbd DIR', 'a folder with depth: TUM RGB-D or 7-Scenes')
     option(group, '--folder DIR', 'a folder of any known layout, with its depth: TUM RGB-D, '
            '7-Scenes, Polycam, Record3D, Stray Scanner, ARKitScenes, HoloLens 2, transforms.json, '
@@ -54,38 +55,38 @@ def add_reading_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--pose-topic --ground-truth TOPIC', 'PoseStamped, PoseWithCovarianceStamped or '
            'Odometry')
     option(group, '--map-frame FRAME', 'take poses from /tf: the coordinate frame of the map '
-           '(map, where the bag has no /ground_truth and nothing else is named)')
+           '(map, if the bag has no /ground_truth and no other option names poses)')
     option(group, '--camera-frame FRAME', "the camera's optical coordinate frame in /tf (that of "
            'the images)')
-    option(group, '--tf TOPIC', '(/tf, or the only one under the name of a robot; the static '
-           'one is its name with _static)')
+    option(group, '--tf TOPIC', 'topic of the transforms (/tf, or the only one in a namespace; '
+           'static transforms: its name with _static)')
     option(group, '--trajectory FILE', 'take poses from a file in TUM format')
     option(group, '--mount --body-from-camera V', 'x y z qx qy qz qw of the camera (z forward) on '
-           'what the poses of a topic or file are of; 7 numbers for each of --cameras, in their '
-           'order', finite, nargs='+')
-    option(group, '--max-gap SECONDS', 'interpolate between poses at most so far apart '
+           'the body that the poses of a topic or file describe; 7 numbers for each of '
+           '--cameras, in their order', finite, nargs='+')
+    option(group, '--max-gap SECONDS', 'interpolate between poses at most this far apart '
            '(%(default)s)', not_negative, 0.5)
-    option(group, '--stamp-tolerance SECONDS', 'a pose or depth image belongs to an image at most '
-           'so far away (%(default)s)', not_negative, 0.02)
+    option(group, '--stamp-tolerance SECONDS', 'greatest difference in time between an image '
+           'and its pose or depth image (%(default)s)', not_negative, 0.02)
     group = parser.add_argument_group('poses of --folder, --colmap and --nerf')
     option(group, '--images DIR', 'where the images of --colmap or --nerf are, if not beside them')
-    option(group, '--scale METRES', 'of a unit of the poses', positive)
-    option(group, '--known-distance IMAGE_A IMAGE_B METRES', 'between the cameras of two images: '
-           'another way to say the scale')
-    option(group, '--level', 'turn z up, by the tilt of the cameras; of --bag and --observations, '
-           'too')
-    option(group, '--axes', 'what the poses are: of cameras with these axes, or inverse (the '
-           "layout's own)", choices=(
+    option(group, '--scale METRES', 'length of a unit of the poses', positive)
+    option(group, '--known-distance IMAGE_A IMAGE_B METRES', 'distance between the cameras of two '
+           'images: another way to give the scale')
+    option(group, '--level', 'turn z up, by the tilt of the cameras; also for --bag and '
+           '--observations')
+    option(group, '--axes', 'axes of the cameras that the poses describe, or of inverse poses '
+           '(those of the layout)', choices=(
                'opencv', 'opengl', 'opencv-inverse', 'opengl-inverse', 'ros'))
     group = parser.add_argument_group('images and depth of --bag and folders')
     add_topic_options(group)
     option(group, '--depth TOPIC', 'depth registered to the images of --bag')
-    option(group, '--intrinsics fr1|fr2|fr3|FILE', 'camera of TUM RGB-D and 7-Scenes, where the '
-           'folder does not say it; of --bag, a camera.json instead of camera_info')
-    option(group, '--depth-unit METRES', 'one count of a depth image (0.001; 0.0002 for TUM; 1 '
-           'for floats)', positive)
-    option(group, '--depth-intrinsics FX FY CX CY', 'of a depth camera that is not registered to '
-           'the images', finite)
+    option(group, '--intrinsics fr1|fr2|fr3|FILE', 'camera of TUM RGB-D and 7-Scenes, if the '
+           'folder does not give it; for --bag, a camera.json instead of camera_info')
+    option(group, '--depth-unit METRES', 'length of a unit of a depth image (0.001; 0.0002 for '
+           'TUM; 1 for floats)', positive)
+    option(group, '--depth-intrinsics FX FY CX CY', 'intrinsics of a depth camera that is not '
+           'registered to the images', finite)
     option(group, '--depth-baseline X Y Z', 'its origin, seen from the colour camera [m] (0 0 0)',
            finite)
 
@@ -94,23 +95,25 @@ def add_topic_options(group: Any) -> None:
     """Add the options that name the images of a bag to a parser or a group of it."""
     option(group, '--cameras NAME', 'several cameras of the recording, by the namespaces of their '
            'topics: /NAME/image, /NAME/camera_info and so on', default=[''], nargs='+')
-    option(group, '--image TOPIC', "(the recording's only colour image; /image of --cameras)")
-    option(group, '--camera-info TOPIC', '(the one beside the image)')
-    option(group, '--rectified', 'the bag has rectified images')
+    option(group, '--image TOPIC', "image topic (the recording's only colour image; /image "
+           'of --cameras)')
+    option(group, '--camera-info TOPIC', 'topic of the camera_info (the one beside the images)')
+    option(group, '--rectified', 'the images of the bag are rectified')
 
 
 def add_network_options(group: Any) -> None:
     """Add the options that name detector and CLIP to a group of a parser."""
-    option(group, '--profile', 'detector and CLIP: that of the robot, as image embeddings are of '
-           'one CLIP (%(default)s: accurate on a GPU, balanced on a CPU)', default='auto',
-           choices=PROFILE_NAMES)
+    option(group, '--profile', 'detector and CLIP: the same as on the robot, as image embeddings '
+           'are specific to a CLIP (%(default)s: accurate on a GPU, balanced on a CPU)',
+           default='auto', choices=PROFILE_NAMES)
     add_weights_options(group)
     option(group, '--device', '(%(default)s)', default='auto')
-    option(group, '--inference', '(%(default)s: OpenVINO on a CPU where it is installed)',
+    option(group, '--inference', '(%(default)s: OpenVINO on a CPU if it is installed)',
            default='auto', choices=INFERENCES)
     option(group, '--no-clip', 'run no CLIP: boxes and classes only', dest='clip',
            action='store_false')
-    option(group, '--scheduler ADDRESS', 'of a Dask cluster, instead of local processes',
+    option(group, '--scheduler ADDRESS', 'address of a Dask cluster, used instead of local '
+           'processes',
            default='')
 
 
@@ -118,8 +121,8 @@ def add_weights_options(group: Any) -> None:
     """Add the options that name the weights of detector and CLIP to a group of a parser."""
     option(group, '--model', 'a detector: ONNX file, folder or OWNER/NAME of the hub, or YOLO '
            "weights (the profile's)", default='')
-    option(group, '--detector-vocabulary NAMES', "what a YOLO-World or YOLOE looks for: 'mug, "
-           "chair', or a map (.yaml) with its classes and labels", default='')
+    option(group, '--detector-vocabulary NAMES', "classes that a YOLO-World or YOLOE detects: "
+           "'mug, chair', or a map (.yaml) with its classes and labels", default='')
     option(group, '--text-model FILE', 'text tower of that detector (downloaded once)', str, '')
     option(group, '--clip-model', "architecture of open_clip (the profile's)", default='')
     option(group, '--clip-pretrained', 'folder with ONNX files or OWNER/NAME of the hub, or a tag '
@@ -127,14 +130,14 @@ def add_weights_options(group: Any) -> None:
 
 
 def folder_of(options: argparse.Namespace) -> tuple[Path, str] | None:
-    """Return the folder that the command line names and the key of its layout; '' to find it."""
+    """Return the folder that the command line names and the key of its layout; '' to detect it."""
     named = {'tum': 'tum', 'rgbd': 'rgbd', 'folder': '', 'colmap': 'colmap', 'nerf': 'nerf'}
     return next(((getattr(options, name), key) for name, key in named.items()
                  if getattr(options, name) is not None), None)
 
 
 def check_folder_options(options: argparse.Namespace) -> None:
-    """Refuse options of folders with another source; OptionsError names them."""
+    """Refuse options of folders if the source is not a folder; OptionsError names them."""
     given = [f'--{name.replace("_", "-")}' for name in _PLACING
              if getattr(options, name) not in (None, False)]
     if given and folder_of(options) is None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Load both nodes as on the robot, answer a request, and say what it costs and what to carry."""
+"""Load both nodes as on the robot, measure a request, and list the files to copy to the robot."""
 
 import time
 from collections.abc import Iterator
@@ -30,11 +30,11 @@ from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters, map_files
 
-# A request is measured with as many boxes as a picture of a furnished room has.
+# A request is measured with this number of boxes, typical of a picture of a furnished room.
 _BOXES = 12
 _ROWS, _COLUMNS = 3, 4
 _REQUESTS = 3
-# Parameters that name files of the user, which are not copied.
+# Parameters that name the user's files, which are not in the cache.
 _FILES = ('model', 'map_file', 'keyframes_file', 'clip_model', 'clip_pretrained',
           'clip_checkpoint_path')
 
@@ -44,23 +44,23 @@ class Request:
     """The cost of one request."""
 
     stage_ms: dict[str, float]  #: Stage to its time [ms]
-    #: How many boxes the detector found, and how many the search had
+    #: Number of boxes that the detector found, and that the search used
     detected: int
     boxes: int
     reason: str  #: The verdict in words
 
 
 def prepare_nodes(picture: Path | None, cache_dir: Path | None, has_detector: bool) -> None:
-    """Prepare both nodes, whose parameters rclpy got, and print progress and costs.
+    """Prepare both nodes, with the parameters given to rclpy; print progress and cost.
 
-    CliplocError: the message names the file, parameter or download to mend.
+    CliplocError: the message names the file, parameter or download to correct.
 
     Parameters
     ----------
     picture : Path or None
         Picture for the request; None: a drawn one.
     cache_dir : Path or None
-        The folder to carry; None: that of the parameters.
+        The folder to copy to the robot; None: as the parameters say.
     has_detector : bool
         Whether the robot runs this package's detector.
     """
@@ -93,7 +93,7 @@ def read_picture(picture: Path | None) -> NDArray[np.uint8]:
     ImageError: the picture cannot be read.
     """
     if picture is None:
-        # Edges at all places, in which keyframes find as many features as they keep.
+        # Edges everywhere, so that keyframes find as many features as they keep.
         tiles = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
         return tiles.repeat(10, axis=0).repeat(10, axis=1)
     image_bgr = cv2.imread(str(picture), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -110,10 +110,10 @@ def answer(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,
     detection_ms = (time.monotonic() - start) * 1e3
     height, width = image_rgb.shape[:2]
     boxes = with_drawn_boxes(found, localizer.landmark_map, (width, height))
-    # The time does not depend on the lens: 53 degrees wide.
+    # The time does not depend on the field of view: 53 degrees.
     camera = Camera(width, height, width, width, width / 2, height / 2)
     times = StageTimes('waiting', time.monotonic())
-    # what a request costs at most
+    # the options of the most expensive request
     answered = localizer.answer(Query((Observation(camera, boxes),), (image_rgb,), None),
                                 replace(parameters.options(), crops='all'), times)
     stage_ms = {'detection': detection_ms} if detector is not None else {}
@@ -122,7 +122,7 @@ def answer(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,
 
 def with_drawn_boxes(found: Detections, landmark_map: LandmarkMap, size: tuple[int, int]
                      ) -> Detections:
-    """Return detections, and as many drawn boxes as a usual picture has more."""
+    """Add drawn boxes to detections, up to the number of boxes in a typical picture."""
     missing = range(len(found), _BOXES)
     cell = np.array(size) / (_COLUMNS, _ROWS)
     corners = np.array([divmod(number, _COLUMNS)[::-1] for number in missing]).reshape(-1, 2)
@@ -134,14 +134,14 @@ def with_drawn_boxes(found: Detections, landmark_map: LandmarkMap, size: tuple[i
 
 
 def cost_table(requests: list[Request]) -> str:
-    """Return a table of what the requests cost, by stage."""
+    """Return a table of the cost of the requests, by stage."""
     first, last = requests[0], requests[-1]
     drawn = last.boxes - last.detected
-    lines = [f'what a request costs here, with {last.boxes} boxes'
-             + (f' ({drawn} of them drawn to measure with)' if drawn else ''),
+    lines = [f'cost of a request on this machine, with {last.boxes} boxes'
+             + (f' ({drawn} of them drawn for the measurement)' if drawn else ''),
              f'{"stage":<12} {"first ms":>9} {"later ms":>9}']
     rows = [(stage, first.stage_ms[stage],
-             float(np.median([each.stage_ms[stage] for each in requests[1:]])))
+             float(np.median([request.stage_ms[stage] for request in requests[1:]])))
             for stage in last.stage_ms if stage != 'waiting']
     rows.append(('in all', sum(row[1] for row in rows), sum(row[2] for row in rows)))
     lines += [f'{stage:<12} {once:>9.0f} {later:>9.0f}' for stage, once, later in rows]
@@ -150,26 +150,26 @@ def cost_table(requests: list[Request]) -> str:
 
 
 def carrying(cache_dir: Path, used: list[CommonParameters]) -> list[str]:
-    """Return instructions for a folder to carry, in lines."""
+    """Return instructions for copying a folder to the robot, in lines."""
     size = sum(file.stat().st_size for file in cache_dir.rglob('*') if file.is_file()
                and not file.is_symlink())
-    lines = [f'carry {cache_dir} ({size / 1e6:.0f} MB) to the robot, and set cache_dir to its '
+    lines = [f'copy {cache_dir} ({size / 1e6:.0f} MB) to the robot, and set cache_dir to its '
              'path there',
              f"its kernels are for processors like this one ('{get_host_cpu_name()}'); another "
              'one compiles them at its first start']
-    names = {getattr(one, name, '') for one in used for name in _FILES} - {''}
-    maps = {name for one in used if isinstance(one, RelocalizerParameters)
-            for name in map_files(one)}
+    names = {getattr(parameters, name, '') for parameters in used for name in _FILES} - {''}
+    maps = {name for parameters in used if isinstance(parameters, RelocalizerParameters)
+            for name in map_files(parameters)}
     names |= maps | {str(beside(name)) for name in maps
                      for beside in (embeddings_path, layer_path)}
     files = sorted({Path(name).expanduser().absolute() for name in names})
-    return lines + [f'carry as well, for a parameter names it: {file}' for file in files
+    return lines + [f'copy this file, too, as a parameter names it: {file}' for file in files
                     if file.exists()]
 
 
 @contextmanager
 def _step(what: str) -> Iterator[None]:
-    """Print what begins, and how long it took."""
+    """Print the name of a step, and its duration."""
     start = time.monotonic()
     print(f'==> {what}', flush=True)
     yield

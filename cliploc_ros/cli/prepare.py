@@ -11,12 +11,12 @@ from cliploc_ros.command import needs_ros, option, run_main, running_ros
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 
 EPILOG = """\
-It loads what detector and relocalizer load with these parameters: networks are downloaded and
-compiled, the map's labels embedded, and kernels compiled.
-It answers a request for one picture, and prints what that costs on this machine.
+It loads everything that detector and relocalizer load with these parameters: it downloads and
+compiles networks, embeds the map's labels, and compiles kernels.
+It answers a request for one picture, and prints its cost on this machine.
 
-With --cache-dir, what was downloaded and computed lies in a folder. Copy it to a robot, and set
-its parameter cache_dir to the copy.
+With --cache-dir, everything that was downloaded and computed is in one folder. Copy it to a robot,
+and set its parameter cache_dir to the copy.
 
 examples:
   prepare --params-file robot.yaml
@@ -41,16 +41,16 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--image FILE', "picture of the robot's camera for the request (default: a "
            'drawn one)')
     option(parser, '--cache-dir DIR', 'keep everything in this folder, to copy it to a robot '
-           '(default: where the parameters say)')
-    option(parser, '--without-detector', 'the robot has a detector of its own: load no YOLO, and '
-           'draw boxes instead')
+           '(default: as the parameters say)')
+    option(parser, '--without-detector', 'the robot has another detector: load no YOLO, and draw '
+           'boxes instead')
     return parser
 
 
 def prepare(options: argparse.Namespace) -> int:
     """Load both nodes as they start on the robot, and answer a request; return the exit code.
 
-    CliplocError: the message names the file, parameter or download to mend.
+    CliplocError: the message names the file, parameter or download to correct.
     """
     for file in options.params_file:
         read_parameter_file(file)  # its messages name the line
@@ -60,11 +60,11 @@ def prepare(options: argparse.Namespace) -> int:
     if options.cache_dir is not None:
         options.cache_dir = options.cache_dir.expanduser().absolute()
         arguments += ['-p', f'cache_dir:={options.cache_dir}']
-        # Weights in the hub's own cache would be found here, and missing on the robot.
+        # Weights in the hub's default cache would be found here, but be missing on the robot.
         os.environ['HF_HUB_CACHE'] = str(options.cache_dir / 'weights')
-    # As the nodes run, see run_node; PyTorch reads it when it is loaded.
+    # As in run_node, which runs the nodes; PyTorch reads the variable when it is loaded.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
-    # The nodes here must not meet those of a running robot.
+    # The nodes here must not communicate with those of a running robot.
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
     os.environ.pop('ROS_LOCALHOST_ONLY', None)
     with needs_ros('prepare'):

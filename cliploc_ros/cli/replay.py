@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``replay``: publish a recording where no ``ros2 bag`` is installed."""
+"""The executable ``replay``: publish a recording without ``ros2 bag``."""
 
 import argparse
 import signal
@@ -51,7 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '-l --loop', 'begin again at the end')
     option(parser, '--start-offset S', 'begin S seconds after the start of the recording',
            command.not_negative, 0.0)
-    option(parser, '--topics TOPIC', 'publish these only (default: all)', _absolute, nargs='+')
+    option(parser, '--topics TOPIC', 'publish only these (default: all)', _absolute, nargs='+')
     option(parser, '--exclude TOPIC', 'leave these out', _absolute, [], nargs='+')
     option(parser, '-m --remap OLD:=NEW', 'publish the recorded topic OLD as NEW', _remap_rule, [],
            nargs='+')
@@ -71,7 +71,7 @@ def make_parser() -> argparse.ArgumentParser:
 def replay(args: list[str], stop: command.Interruption) -> int:
     """Publish a recording until its end or until stopped; return the exit code.
 
-    CliplocError: for a recording or an option that cannot be used, or without ROS.
+    CliplocError: a recording or an option cannot be used, or ROS is missing.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def _play(player: 'Player', options: argparse.Namespace, stop: command.Interrupt
           f'at most {report.worst_lateness_s * 1000:.1f} ms late', flush=True)
     if report.unread:
         print(f'warning: {report.unread} messages that the recording lists were not found in it; '
-              'is it damaged?', file=sys.stderr)
+              'it may be damaged', file=sys.stderr)
     if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
         print(f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all messages '
               f'within {options.wait_for_all_acked:g} s', file=sys.stderr)

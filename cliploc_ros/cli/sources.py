@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read the recording that the options of a program name, see cli.options."""
+"""Read the recording that the command line names, see cli.options."""
 
 import argparse
 from dataclasses import replace
@@ -35,9 +35,10 @@ from cliploc_ros.units import NS_PER_S
 _READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
             'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
             'depth_baseline', 'intrinsics')
-# What the poses of a folder are.
+# Options that define the poses of a folder.
 _PLACING = ('axes', 'scale', 'known_distance', 'level')
-# These do, too, and came later: where they are not given, observation files of before serve.
+# Further such options that were added later: at their defaults, older observation files stay
+# valid.
 _READING_MORE = {'tf': None, 'stamp_tolerance': 0.02}
 
 
@@ -60,7 +61,7 @@ def clip_options(options: argparse.Namespace) -> ClipOptions:
 
 
 def metres_of(text: str, option: str) -> float:
-    """Return the length that an option gives; OptionsError: it is none."""
+    """Return the length that an option gives; OptionsError: it is not a length."""
     try:
         return positive(text)
     except (ValueError, argparse.ArgumentTypeError):
@@ -68,9 +69,9 @@ def metres_of(text: str, option: str) -> float:
 
 
 def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
-    """Set the topics of image and camera_info that the command line leaves open.
+    """Set the topics of image and camera_info that the command line does not name.
 
-    DatasetError: the bag has none, or several.
+    DatasetError: the bag has no such topic, or several.
     """
     if getattr(options, 'intrinsics', None) is not None:  # no camera_info is needed
         options.camera_info = options.camera_info or bag_frames.BagTopics.camera_info
@@ -113,10 +114,10 @@ def read_source(options: argparse.Namespace) -> Source:
 
 def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeOptions,
                       *more: object) -> recorder.RecordingOptions:
-    """Return how detector and CLIP look at the images that the command line names.
+    """Return the options for running detector and CLIP on the images that the command line names.
 
-    All that says how a recording is read is part of it, with more of the program: another text,
-    another observation file.
+    They include a text with all options that affect reading, and with `more` from the program.
+    Each text has its own observation file.
     """
     reading = [*(str(getattr(options, name)) for name in _READING),
                *(options.cameras if options.cameras != [''] else []), *map(str, more),
@@ -130,13 +131,13 @@ def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeO
 
 def recording_of(options: argparse.Namespace, file: Path, scale: float,
                  rotation: NDArray[np.float64]) -> MapRecording:
-    """Return the input of a map; its poses are those of a file, scaled and turned."""
+    """Return the recording of a map, whose poses are those of a file, scaled and rotated."""
     folder = folder_of(options)
     source, layout = folder or (options.bag, '')
     if options.bag is not None:
         return MapRecording(file, source, options.image, options.camera_info, options.rectified,
                             intrinsics=options.intrinsics, scale=scale, rotation=rotation.tolist())
-    # --rgbd finds its layout itself
+    # --rgbd detects its layout
     return MapRecording(file, source, layout='' if layout == 'rgbd' else layout,
                         intrinsics=options.intrinsics, images=options.images,
                         placing={} if folder is None else {
@@ -148,15 +149,15 @@ def recording_of(options: argparse.Namespace, file: Path, scale: float,
 def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str, Frames]:
     """Return the images of the source by camera, with their poses in a map, see read_cameras.
 
-    A map that was levelled or scaled has other poses than its recording; where the recording is
-    the source, they are placed as they were for the map.
+    A map that was levelled or scaled has different poses than its recording. If the source is this
+    recording, its poses are transformed as they were for the map.
     """
     built_from = load_recording(map_file)
     if built_from is None or built_from.source is None or (
             built_from.source.resolve() != source_of(options).resolve()):
         if options.bag is not None and built_from is not None and built_from.is_moved:
-            raise OptionsError(f'{map_file}: was turned or scaled by build_map, the poses of '
-                               '--bag are not; only the recording it was built from is known')
+            raise OptionsError(f'{map_file}: was levelled or scaled by build_map, the poses of '
+                               '--bag were not; give the recording that the map was built from')
         return read_cameras(options, gap_s=0.0)
     if not any(getattr(options, name) for name in _PLACING):
         for name, value in built_from.placing.items():
@@ -176,17 +177,18 @@ def source_of(options: argparse.Namespace) -> Path:
 
 
 def read_frames(options: argparse.Namespace) -> Frames:
-    """Return the images of the source, of all its cameras, see read_cameras."""
+    """Return the images of all cameras of the source, see read_cameras."""
     of_cameras = read_cameras(options)
     return of_cameras[''] if '' in of_cameras else join_frames(of_cameras)
 
 
 def read_cameras(options: argparse.Namespace, gap_s: float | None = None, *,
                  any_unit: bool = False) -> dict[str, Frames]:
-    """Return the images of the source with their poses, by the name of the camera, '' for one.
+    """Return the images of the source with their poses, by camera name, '' for a single camera.
 
-    The poses of a topic or a folder are interpolated over gaps of `gap_s` [s]; None: as those of
-    tf. Not for --observations. CliplocError: the source or the options cannot be used.
+    The poses of a topic or a folder are interpolated over gaps of `gap_s` [s]; None: of --max-gap,
+    like those of tf. Not for --observations. CliplocError: the source or the options cannot be
+    used.
     """
     mounts = _mounts(options)
     gap_ns = round((options.max_gap if gap_s is None else gap_s) * NS_PER_S)
@@ -252,7 +254,7 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
 
 def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
                     mount: NDArray[np.float64] | None, gap_ns: int) -> bag_poses.ReadPoses:
-    """Return a reader of a topic, which without a mount is the camera's own, in its namespace."""
+    """Return a reader of a topic, which is in the camera's namespace if there is no mount."""
     return bag_poses.poses_of_topic(
         topic if mount is not None else bag_frames.topic_of(camera, topic), gap_ns, mount,
         round(options.stamp_tolerance * NS_PER_S), options.tf)
@@ -260,13 +262,13 @@ def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
 
 def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
                 gap_ns: int) -> bag_poses.ReadPoses:
-    """Return a reader of the poses of a camera of a bag; the gap [ns] is that of a topic."""
+    """Return a reader of the poses of a camera of a bag; gap_ns is for poses of a topic."""
     given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
              if getattr(options, name) is not None]
     max_gap_ns = round(options.max_gap * NS_PER_S)
     if len(given) > 1:
-        raise OptionsError(f'{", ".join("--" + name.replace("_", "-") for name in given)}: poses '
-                           'come from one of them')
+        raise OptionsError(f'{", ".join("--" + name.replace("_", "-") for name in given)}: '
+                           'give only one source of poses')
     if not given:
         if mount is not None:
             raise OptionsError('--mount is for --pose-topic and --trajectory: name one of them')
@@ -283,20 +285,20 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.floa
                         tolerance_ns=round(options.stamp_tolerance * NS_PER_S))
         return lambda reader, camera_frame: poses
     if mount is not None:
-        raise OptionsError('--mount is not for --map-frame: tf knows the mount')
+        raise OptionsError('--mount is not for --map-frame: tf has the mount')
     if options.camera_frame is not None and len(options.cameras) > 1:
-        raise OptionsError('--camera-frame is of one camera: several have the frames of their '
-                           'images')
+        raise OptionsError('--camera-frame is for one camera: with several, the images name the '
+                           'frames')
     return bag_poses.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns, options.tf)
 
 
 def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
-    """Return the cameras of a bag by odometry, by name; None if none is asked for."""
+    """Return the odometry of each camera of a bag, by name; None if no option names any."""
     max_gap_ns = round(options.max_gap * NS_PER_S)
     if options.odometry_frame is None and options.odometry_topic is None:
         return None
     if options.odometry_topic is not None and options.map_frame is not None:
-        raise OptionsError('--odometry-topic needs a --mount, which --map-frame has from tf: give '
+        raise OptionsError('--odometry-topic needs a --mount, which is not for --map-frame: give '
                            '--odometry-frame')
     return {name: bag_poses.bag_odometry(
         options.bag, bag_frames.topic_of(name, options.image),

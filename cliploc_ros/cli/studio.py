@@ -31,9 +31,9 @@ examples:
   studio office.yaml --observations office.npz --images office_bag
   studio office.yaml --images tum_folder_with_ground_truth
   studio                     an empty map, to be saved as map.yaml
-  studio office.yaml --ros   with the answers of the relocalizer that runs
+  studio office.yaml --ros   with the answers of the running relocalizer
 
-Edits are kept beside the map as they are made: a studio that was killed restores them.
+Edits are saved beside the map as they are made: after a crash, the studio restores them.
 """
 
 
@@ -48,34 +48,34 @@ def make_parser() -> argparse.ArgumentParser:
         prog='studio', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Create and correct a map in the browser. Needs no sourced ROS, except for '
         '--ros.')
-    option(parser, 'map MAP', 'a map file; one that does not exist yet starts empty (map.yaml, or '
-           'the first free of map-2.yaml, map-3.yaml, ...)', nargs='?')
+    option(parser, 'map MAP', 'a map file; a new one starts empty (map.yaml, or the first unused '
+           'name of map-2.yaml, map-3.yaml, ...)', nargs='?')
     option(parser, '--observations NPZ', 'boxes and poses of a recording of the place')
-    option(parser, '--images BAG|DIR', 'a rosbag2 recording, or a folder as of build_map '
+    option(parser, '--images BAG|DIR', 'a rosbag2 recording, or a folder as for build_map '
            '--folder, with the images of the views')
     add_topic_options(parser)
     option(parser, '--clip-pretrained NAME', 'offer the five phrases that this CLIP finds best: a '
-           'folder or OWNER/NAME with ONNX files, or a tag or file of open_clip, as of build_map')
+           'folder or OWNER/NAME with ONNX files, or a tag or file of open_clip, as for build_map')
     option(parser, '--clip-model NAME', 'the architecture of a tag or file (%(default)s)')
     option(parser, '--device', 'of CLIP (%(default)s)', default='auto')
     option(parser, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--occupancy-grid FILE', 'show the walls: the YAML file of nav2_map_server, in '
            "the map's coordinate frame")
-    option(parser, '--port N', 'the next free one from this on (%(default)s)', within(0, 65535),
-           8080)
-    option(parser, '--host ADDRESS', 'listen at this address too (%(default)s: this machine only)',
+    option(parser, '--port N', 'the first port to try; if it is in use, the next free one '
+           '(%(default)s)', within(0, 65535), 8080)
+    option(parser, '--host ADDRESS', 'listen at this address (%(default)s: this machine only)',
            default=_LOOPBACK)
     option(parser, '--ros', "show the running relocalizer's last answer in the map, and let it "
            'relocalize and reload the map')
     option(parser, '--relocalizer NAME', 'its name, with its namespace (%(default)s)',
            default='/relocalizer')
-    option(parser, '--no-browser', 'print the URL only')
+    option(parser, '--no-browser', 'only print the URL')
     return parser
 
 
 def serve(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C; return the exit code."""
-    # Late, so that --help is fast.
+    # Imported late, so that --help is fast.
     from cliploc_ros.offline.mapping.tilt import tilt_note
     from cliploc_ros.offline.studio.page import serve_studio
     from cliploc_ros.offline.studio.web import once
@@ -100,7 +100,7 @@ def serve(options: argparse.Namespace) -> int:
 
 
 def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocalizer | None]':
-    """Return the running relocalizer where it is asked for; OptionsError: there is no ROS."""
+    """Return the running relocalizer if --ros is given; OptionsError: ROS is missing."""
     if not options.ros:
         return nullcontext()
     with needs_ros('--ros'):
@@ -130,7 +130,7 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     built_from = None if options.map is None else load_recording(options.map)
     if is_folder and built_from is not None and built_from.source is not None and not (
             built_from.source.samefile(options.images)):
-        built_from = None  # a folder has poses of its own
+        built_from = None  # the folder has different poses
     if options.observations is not None:
         detections = load_observations(options.observations)
     elif built_from is not None:
@@ -146,7 +146,7 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
         detections = views_of_folder(options.images)
     recording = None if detections is None else Recording(detections, images)
     finder = _phrase_finder(options, recording)
-    # a new map gets the first name that no map has
+    # a new map gets the first unused name
     names = itertools.chain(['map.yaml'], (f'map-{number}.yaml' for number in itertools.count(2)))
     document = Document(options.map or next(
         path for path in map(Path, names) if not path.exists()))
@@ -174,8 +174,8 @@ def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None'
 
     if options.clip_pretrained is None:
         if options.clip_model is not None or options.vocabulary is not None:
-            raise OptionsError('--clip-model and --vocabulary are for a CLIP: give '
-                               '--clip-pretrained, too')
+            raise OptionsError('--clip-model and --vocabulary are for a CLIP: also give '
+                               '--clip-pretrained')
         return None
     clip = ClipOptions(model=options.clip_model or ClipOptions.model,
                        pretrained=options.clip_pretrained, device=options.device)

@@ -39,10 +39,10 @@ def make_parser() -> argparse.ArgumentParser:
         'nodes, without depth. Needs no sourced ROS.')
     option(parser, 'folder', 'the folder', Path)
     option(parser, 'output', 'folder of the recording; must not exist', Path)
-    option(parser, '--every N', 'take every N-th image only (default: 1)', positive_int, 1)
+    option(parser, '--every N', 'take only every N-th image (default: 1)', positive_int, 1)
     option(parser, '--detections FILE', 'also write these recorded detections (JSON)')
     option(parser, '--intrinsics fr1|fr2|fr3|FILE', "the dataset's camera, or a camera.json "
-           "(default: the folder's camera.json, else the camera in the folder's name)")
+           "(default: the folder's camera.json, otherwise the camera in the folder's name)")
     option(parser, '--storage', 'default: %(default)s', default='sqlite3', choices=list(STORAGES))
     images = parser.add_mutually_exclusive_group()
     option(images, '--raw', 'write decoded images (the default)', default='raw',
@@ -56,8 +56,8 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def convert(options: argparse.Namespace) -> int:
-    """Convert, and print what was written and how many images lack something."""
-    # Late, so that --help is fast.
+    """Convert a folder; print what was written, and how many images have no pose or detections."""
+    # Imported late, so that --help is fast.
     from tqdm import tqdm
 
     from cliploc_ros.offline.datasets import tum_conversion

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``wake_up``: request the pose until it is accepted, turning between looks."""
+"""The executable ``wake_up``: request the pose until it is accepted, turning between requests."""
 
 import argparse
 import signal
@@ -36,16 +36,16 @@ def make_parser() -> argparse.ArgumentParser:
         prog='wake_up', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         usage='wake_up [options] [--ros-args ...]',
         description='Wait for an active relocalizer, its camera and a localizer; then request '
-        "the pose, and turn with Nav2's action spin between looks, until a pose is accepted.")
+        "the pose until one is accepted, turning with Nav2's action spin between requests.")
     option(parser, '--relocalizer NAME', 'its name, in the namespace of this node or absolute '
            '(%(default)s)', default='relocalizer')
-    option(parser, '--timeout S', 'begin no turn after S seconds (%(default)g)', command.positive,
-           60.0)
-    option(parser, '--turn-deg DEG', 'turn counterclockwise by this much between looks; 0: never '
-           '(%(default)g)', command.within(-180.0, 180.0), 45.0)
-    option(parser, '--watch', 'go on: wake up again whenever the relocalizer, which has to watch, '
-           'finds the robot lost and at rest', default='false', nargs='?',
-           choices=('true', 'false'), const='true')
+    option(parser, '--timeout S', 'start no more turns after S seconds (%(default)g)',
+           command.positive, 60.0)
+    option(parser, '--turn-deg DEG', 'turn counterclockwise by this angle between requests; 0: '
+           'never (%(default)g)', command.within(-180.0, 180.0), 45.0)
+    option(parser, '--watch', 'keep running: wake up again whenever the relocalizer, whose '
+           'parameter watch has to be set, finds the robot lost and at rest', default='false',
+           nargs='?', choices=('true', 'false'), const='true')
     return parser
 
 
@@ -53,7 +53,7 @@ def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: comma
             ) -> int:
     """Wake the robot up with the options of the command line; return the exit code.
 
-    OptionsError: there is no ROS, or it does not start with these arguments.
+    OptionsError: ROS is missing, or does not start with these arguments.
     """
     with command.needs_ros('wake_up'):
         from cliploc_ros.ros.running import check_name

@@ -149,4 +149,4 @@ def test_a_levelled_map_is_evaluated_on_the_bag_that_made_it(tmp_path, capsys):
     assert len(errors) >= 15 and max(errors) < 0.1
     capsys.readouterr()
     assert run(evaluate, '--bag', other, *asked) == 1
-    assert 'was turned or scaled' in capsys.readouterr().err
+    assert 'was levelled or scaled' in capsys.readouterr().err

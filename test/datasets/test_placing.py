@@ -76,7 +76,7 @@ def test_levelled_by_the_tilt_of_the_cameras(angles_deg, shots, tmp_path):
     plain = read_folder(folder, FolderOptions(scale=1.0))
     up = world[:3, 2]
     tilt_deg = np.degrees(np.arccos(up[2]))
-    assert any('--level turns it up' in note for note in plain.notes) == (tilt_deg > 5.0 + 1.0)
+    assert any('--level corrects it' in note for note in plain.notes) == (tilt_deg > 5.0 + 1.0)
     frames = read_folder(folder, FolderOptions(scale=1.0, level=True))
     note, = (note for note in frames.notes if note.startswith('levelled'))
     found_deg = float(note.split(' was ')[1].split()[0])

@@ -249,7 +249,7 @@ def test_a_slip_is_left_out_and_one_that_the_poses_hide_does_little_harm(
         truth, linked, without, way_m, pairs, share):
     built = build_map(moved_odometry(linked, lambda poses: slip(poses, way_m)), OPTIONS)
     assert joined(built) == pairs
-    assert any('jumps 1 times' in note for note in built.report.notes) == (pairs == 118)
+    assert any('jumps left out: 1' in note for note in built.report.notes) == (pairs == 118)
     assert pose_error_m(built, truth) < share * pose_error_m(without, truth)
 
 

@@ -79,13 +79,13 @@ def content(folder):
 def test_prepare_shows_progress_and_costs(prepared, robot):
     folder, output = prepared
     for text in ('==> detector: weights and network', '==> relocalizer: map', 'done after',
-                 'what a request costs here', 'the verdict on this picture: ',
+                 'cost of a request on this machine', 'the verdict on this picture: ',
                  'need neither network nor compiler', f'carry {folder}'):
         assert text in output
     stages = [line.split()[0] for line in output.splitlines() if len(line.split()) == 3]
     assert set(stages[-3:]) == {'detection', 'CLIP', 'search'}
     for file in (*map(robot.with_name, WEIGHTS), Path(ASSETS) / 'map.yaml'):
-        assert f'carry as well, for a parameter names it: {file}' in output
+        assert f'copy this file, too, as a parameter names it: {file}' in output
     assert len(list((folder / 'openvino').iterdir())) == 3
 
 

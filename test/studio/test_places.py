@@ -68,7 +68,8 @@ def test_positions_that_only_keyframes_reach_are_told_apart(studio):
     objects = count - len(lost)
     assert len(lost) > 1
     assert without.figures[figure] == (
-        f'by objects {objects}, only by keyframes 0, not at all {len(lost)} of {count} positions')
+        f'{count} positions: {objects} localized by objects, 0 by keyframes only, '
+        f'{len(lost)} not localized')
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     poses = np.array([make_transform(
         Rotation.from_euler('z', angle, degrees=True).as_matrix() @ level, place)
@@ -76,7 +77,8 @@ def test_positions_that_only_keyframes_reach_are_told_apart(studio):
     layer = replace(make_layer(map_of(landmarks), len(poses), points=1), map_from_camera=poses)
     found = find_places(landmarks, None, None, silent, layer=layer)
     assert found.figures[figure] == (
-        f'by objects {objects}, only by keyframes {len(lost)}, not at all 0 of {count} positions')
+        f'{count} positions: {objects} localized by objects, {len(lost)} by keyframes only, '
+        '0 not localized')
     was, now = tile_colors(without), tile_colors(found)
     is_lost = (without.check.accepted == 0) & (without.check.misled == 0)
     assert (was[~is_lost] == now[~is_lost]).all()

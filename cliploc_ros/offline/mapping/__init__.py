@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mapping: from posed detections to landmarks and a report. No ROS, no torch, no files.
 
-The modules here build a map (``building``) or fit a given one (``refit``); ``check`` says how good
-a map is, ``update`` brings it up to date.
+``building`` builds a map and ``refit`` fits a given one. ``check`` judges a map, and ``update``
+updates it with a new recording.
 
-Throughout, ``shown`` (n,) has the row of the landmark that each of n boxes shows, -1 for none.
+Throughout, ``shown`` (n,) is the row of the landmark that each of n boxes shows, -1 for none.
 """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which box shows which landmark: one to one in every frame, by greatest overlap in sum."""
+"""Associate boxes with landmarks: one to one in every frame, with the greatest total overlap."""
 
 from math import sqrt
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from cliploc_ros.offline.mapping.views import Views
 #: A box and a landmark that overlap less do not belong together.
 ASSOCIATION_IOU = 0.2
 _GROUP_SIZE = 8
-# Rounding must not hide a landmark [m].
+# Tolerance, so that rounding does not exclude a landmark [m].
 _SLACK = 1e-6
 
 
@@ -31,7 +31,7 @@ class Overlaps(NamedTuple):
 
 
 def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float) -> Overlaps:
-    """Return the pairs that overlap more than min_iou, by each class of a landmark."""
+    """Return the pairs that overlap by more than min_iou, for each class of a landmark."""
     classes = int(max(views.classes.max(initial=0), landmarks.names[:, 1].max(initial=0))) + 1
     boxes, numbers, ious = _overlaps(views, landmarks.centers, landmarks.bases,
                                      _make_groups(landmarks, classes), min_iou)
@@ -40,7 +40,7 @@ def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float) -> Overlap
 
 
 class _Groups(NamedTuple):
-    """Near landmarks of one class with a sphere about them, so that most need no projection.
+    """Groups of nearby landmarks of one class with a bounding sphere, to avoid most projections.
 
     Class k has the groups from starts[k] up to starts[k + 1], group g the landmarks
     members[offsets[g]:offsets[g + 1]]. Landmark l lies within sizes[l] of its centre.
@@ -55,7 +55,7 @@ class _Groups(NamedTuple):
 
 
 def _make_groups(landmarks: Landmarks, classes: int) -> _Groups:
-    """Return groups of landmarks; one without a class is in none."""
+    """Return groups of landmarks; landmarks without a class are in no group."""
     rows, of_names = landmarks.names.T
     order = np.lexsort((morton_codes(landmarks.centers)[rows], of_names))
     members, own = rows[order], of_names[order]
@@ -112,7 +112,7 @@ def _overlaps(views, centers, bases, groups, min_iou):
 
 @compiled
 def _may_show(views, row, center, radius):
-    """Tell whether a box may show a part of a sphere: it reaches into the pyramid of its rays."""
+    """Tell whether a box may show a part of a sphere: it reaches into the box's pyramid."""
     r, t = views.rotations[views.frames[row]], views.translations[views.frames[row]]
     z = r[2, 0] * center[0] + r[2, 1] * center[1] + r[2, 2] * center[2] + t[2]
     if z < -radius:
@@ -128,11 +128,11 @@ def _may_show(views, row, center, radius):
 
 def associate(views: Views, landmarks: Landmarks, min_iou: float = ASSOCIATION_IOU,
               among: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
-    """Return the landmark (n,), among some or all (L,), that each box shows, -1 for none.
+    """Return the landmark (n,) that each box shows, -1 for none.
 
-    In every frame a landmark has at most one box and a box at most one landmark; the sum of
-    their IoUs is the greatest possible (Hungarian method). Pairs that overlap less than min_iou
-    are not candidates.
+    In every frame a landmark has at most one box and a box at most one landmark; the sum of their
+    IoUs is the greatest possible (Hungarian method). Pairs that overlap by less than min_iou are
+    not candidates, nor are landmarks that the mask among (L,) excludes.
     """
     boxes, candidates, ious = find_overlaps(views, landmarks, min_iou)
     if among is not None:
@@ -162,7 +162,7 @@ def _is_sole(values: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 @compiled
 def ious_with(views, rows, center, basis):
-    """Return the IoU of an ellipsoid with each of some boxes; 0 where it is behind."""
+    """Return the IoU of an ellipsoid with each of some boxes; 0 if it is behind the camera."""
     ious, box = np.zeros(len(rows)), np.empty(4)
     for place in range(len(rows)):
         frame = views.frames[rows[place]]

@@ -39,24 +39,25 @@ from cliploc_ros.offline.mapping.triangulation import (
 )
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views, thin_out
 
-# Landmarks are found in windows of time that overlap: no pair of boxes is farther apart.
+# Landmarks are found in overlapping windows of time [s]; no pair of boxes is farther apart than
+# the overlap.
 _WINDOW_S, _OVERLAP_S = 90.0, 30.0
 # At most this number of frames of a viewpoint are searched for new landmarks.
 _FRAMES_PER_VIEWPOINT = 8
-# How often boxes without a landmark are searched for new ones; how often after that landmarks are
-# associated, merged and fitted.
+# Rounds in which boxes without a landmark are searched for new ones; rounds of association,
+# merging and fitting after each search.
 _DISCOVERY_ROUNDS = 2
 SETTLING_ROUNDS = 3
-# How often the map is built again with refined poses; how often poses and landmarks are refined
-# together before each of these, and after all.
+# Number of rebuilds of the map with refined poses; number of joint refinements of poses and
+# landmarks before each rebuild, and after the last one.
 _REBUILDS = 1
 REFINEMENTS = 3
 _REASONS_SHOWN = 10
-#: A map is refused that explains less of the boxes of its classes. A guess: true recordings of a
-#: few frames explain .3, poses that are off by a metre .2.
+#: A map that explains a smaller share of the boxes of its classes is refused. A guess: valid
+#: recordings of a few frames reach .3, poses that are off by a metre .2.
 LEAST_EXPLAINED = 0.2
 
-#: Told the name of a stage and the share of it that is done, 0 to 1.
+#: Called with the name of a stage and the share of it that is done, 0 to 1.
 Progress = Callable[[str, float], None]
 
 
@@ -73,7 +74,7 @@ class LeftOut:
 
 
 class NothingFoundError(MappingError):
-    """The boxes show no landmark that is good enough for a map, but perhaps some that are not."""
+    """No landmark is good enough for a map; left_out has those that were found."""
 
     def __init__(self, message: str, left_out: tuple[LeftOut, ...]):
         super().__init__(message)
@@ -81,17 +82,17 @@ class NothingFoundError(MappingError):
 
 
 def rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Return a centre to the millimetre, for reports."""
+    """Round a centre to millimetres, for reports."""
     x, y, z = center.round(3).tolist()
     return x, y, z
 
 
 def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
-    """Return the landmarks that are left out, as text."""
+    """Describe the landmarks that are left out, in lines."""
     rows = [f'left out: {len(left_out)}'] if left_out else []
-    rows += [f'  {one.class_id} at {one.center[0]:.2f} {one.center[1]:.2f} '
-             f'{one.center[2]:.2f} with {one.support} frames: {one.reason}'
-             for one in left_out[:_REASONS_SHOWN]]
+    rows += [f'  {landmark.class_id} at {landmark.center[0]:.2f} {landmark.center[1]:.2f} '
+             f'{landmark.center[2]:.2f} with {landmark.support} frames: {landmark.reason}'
+             for landmark in left_out[:_REASONS_SHOWN]]
     if len(left_out) > _REASONS_SHOWN:
         rows.append(f'  and {len(left_out) - _REASONS_SHOWN} more')
     return rows
@@ -99,7 +100,7 @@ def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
 
 @dataclass(frozen=True)
 class MappingReport:
-    """The result of mapping in numbers and words: what it found, what it left out and why."""
+    """The result of mapping: figures, the landmarks left out, and notes."""
 
     frames: int
     viewpoints: int
@@ -107,15 +108,15 @@ class MappingReport:
     landmarks: int
     #: Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3
     explained: float
-    #: Of these boxes. Both are measured on the frames that the map was fitted to.
+    #: Median IoU of these boxes. Both are measured on the frames that the map was fitted to.
     median_iou: float
-    #: The share of the boxes of the classes that are in the map, as import_map measures it
+    #: The explained share of the boxes of classes in the map, measured as in import_map
     explained_of_classes: float
     #: Root mean square by which joint refinement moved the poses
     pose_change_m: float
     pose_change_deg: float
-    left_out: tuple[LeftOut, ...]  #: The one with the greatest support first
-    notes: tuple[str, ...]  #: What is wrong with the input, and what to do about it
+    left_out: tuple[LeftOut, ...]  #: The landmarks with the greatest support first
+    notes: tuple[str, ...]  #: Problems with the input, and what to do about them
 
     @staticmethod
     def of_nothing(detections: PosedDetections, error: MappingError) -> 'MappingReport':
@@ -152,15 +153,15 @@ class BuiltMap:
     landmark_map: LandmarkMap
     report: MappingReport
     shown: NDArray[np.int64]  #: (n,): row of the landmark that each box shows, -1 for none
-    map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses, refined where that was asked for
-    mount: MountCorrection | None = None  #: Where a correction was asked for
+    map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses, refined if requested
+    mount: MountCorrection | None = None  #: With refine_mount only
 
 
 def build_map(detections: PosedDetections, options: MappingOptions | None = None,
               progress: Progress | None = None) -> BuiltMap:
     """Build a map from posed detections.
 
-    MappingError: no map can be made of this input; the message says what to correct.
+    MappingError: no map can be made from this input; the message says what to correct.
     """
     options = options or MappingOptions()
     if options.refine_mount and len(detections.cameras) > 1:
@@ -172,7 +173,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     notes = check_input(detections, given, options.min_viewpoints)
     draft = builder.draft(given)
     if detections.depths is not None:
-        # the draft of boxes alone tells the scale of depth
+        # the draft from boxes alone gives the scale of depth
         given, depth_notes = scaled_depths(given, detections, draft.landmarks, draft.shown)
         notes += depth_notes
         builder = builder._replace(options=options_with_depth(options))
@@ -192,21 +193,21 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
         odometry = None if odometry is None else odometry @ mount.given_from_corrected
     views, draft, errors, pose_notes = builder.with_poses(given, odometry, draft)
     builder.tell('done', 1.0)
-    left_out = tuple(sorted(draft.left_out, key=lambda one: -one.support))
+    left_out = tuple(sorted(draft.left_out, key=lambda landmark: -landmark.support))
     moving = Counter(name for name in np.array(detections.class_names)[detections.classes].tolist()
                      if options.moves(name))
     if moving:
-        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are not landmarks: '
-                     'they move')
+        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are not landmarks, '
+                     'as these classes move')
     if len(draft.landmarks.centers) == 0:
-        why = ('no boxes of one class meet in space; check that poses and stamps belong to these '
-               'images, that the poses are of the camera (z forward), and the intrinsics')
+        why = ('boxes of one class do not meet in space; check that poses and stamps belong to '
+               'these images, that the poses are of the camera (z forward), and the intrinsics')
         if draft.left_out:
-            kinds = Counter(one.reason.partition(':')[0] for one in draft.left_out)
+            kinds = Counter(landmark.reason.partition(':')[0] for landmark in draft.left_out)
             counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
             why = (f'no landmark is good enough for a map; {len(left_out)} were left out '
-                   f'({counts}), the first one because: {draft.left_out[0].reason}. Record while '
-                   'the camera moves past the objects, not only turns, or map images with depth')
+                   f'({counts}); for the first one: {draft.left_out[0].reason}. Move the camera '
+                   'past the objects instead of only turning it, or map images with depth')
         raise NothingFoundError(why, left_out)
     landmarks, shown = _one_of_each(views, draft.landmarks)
     quality = explained_boxes(views, landmarks, shown)
@@ -229,7 +230,7 @@ class _Draft(NamedTuple):
 
 
 class _Builder(NamedTuple):
-    """What all stages of building share."""
+    """The data that all stages of building share."""
 
     detections: PosedDetections
     options: MappingOptions
@@ -237,7 +238,7 @@ class _Builder(NamedTuple):
     tell: Progress
 
     def draft(self, views: Views) -> _Draft:
-        """Return the landmarks that the views show, for the poses that they have."""
+        """Return the landmarks that the views show, with their current poses."""
         landmarks, shown = Landmarks.none(), np.full(len(views.frames), -1, dtype=np.int64)
         for number in range(_DISCOVERY_ROUNDS):
             found = self._discover(views, shown < 0)
@@ -253,16 +254,17 @@ class _Builder(NamedTuple):
             names[row], rounded(landmarks.centers[row]),
             int(evidence.support[row]), int(evidence.viewpoints[row]), reason)
             for row, reason in enumerate(reasons) if reason is not None)
-        landmarks = landmarks.select(np.array([one is None for one in reasons], dtype=np.bool_))
-        # boxes of what is left out may belong to what stays
+        landmarks = landmarks.select(np.array([reason is None for reason in reasons],
+                                              dtype=np.bool_))
+        # boxes of landmarks that are left out may belong to the others
         landmarks = fit_landmarks(views, landmarks, associate(views, landmarks))
         return _Draft(landmarks, associate(views, landmarks), left_out)
 
     def _discover(self, views: Views, free: NDArray[np.bool_]) -> Landmarks:
-        """Return landmarks that explain the free boxes, class by class and minute by minute.
+        """Return landmarks that explain the free boxes, by class and window of time.
 
-        Landmarks that a window of time has found explain boxes of the next one, so that the work
-        grows with the length of the recording only.
+        Landmarks of one window explain boxes of the next, so that the work is proportional to the
+        length of the recording.
         """
         moving = [number for number, name in enumerate(self.detections.class_names)
                   if self.options.moves(name)]
@@ -278,7 +280,8 @@ class _Builder(NamedTuple):
                             self.options.min_viewpoints, self.rng)
                 for number in np.unique(window.classes[left]))))
         all_found = Landmarks.joined(*found)
-        # found and dropped, so that the others draw the same numbers whatever moves
+        # searched before they are dropped, so that moving_classes does not change the random
+        # numbers
         return all_found.select(~np.isin(all_found.classes, moving))
 
     def _settle(self, views: Views, landmarks: Landmarks) -> tuple[Landmarks, NDArray[np.int64]]:
@@ -298,8 +301,8 @@ class _Builder(NamedTuple):
                    ) -> tuple[Views, _Draft, PoseErrors | None, list[str]]:
         """Return the views with refined poses, the landmarks that fit them, errors, and notes.
 
-        Poses are refined where their errors are given, or estimated and significant. None: they
-        are taken as exact.
+        Poses are refined if their errors are given, or estimated and significant. Otherwise the
+        errors are None, and the poses count as exact.
         """
         views, errors, notes = given, self.options.pose_errors, list[str]()
         is_estimated = errors is None and self.options.estimate_pose_errors
@@ -315,8 +318,9 @@ class _Builder(NamedTuple):
             if odometry is not None:
                 steps, link_note = link_frames(given, odometry, errors,
                                                self.options.odometry_errors)
-            # Errors of the poses split objects in two. Poses and parts move towards each other in
-            # turns, until the parts merge.
+            # Errors of the poses split objects in two. Poses and parts are refined in turn until
+            # the
+            # parts merge.
             for _ in range(REFINEMENTS):
                 views, landmarks = refine_jointly(given, views, draft.landmarks, draft.shown,
                                                   errors, steps=steps)
@@ -325,7 +329,7 @@ class _Builder(NamedTuple):
             if number < _REBUILDS:
                 draft = self.draft(views)
                 if is_estimated:
-                    # objects that were split before tell more now
+                    # objects that were split before give a better estimate now
                     errors = estimate_pose_errors(given, draft.landmarks, draft.shown,
                                                   views) or errors
         if is_estimated:
@@ -334,7 +338,7 @@ class _Builder(NamedTuple):
 
     def map_of(self, landmarks: Landmarks, shown: NDArray[np.int64], given: Views, views: Views,
                errors: PoseErrors | None) -> LandmarkMap:
-        """Return the map of landmarks, with labels that are the class names."""
+        """Return the map of the landmarks, labelled with their class names."""
         count = len(landmarks.centers)
         evidence = gather_evidence(views, landmarks, shown)
         evidence = evidence._replace(position_sigma=np.hypot(
@@ -355,7 +359,7 @@ class _Builder(NamedTuple):
 
 
 def _windows(stamps_s: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Return the first frame of each window of time, and the one after its last."""
+    """Return the first frame of each window of time, and the frame after its last."""
     windows, begin_s = [], stamps_s[0]
     while True:
         first, last = np.searchsorted(stamps_s, [begin_s, begin_s + _WINDOW_S])
@@ -368,7 +372,7 @@ def _windows(stamps_s: NDArray[np.float64]) -> list[tuple[int, int]]:
 
 def _keep(landmarks: Landmarks, into: NDArray[np.int64], shown: NDArray[np.int64]
           ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return the landmarks that are not part of another, and the landmark of each box."""
+    """Return the landmarks that are not merged into another, and the landmark of each box."""
     is_kept = into == np.arange(len(into))
     numbers = np.append((np.cumsum(is_kept) - 1)[into], -1)
     return landmarks.select(is_kept), numbers[shown]

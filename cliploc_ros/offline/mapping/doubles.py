@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which landmarks are one thing: the one criterion of building, refitting, updating and checking.
+"""Decide whether two landmarks are the same object.
 
-Landmarks that stand in one another are one thing, whatever their classes, unless the images show
-two. A detector calls one thing by several names, in different images or in one, and finds parts of
-it: boxes that lie on one another show one thing, and so does a box within another one, unless it
-is small and there most of the time, as that of a cup on a table.
+Building, refitting, updating and checking share this criterion. Overlapping landmarks are the same
+object, whatever their classes, unless the images show two objects. A detector may give one object
+several names, in different images or in the same one, and detect parts of it. Therefore boxes
+that overlap well show the same object, and so does a box within another one, unless it is small
+and usually present, like that of a cup on a table.
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,23 +23,24 @@ from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
 from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.offline.mapping.views import Views
 
-# Two boxes of one image show one thing if their IoU is above the first number. One is within the
-# other if it shares more than the second number of its area. Below the third number of the other's
-# area it is a part, or a thing on it; below the fourth it is a thing.
+# Two boxes of one image show the same object if their IoU is above the first number. A box is
+# within another one if more than the second share of its area is. Below the third share of the
+# other's area, it is a part or a separate object on it; below the fourth, it is a separate object.
 _ONE_BOX_IOU, _WITHIN_SHARE, _PART_SHARE, _THING_SHARE = 0.5, 0.8, 0.3, 1 / 16
-# Two classes of one thing are hardly ever detected in the same image. Two things are: in at least
-# the first share of the number of images that independent detections predict, or in at least the
-# second share of the images that show the less frequent of the two.
+# Two classes of one object are hardly ever detected in the same image. Two objects are: in at
+# least the first share of the number of images that independent detections predict, or in at least
+# the second share of the images that show the less frequent of the two.
 _LEAST_LIFT, _LEAST_SHARE = 1 / 3, 0.15
-# A part has a box of its own at times, a thing on another one in this share of the images of both.
-# All are guesses, between the doubles and the neighbours of four rooms and TUM fr3.
+# A part sometimes has a separate box; an object on another one has one in at least this share of
+# the images of both. All values are guesses that separate the doubles from the neighbours of four
+# rooms and TUM fr3.
 _LEAST_STEADY = 0.3
-# Landmarks of one thing are fitted together, unless the mean IoU of their boxes falls by more.
+# Landmarks of one object are fitted together, unless the mean IoU of their boxes drops by more.
 _MERGE_LOSS = 0.1
 
 
 def close_pairs(landmarks: Landmarks) -> list[tuple[int, int, float]]:
-    """Return the pairs that stand in one another with the normalized distance, nearest first."""
+    """Return the pairs of overlapping landmarks and their normalized distances, nearest first."""
     if len(landmarks.centers) < 2:
         return []
     reach = np.linalg.norm(landmarks.bases, axis=(1, 2))
@@ -58,7 +60,7 @@ def close_pairs(landmarks: Landmarks) -> list[tuple[int, int, float]]:
 
 
 class Relation(Enum):
-    """What the images show of two landmarks that stand in one another."""
+    """Evidence of the images on two overlapping landmarks."""
 
     TWO = 'two things at once'
     PART = 'boxes of different extent, seldom at once: one is a part of the other'
@@ -67,7 +69,7 @@ class Relation(Enum):
 
 def relation(views: Views, landmarks: Landmarks, rows_of: Sequence[NDArray[np.int64]],
              pair: tuple[int, int]) -> Relation:
-    """Return the images' evidence about two landmarks, by the boxes of each."""
+    """Return the evidence of the images on two landmarks, by the boxes of each."""
     first, second = (rows_of[number] for number in pair)
     common, *places = np.intersect1d(views.frames[first], views.frames[second],
                                      return_indices=True)
@@ -79,7 +81,7 @@ def relation(views: Views, landmarks: Landmarks, rows_of: Sequence[NDArray[np.in
     small, large = np.sort((boxes[..., 2:] - boxes[..., :2]).prod(axis=2), axis=0)
     is_one = shared > _ONE_BOX_IOU * (small + large - shared)
     is_within = ~is_one & (shared > _WITHIN_SHARE * small) & (small > _THING_SHARE * large)
-    # frames of one viewpoint err alike
+    # the errors of frames of one viewpoint are correlated
     together = views.weights[common]
     one, within, beside = (together @ mask for mask in (is_one, is_within, ~is_one & ~is_within))
     small_within = together @ (is_within & (small < _PART_SHARE * large))
@@ -96,8 +98,8 @@ def _rates_in_view(views: Views, landmarks: Landmarks, rows_of: Sequence[NDArray
                    pair: tuple[int, int]) -> tuple[NDArray[np.float64], float]:
     """Return the weight of the frames with a box of each of two landmarks (2,), and of all.
 
-    Of the frames with both of their places in view: those that have a box, or should have one by
-    those that have one.
+    Only frames with both places in view count. A place is in view if it has a box, or should have
+    one, given the distances at which it was detected.
     """
     cameras = views.centers
     seen, in_view = np.zeros((2, len(cameras)), dtype=np.bool_), []
@@ -113,9 +115,9 @@ def _rates_in_view(views: Views, landmarks: Landmarks, rows_of: Sequence[NDArray
 
 def find_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
                  ) -> list[tuple[int, int]]:
-    """Return the pairs that are one thing, the nearest first.
+    """Return the pairs of landmarks that are the same object, nearest first.
 
-    Of two landmarks without a box the images tell nothing.
+    Pairs without any box are left out, as the images contain no evidence on them.
     """
     rows_of = group_boxes(shown, len(landmarks.centers))
     return [(first, second) for first, second, _ in close_pairs(landmarks)
@@ -126,10 +128,11 @@ def find_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 def resolve_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                     chosen: NDArray[np.bool_] | None = None
                     ) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Return all landmarks, and the one (L,) that each of the chosen is one thing with.
+    """Return all landmarks, and the landmark (L,) that each of the chosen is merged into.
 
-    Those whose boxes fit one ellipsoid are fitted together. Of others, the landmark with more
-    boxes, weighted by their IoU, stays as it is: the other is a part of it, or a wrong find.
+    Landmarks whose boxes fit one ellipsoid are fitted together. Of any other pair, the landmark
+    with more boxes, weighted by their IoU, is kept unchanged: the other one is a part of it, or a
+    false landmark.
     """
     def doubles(shown: NDArray[np.int64]) -> list[tuple[int, int]]:
         return [pair for pair in find_doubles(views, landmarks, shown)
@@ -148,11 +151,11 @@ def resolve_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 
 def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                   pairs: Iterable[tuple[int, int]]) -> tuple[Landmarks, NDArray[np.int64]]:
-    """Fit those of the pairs that are one thing together, in the order given.
+    """Fit the two landmarks of each pair that is one object together, in the order given.
 
-    They stay two where the boxes of either do not fit the common ellipsoid. Of two landmarks the
-    one with more boxes stays, with the classes of both. Returns all landmarks, and the one (L,)
-    that each is part of.
+    They stay separate if the boxes of either do not fit the common ellipsoid. Otherwise, the
+    landmark with more boxes is kept, with the classes of both. Returns all landmarks, and the
+    landmark (L,) that each is merged into.
     """
     merged = landmarks._replace(centers=landmarks.centers.copy(), bases=landmarks.bases.copy())
     centers, bases, rows_of = merged.centers, merged.bases, group_boxes(shown, len(merged.centers))
@@ -180,5 +183,5 @@ def merge_doubles(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
 
 
 def _fits(before: NDArray[np.float64], after: NDArray[np.float64], enough: float) -> bool:
-    """Tell by the IoUs of boxes, before and after, if they fit enough, or hardly worse."""
+    """Tell whether the mean IoU of boxes is high enough after a fit, or hardly lower."""
     return len(before) == 0 or bool(after.mean() >= min(enough, before.mean() - _MERGE_LOSS))

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How well the frames support each landmark, and which of them show its place.
+"""Measure how well the frames support each landmark, and which of them show its place.
 
-Walls are in no map. A place is in view only if the frame also shows another landmark close to its
-direction that is not nearer.
+Maps have no walls. A place therefore counts as in view only if the frame also shows another
+landmark in nearly the same direction that is no nearer.
 """
 
 from dataclasses import dataclass, replace
@@ -23,21 +23,21 @@ from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, projec
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import Views
 
-#: A landmark is expected from no farther away than this times the greatest distance at which it
-#: was detected.
+#: A landmark is expected up to this multiple of the greatest distance at which it was detected.
 REACH = 1.2
-#: Of the boxes of a landmark in a map.
+#: Least median IoU with its boxes that a landmark of a map needs.
 MIN_MEDIAN_IOU = 0.5
 #: The centre of a large landmark may deviate by this share of its size.
 MAX_SIGMA_SHARE = 0.2
-# IoU from which a landmark explains a box of its class.
+# A landmark explains a box of its class if their IoU is greater than this.
 _EXPLAINED_IOU = 0.3
-# A class with fewer boxes is taken to be seen at the sizes of its boxes and of all classes only.
+# For a class with fewer boxes, the least size of a detection is that of its boxes or of all
+# classes, whichever is larger.
 _FEW_BOXES = 20
 _LEAST_QUANTILE = 0.1
-# So many frames are looked at together: a table of all frames and places would be large.
+# Frames are processed in windows of this size: a table of all frames and places would be large.
 _WINDOW = 1000
-# Points in a box at which the kernel asks whether something hides it: a 5 x 5 grid in the ellipse.
+# Points of a box that are tested for occlusion: those of a 5 x 5 grid within the ellipse.
 _GRID = np.array([(x, y) for x in (-0.8, -0.4, 0.0, 0.4, 0.8) for y in (-0.8, -0.4, 0.0, 0.4, 0.8)
                   if x * x + y * y < 1.0])
 
@@ -56,7 +56,7 @@ class Evidence(NamedTuple):
     #: (L,): standard deviation of the centre on its worst axis [m]
     position_sigma: NDArray[np.float64]
     median_iou: NDArray[np.float64]  #: (L,): of its boxes; 0 without any
-    last_seen: NDArray[np.float64]  #: (L,): [s]; NaN where nothing shows it
+    last_seen: NDArray[np.float64]  #: (L,): [s]; NaN without any box
 
     @property
     def seen_ratio(self) -> NDArray[np.float64]:
@@ -64,11 +64,11 @@ class Evidence(NamedTuple):
         return np.asarray(np.minimum(1.0, self.support / np.maximum(1, self.expected)))
 
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Evidence':
-        """Return the evidence for some of the landmarks."""
+        """Return the evidence for the given landmarks."""
         return self._replace(**{name: column[rows] for name, column in self._asdict().items()})
 
     def details(self, row: int, given: LandmarkDetails) -> LandmarkDetails:
-        """Return the details of a landmark in a map with this evidence in place of the given."""
+        """Return the given details of a landmark, updated with this evidence."""
         return replace(
             given, position_sigma=float(self.position_sigma[row]), support=int(self.support[row]),
             seen_ratio=float(self.seen_ratio[row]), baseline_deg=float(self.baseline_deg[row]),
@@ -106,7 +106,7 @@ def best_ious(views: Views, landmarks: Landmarks) -> NDArray[np.float64]:
 
 
 def widest_angle_deg(directions: NDArray[np.float64]) -> float:
-    """Return the greatest angle [deg] between two of m unit vectors (m, 3), to 2 degrees."""
+    """Return the greatest angle [deg] between any two unit vectors (m, 3), within 2 degrees."""
     cells = np.unique(np.round(directions / 0.03), axis=0)
     cells /= np.linalg.norm(cells, axis=1, keepdims=True)
     return float(np.degrees(np.arccos(np.clip((cells @ cells.T).min(), -1.0, 1.0))))
@@ -114,7 +114,7 @@ def widest_angle_deg(directions: NDArray[np.float64]) -> float:
 
 @compiled
 def is_expected(views, cameras, center, basis, reach):
-    """Return the frames (F,) that show an ellipsoid, from no farther away than reach [m]."""
+    """Return a mask of the frames (F,) in which an ellipsoid is visible within reach [m]."""
     expected, box = np.zeros(len(cameras), dtype=np.bool_), np.empty(4)
     for frame in range(len(cameras)):
         distance_2 = 0.0
@@ -130,8 +130,8 @@ def is_expected(views, cameras, center, basis, reach):
 
 def reasons_against(landmarks: Landmarks, evidence: Evidence, options: MappingOptions
                     ) -> list[str | None]:
-    """Return for each landmark why it stays out of the map; None where it belongs into it."""
-    # by its volume: what is drawn out along the rays is uncertain, not large
+    """Return for each landmark why it is left out of the map; None if it is good enough."""
+    # size by volume: an ellipsoid that is stretched along the rays is uncertain, not large
     sizes_m = np.sqrt(3.0) * np.cbrt(np.abs(np.linalg.det(landmarks.bases)))
     return [_reason(evidence, number, size_m, options)
             for number, size_m in enumerate(sizes_m.tolist())]
@@ -142,12 +142,12 @@ def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOpti
     viewpoints, ratio = evidence.viewpoints[number], evidence.seen_ratio[number]
     baseline, sigma = evidence.baseline_deg[number], evidence.position_sigma[number]
     if viewpoints < options.min_viewpoints:
-        return f'seen from {viewpoints} viewpoints, not {options.min_viewpoints}'
+        return f'seen from {viewpoints} viewpoints, fewer than {options.min_viewpoints}'
     if ratio < options.min_seen_ratio:
-        return f'seen in {_floor(100 * ratio)} % of the frames that show its place, not ' \
+        return f'seen in {_floor(100 * ratio)} % of the frames that show its place, less than ' \
                f'{100 * options.min_seen_ratio:g} %: rarely detected, or moved'
     if baseline < options.min_baseline_deg:
-        return f'seen from one side only: {_floor(baseline)} degrees, not ' \
+        return f'seen from one side only: {_floor(baseline)} degrees, less than ' \
                f'{options.min_baseline_deg:g}'
     if sigma > max(options.max_position_sigma_m, MAX_SIGMA_SHARE * size_m):
         return f'its position is uncertain: {sigma:.2f} m'
@@ -157,22 +157,21 @@ def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOpti
 
 
 def _floor(value: float) -> str:
-    """Return one decimal, never rounded up: 19.97 stays below 20."""
+    """Format a value with one decimal, rounded down: 19.97 stays below 20."""
     return f'{np.floor(10.0 * value) / 10.0:.1f}'
 
 
 @dataclass(frozen=True)
 class BoxQuality:
-    """How well landmarks explain boxes."""
+    """The share of boxes that landmarks explain, and how well they fit."""
 
     boxes: int
     #: Share of the boxes that a landmark of their class overlaps by more than an IoU of 0.3
     explained: float
-    median_iou: float  #: Of these
-
+    median_iou: float  #: Of these boxes
     @staticmethod
     def of(ious: NDArray[np.float64]) -> 'BoxQuality':
-        """Return the quality of boxes by the best IoU of each with a landmark of its class."""
+        """Summarize the best IoU (n,) of each box with a landmark of its class."""
         is_explained = ious > _EXPLAINED_IOU
         return BoxQuality(len(ious), float(is_explained.mean()) if len(ious) else 0.0,
                           float(np.median(ious[is_explained])) if is_explained.any() else 0.0)
@@ -180,9 +179,9 @@ class BoxQuality:
 
 def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64] | None = None
                     ) -> BoxQuality:
-    """Return how well landmarks explain boxes.
+    """Measure how well landmarks explain boxes.
 
-    The landmark that a box shows explains it although its class is another one.
+    The landmark that a box shows may explain it even if their classes differ.
     """
     ious = best_ious(views, landmarks)
     if shown is not None:
@@ -193,7 +192,7 @@ def explained_boxes(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 
 
 class Sight(NamedTuple):
-    """In how many viewpoints each of L places was in view, and its landmark seen."""
+    """Count viewpoints and frames in which each of L places was in view, and its landmark seen."""
 
     #: (L,): viewpoints
     expected: NDArray[np.int64]
@@ -208,26 +207,27 @@ class Sight(NamedTuple):
         return np.asarray(self.seen_frames / np.maximum(1, self.expected_frames))
 
     def words(self, place: int) -> str:
-        """Return in how many frames a landmark was expected and seen, in words."""
+        """Describe in how many frames a landmark was expected and seen."""
         return (f'expected in {self.expected_frames[place]} frames, seen in '
                 f'{self.seen_frames[place]}')
 
     def select(self, rows: slice | NDArray[np.int64]) -> 'Sight':
-        """Return some of the places."""
+        """Return the counts of the given places."""
         return Sight(*(column[rows] for column in self))
 
 
 def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
              is_solid: NDArray[np.bool_]) -> Sight:
-    """Return in which frames places were in view, and in which of them their landmark was seen.
+    """Count the viewpoints and frames with each place in view, and with its landmark detected.
 
-    Class -1 is one that no box has. Solid places have an object, which may hide others.
+    A place of class -1 has a class without boxes. Solid places contain an object, which may hide
+    others.
     """
     count = len(places.centers)
     extents = _least_extents(views, int(places.classes.max(initial=0)))
     least = np.where(places.classes < 0, extents[-1], extents[places.classes])
     radii = np.linalg.norm(places.bases, axis=1).max(axis=1, initial=0.0)
-    # by whether a place was in view or seen: (L,) frames, and keys of viewpoints and places
+    # first for "in view", then for "seen": frame counts (L,), and keys of (viewpoint, place)
     frames = np.zeros((2, count), dtype=np.int64)
     keys: tuple[list[NDArray[np.int64]], ...] = [], []
     for first in range(0, max(1, len(views.rotations)), _WINDOW):
@@ -240,8 +240,8 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
         was_seen[window.frames[rows], own[rows]] = True
         for number, of_frames in enumerate((in_view | was_seen, was_seen)):
             frames[number] += of_frames.sum(axis=0)
-            in_frames, its = np.nonzero(of_frames)
-            keys[number].append(np.unique(window.viewpoints[in_frames] * count + its))
+            in_frames, of_places = np.nonzero(of_frames)
+            keys[number].append(np.unique(window.viewpoints[in_frames] * count + of_places))
     # frames of one viewpoint may lie in several windows
     expected, seen = (np.bincount(np.unique(np.concatenate(own)) % max(count, 1), minlength=count)
                       for own in keys)
@@ -251,7 +251,7 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
 def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
     """Return the least size of detected boxes, by class, on the plane z = 1.
 
-    The last entry is that of all classes together.
+    The last entry is for all classes together.
     """
     sides = np.maximum(views.edges[:, 2:] - views.edges[:, :2], 0.0)
     extents = np.sqrt(sides.prod(axis=1))
@@ -269,7 +269,7 @@ def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
 
 @compiled
 def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown):
-    """Return which places are in view in each frame (F, L)."""
+    """Return a mask (F, L) of the places in view in each frame."""
     count = len(centers)
     farthest = reaches.max() if count else 0.0
     boxes, offsets = np.empty((count, 4)), np.empty((count, 3))
@@ -343,7 +343,7 @@ def _has_beside(place, near, was_seen, offsets, distances):
 
 @compiled
 def _hidden(place, near, boxes, distances, radii, is_solid, shown, edges, first, last):
-    """Return the share of a place that nearer landmarks hide, or boxes of no landmark."""
+    """Return the share of a place hidden by nearer landmarks or by boxes without a landmark."""
     box = boxes[place]
     x0, y0 = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
     a, b = 0.5 * (box[2] - box[0]), 0.5 * (box[3] - box[1])

@@ -3,12 +3,12 @@
 """Fit ellipsoids, each to the edges of its boxes, by robust least squares.
 
 Each edge that does not lie at the image border gives a residual: projected edge minus detected
-edge, in standard deviations. An edge at the border only bounds the object: it counts where the
-projection ends inside of it. A measured depth gives one more residual. Residuals r pass through
-the Cauchy loss c^2/2 log(1 + r^2/c^2). A weak prior draws the logarithms of the semi-axes to
-their mean, since boxes from similar directions leave the thickness open. Where depth lets boxes of
-one side suffice, each semi-axis that is longer than objects of the class are gives a residual of
-its logarithm, with the same loss, for the same reason.
+edge, in standard deviations. An edge at the border only bounds the object: it counts if the
+projection ends inside it. A measured depth gives one more residual. Residuals r pass through the
+Cauchy loss c^2/2 log(1 + r^2/c^2). A weak prior pulls the logarithms of the semi-axes to their
+mean, since boxes from similar directions do not constrain the thickness. With depth, boxes from
+one side suffice for a landmark. For the same reason, a semi-axis that is longer than objects of
+its class then gives a residual of its logarithm, with the same loss.
 """
 
 from math import log, sqrt
@@ -32,17 +32,18 @@ from cliploc_ros.offline.mapping.views import Views
 LOSS_SCALE = 1.5
 # Standard deviation of the logarithm of a semi-axis about the mean of the three. A guess.
 _AXIS_SPREAD = 0.7
-# An ellipsoid that is not wholly in front of a camera costs what four edges this far off cost.
+# An ellipsoid that is not entirely in front of a camera costs as much as four edges this far off.
 _BEHIND_RESIDUAL = 20.0
 _BEHIND_COST = 4.0 * 20.0
-# Objects are no ellipsoids, and detectors have habits: the boxes of one landmark err alike. A mean
-# of any number of viewpoints keeps this share of the variance. Chosen on TUM fr3 and the demo: .59
-# and .84 of all errors are within a deviation, .93 and 1.00 within three.
+# Objects are not ellipsoids, and detectors are biased, so the errors of a landmark's boxes are
+# correlated: the mean over any number of viewpoints keeps this share of the variance. Chosen on
+# TUM fr3 and the demo: .59 and .84 of all errors are within one deviation, .93 and 1.00 within
+# three.
 _ALIKE = 0.15
 _UNKNOWN_M = 1e6
 _MAX_DAMPING = 1e7
 _LEAST_IMPROVEMENT = 1e-4
-# Greatest change of a logarithm, and of the centre in greatest semi-axes, in one step.
+# Greatest change in one step: of a logarithm, and of the centre in sizes of the ellipsoid.
 _MAX_STEP = 1.0
 
 
@@ -59,7 +60,7 @@ class Fit(NamedTuple):
 
 def fit_landmarks(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                   iterations: int = 30, among: NDArray[np.bool_] | None = None) -> Landmarks:
-    """Return all landmarks, those among some or all (L,) fitted to the boxes that show them."""
+    """Fit landmarks, or those that the mask among (L,) selects, to the boxes that show them."""
     centers, bases = landmarks.centers.copy(), landmarks.bases.copy()
     for number, rows in enumerate(group_boxes(shown, len(centers))):
         if len(rows) and (among is None or among[number]):
@@ -72,7 +73,7 @@ def fit_ellipsoid(views: Views, rows: NDArray[np.int64], center: NDArray[np.floa
                   basis: NDArray[np.float64], iterations: int = 30) -> Fit:
     """Fit an ellipsoid to the boxes of some rows, from a start.
 
-    It takes at most this number of steps of Levenberg and Marquardt.
+    The fit takes at most the given number of Levenberg-Marquardt steps.
     """
     center, basis = center.copy(), basis.copy()
     information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
@@ -85,24 +86,24 @@ def centre_covariance(views: Views, rows: NDArray[np.int64], center: NDArray[np.
                       basis: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the covariance (3, 3) [m^2] of a centre that was fitted to the boxes of some rows.
 
-    All who ask how uncertain a landmark is get this answer. Where its boxes do not restrain a
-    landmark, it is a large multiple of the identity. The size of its class does not count.
+    All modules take the uncertainty of a landmark from here. If the boxes do not constrain the
+    centre, the covariance is a large multiple of the identity. The size of the class is ignored.
     """
     information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
     accumulate(views.without_sizes, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
     alike = 1.0 + _ALIKE * len(np.unique(views.viewpoints[views.frames[rows]]))
     try:
         covariance = alike * np.linalg.inv(information)[:3, :3]
-    except np.linalg.LinAlgError:  # boxes that the image cuts on all sides leave it open
+    except np.linalg.LinAlgError:  # boxes cut off on all sides constrain nothing
         covariance = np.full((3, 3), np.nan)
-    # rounding makes what no box restrains negative
+    # rounding makes unconstrained directions negative
     is_known = np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0
     return covariance if is_known else _UNKNOWN_M ** 2 * np.eye(3)
 
 
 @compiled
 def descend(views, rows, center, basis, iterations, information):
-    """Improve center and basis in place; write the information there; return the cost."""
+    """Improve center and basis in place, write the information, and return the cost."""
     gradient = np.zeros(LANDMARK_SIZE)
     trial_information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
     trial_gradient = np.zeros(LANDMARK_SIZE)
@@ -135,7 +136,7 @@ def descend(views, rows, center, basis, iterations, information):
 
 @compiled
 def limit_step(step, basis):
-    """Shorten a step (9,) that leaves the range in which its linearization can hold."""
+    """Shorten a step (9,) that exceeds the range of its linearization."""
     size = sqrt((basis * basis).sum())
     largest = sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2]) / size
     for i in range(3, LANDMARK_SIZE):
@@ -203,7 +204,7 @@ def add_depth(views, row, center, share, information, gradient):
 
 @compiled
 def edge_residual(views, row, edge, box):
-    """Return how far a projected edge is off, in standard deviations."""
+    """Return the residual of a projected edge, in standard deviations."""
     residual = (box[edge] - views.edges[row, edge]) * views.stiffness[row, edge]
     if views.is_open[row, edge]:
         return max(0.0, residual) if edge < 2 else min(0.0, residual)
@@ -226,7 +227,7 @@ def robust_weight(residual):
 
 @compiled
 def _largest(sizes, numbers, count):
-    """Return the largest of the sizes (m, 2) of boxes of each of a number of landmarks."""
+    """Return the largest size (count, 2) among the boxes (m, 2) of each landmark."""
     largest = np.full((count, 2), -np.inf)
     for place in range(len(sizes)):
         if sizes[place, 0] > largest[numbers[place], 0]:
@@ -239,14 +240,14 @@ def add_axis_prior(basis, size, information, gradient):
     """Add the prior on the semi-axes to the normal equations; return its cost.
 
     The logarithm of a semi-axis changes by half of its diagonal element of D. The size (2,) is
-    that of Views.sizes, of the largest class among the landmark's boxes.
+    the entry of Views.sizes for the largest class among the landmark's boxes.
     """
     logs = np.empty(3)
     for k in range(3):
         logs[k] = log(sqrt(basis[0, k] ** 2 + basis[1, k] ** 2 + basis[2, k] ** 2))
     mean = logs.mean()
     cost = 0.0
-    diagonal = (3, 6, 8)  # of D among a landmark's numbers
+    diagonal = (3, 6, 8)  # indices of D's diagonal among the numbers of a landmark
     for k in range(3):
         residual = (logs[k] - mean) / _AXIS_SPREAD
         cost += 0.5 * residual * residual
@@ -262,8 +263,8 @@ def add_axis_prior(basis, size, information, gradient):
             for j in range(i + 1):
                 other = ((0.5 if j == k else 0.0) - 1.0 / 6.0) / _AXIS_SPREAD
                 information[diagonal[i], diagonal[j]] += slope * other
-    # The numbers beside the diagonal turn the axes, which boxes of a sphere leave open: a weak
-    # hold keeps the equations regular, and has no target.
+    # The off-diagonal numbers rotate the axes, which boxes of a sphere do not constrain: weak
+    # damping without a target keeps the equations regular.
     for off in (4, 5, 7):
         information[off, off] += 0.5 / (_AXIS_SPREAD * _AXIS_SPREAD)
     return cost
@@ -322,7 +323,7 @@ def move_all(centers, bases, steps, new_centers, new_bases):
 @compiled
 def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_poses, of_boxes,
                    landmark_gradient, pose_gradient):
-    """Add up the normal equations of all boxes; return their cost, the axis prior included."""
+    """Add up the normal equations of all boxes; return their cost, including the axis prior."""
     cost, box = 0.0, np.empty(4)
     sizes = _largest(views.sizes[rows], landmarks, len(centers))
     by_landmark, by_motion = np.empty((4, LANDMARK_SIZE)), np.empty((4, POSE_SIZE))
@@ -335,7 +336,7 @@ def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_pose
                              bases[landmark], box, by_landmark, by_motion):
             cost += share * _BEHIND_COST
             continue
-        # a pose's error in the map's axes moves the map against it in the camera's
+        # a pose error in the map's axes moves the map the opposite way in the camera's axes
         by_pose = np.concatenate((-by_motion[:, :3] @ rotation, -by_motion[:, 3:] @ rotation),
                                  axis=1)
         x, y, z = views.levers[frame]

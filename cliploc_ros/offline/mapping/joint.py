@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refine landmarks and poses together.
 
-A process of errors holds on to the given poses (PosePrior). Odometry, where there is any, joins
-successive frames (cliploc_ros.offline.mapping.odometry). Box edges give the same residuals as in
-cliploc_ros.offline.mapping.fitting.
+A prior on their errors keeps the poses near the given ones (PosePrior). Odometry, if available,
+joins successive frames (cliploc_ros.offline.mapping.odometry). Box edges give the same residuals
+as in cliploc_ros.offline.mapping.fitting.
 
 The normal equations have a block for each landmark, blocks for each pose and its successor, and
-a block for each box, which joins the two. Poses are eliminated: their part is banded. The
-rest for the landmarks is solved by conjugate gradients, so that memory grows with the number of
-boxes only (Agarwal et al., "Bundle Adjustment in the Large", ECCV 2010).
+a block for each box, which couples a pose and a landmark. The poses, whose part is banded, are
+eliminated. The reduced system of the landmarks is solved by conjugate gradients, so that memory
+grows only with the number of boxes (Agarwal et al., "Bundle Adjustment in the Large", ECCV 2010).
 """
 
 from typing import NamedTuple
@@ -34,14 +34,14 @@ _MAX_DAMPING = 1e4
 
 
 class PosePrior(NamedTuple):
-    """The information of the process of errors: its diagonal and next-to-diagonal (F, 6)."""
+    """The information of the errors of the poses: its diagonal and next diagonal (F, 6)."""
 
     diagonal: NDArray[np.float64]
     beside: NDArray[np.float64]
 
     @staticmethod
     def of(stamps_s: NDArray[np.float64], errors: PoseErrors) -> 'PosePrior':
-        """Return the prior of frames at some times."""
+        """Return the prior of frames with the given stamps."""
         kept = np.zeros(len(stamps_s))
         kept[:-1] = errors.kept(np.maximum(np.diff(stamps_s), INSTANT_S))
         # information of the innovation between a frame and the next one
@@ -56,7 +56,7 @@ class PosePrior(NamedTuple):
 
     def log_determinant(self) -> float:
         """Return the logarithm of the determinant of the information."""
-        # Q = L D L': each pivot is what the frames before leave of the diagonal
+        # Q = L D L': each pivot is the diagonal minus the contribution of the frame before
         pivots = self.diagonal.copy()
         for frame in range(1, len(pivots)):
             pivots[frame] -= self.beside[frame - 1] ** 2 / pivots[frame - 1]
@@ -74,8 +74,8 @@ def pose_bands(of_poses: NDArray[np.float64], prior: PosePrior,
                of_steps: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the poses' part of the equations with the prior, as lower bands.
 
-    Each pose has a block (6, 6), and with odometry one below: the rows of the next pose, the
-    columns of this one. The bands are (7, 6 F), or (12, 6 F) with blocks below.
+    Each pose has a block (6, 6). With odometry, there is a block below it, with the rows of the
+    next pose and the columns of this one. The bands are (7, 6 F), or (12, 6 F) with odometry.
     """
     count = POSE_SIZE + 1 if of_steps is None else 2 * POSE_SIZE
     bands = np.zeros((count, len(of_poses), POSE_SIZE))
@@ -91,7 +91,7 @@ def pose_bands(of_poses: NDArray[np.float64], prior: PosePrior,
 
 
 class Equations(NamedTuple):
-    """Normal equations: F poses, L landmarks, m boxes; with odometry, poses and the next ones."""
+    """Normal equations of F poses, L landmarks, m boxes and, with odometry, successive poses."""
 
     of_landmarks: NDArray[np.float64]    # (L, 9, 9)
     of_poses: NDArray[np.float64]        # (F, 6, 6)
@@ -102,7 +102,7 @@ class Equations(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """Where L landmarks are known to be: centres (L, 3) and their deviations (L,) [m]."""
+    """Known positions of L landmarks: centres (L, 3) and their deviations (L,) [m]."""
 
     centers: NDArray[np.float64]
     sigmas: NDArray[np.float64]
@@ -111,11 +111,11 @@ class Anchors(NamedTuple):
 def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                    errors: PoseErrors, iterations: int = 20, anchors: Anchors | None = None,
                    steps: Steps | None = None) -> tuple[Views, Landmarks]:
-    """Return the views with refined poses, and the refined landmarks.
+    """Refine poses and landmarks together; return the refined views and landmarks.
 
-    The prior holds on to the given poses, anchors to the landmarks' known places, and steps to the
-    odometry between successive frames; views has the poses to start from. It takes at most this
-    number of steps of Levenberg and Marquardt.
+    The prior pulls the poses towards the given ones, anchors pull the landmarks towards their
+    known positions, and steps are the odometry between successive frames. The poses start from
+    those of views. At most the given number of Levenberg-Marquardt steps is taken.
     """
     problem = Problem(views, shown, PosePrior.of(views.stamps_s, errors), anchors, steps)
     state = State(views, landmarks, pose_errors(given, views))
@@ -138,10 +138,10 @@ def refine_jointly(given: Views, views: Views, landmarks: Landmarks, shown: NDAr
 
 
 def pose_errors(given: Views, present: Views) -> NDArray[np.float64]:
-    """Return by how much given poses are off (F, 6): x, y, z [m], rotation vector [rad].
+    """Return the errors of the given poses (F, 6): x, y, z [m], rotation vector [rad].
 
-    Errors are those of the rig's first camera. Another camera's centre is off by its lever's turn,
-    too.
+    They are the errors of the rig's first camera. The rotation also displaces the centre of any
+    other camera, by its lever.
     """
     offsets = present.centers - given.centers
     turns = np.einsum('fji,fjk->fik', present.rotations, given.rotations)
@@ -150,7 +150,7 @@ def pose_errors(given: Views, present: Views) -> NDArray[np.float64]:
 
 
 def pose_changes(given: Views, present: Views) -> tuple[float, float]:
-    """Return the root mean square by which poses changed: [m], [deg]."""
+    """Return the root mean square change of the poses: [m], [deg]."""
     squares = np.square(pose_errors(given, present))
     return (float(np.sqrt(squares[:, :3].sum(axis=1).mean())),
             float(np.degrees(np.sqrt(squares[:, 3:].sum(axis=1).mean()))))
@@ -180,10 +180,10 @@ class State(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What stays the same over the iterations."""
+    """The data that stay constant over the iterations."""
 
     views: Views
-    shown: NDArray[np.int64]  #: (n,): the landmark that each box shows, -1 for none: m show one
+    shown: NDArray[np.int64]  #: (n,): the landmark that each box shows, -1 for none (m show one)
     prior: PosePrior
     anchors: Anchors | None = None
     steps: Steps | None = None
@@ -248,11 +248,9 @@ class Problem(NamedTuple):
         return steps.reshape(count, -1), poses.reshape(frames, -1)
 
     def coupling(self, of_boxes: NDArray[np.float64], frames: int, count: int) -> bsr_matrix:
-        """Return the part (6 F, 9 L) of the equations that joins poses and landmarks."""
+        """Return the part (6 F, 9 L) of the equations that couples poses and landmarks."""
         rows = np.nonzero(self.shown >= 0)[0]
         order = np.lexsort((self.shown[rows], self.views.frames[rows]))
         starts = np.searchsorted(self.views.frames[rows], np.arange(frames + 1))
         return bsr_matrix((of_boxes[order], self.shown[rows][order], starts),
                           shape=(frames * POSE_SIZE, count * LANDMARK_SIZE))
-
-

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Labels of a built map: the phrases that fit the crops of each landmark; its image embeddings.
+"""Label the landmarks of a built map with phrases that fit their crops, and embed them.
 
-A phrase fits a landmark as well as it fits the mean of its crops. On both mapping walks of the
-demo's world (51 and 57 landmarks), none of these named at least 2 objects more: weights for the
-size or the score of crops, leaving out those farthest from the mean, subtracting what a phrase has
-in common with all crops, or with those of its class.
+A phrase is compared with the mean embedding of a landmark's crops. On both mapping walks of the
+demo's world (51 and 57 landmarks), each of these variants named at most one more object:
+weighting crops by size or score, dropping the crops farthest from the mean, subtracting a phrase's
+mean similarity to all crops or to the crops of its class.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,19 +24,19 @@ from cliploc_ros.offline.vocabulary.vocabulary import Phrases
 
 # The best phrase and the next five.
 _LABELS = 6
-# CLIP is trained to give the right one of many texts a probability of softmax(100 cosine).
+# CLIP is trained such that softmax(100 cosine) over many texts is the probability of each text.
 _CLIP_SCALE = 100.0
-# The crops of a landmark that its description uses at most, evenly chosen: bounds the memory.
+# Greatest number of crops that describe a landmark, evenly spaced: it bounds the memory.
 _MOST_CROPS = 512
-# A further medoid brings each crop nearer to one by this cosine on average. A guess.
+# A further medoid has to raise the mean cosine of crops and nearest medoids by this. A guess.
 _LEAST_MEDOID_GAIN = 0.005
 
 
 def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,
                     shown: NDArray[np.int64]) -> LandmarkEmbeddings:
-    """Return the encoder's embeddings of each landmark.
+    """Return the mean embedding and the medoids of each landmark's crops.
 
-    Frames of one viewpoint share the weight of one. Embeddings of the length 0 are not crops.
+    The frames of a viewpoint share the weight of one frame. Embeddings of length 0 are ignored.
     """
     assert detections.embeddings is not None
     viewpoints = number_viewpoints(detections)
@@ -61,9 +61,10 @@ def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,
 
 def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
                     phrases: Mapping[str, Sequence[Phrases]]) -> LandmarkMap:
-    """Return the map with the phrases that fit each landmark best, and their weights.
+    """Label each landmark of a map with its best-fitting phrases and their weights.
 
-    A landmark without embeddings keeps its label. Each class of a landmark has its phrases.
+    A landmark without embeddings keeps its label. The candidates are the phrases of all classes of
+    the landmark.
     """
     embeddings = embeddings.in_order(landmark_map.landmark_ids)
     labels = list(landmark_map.labels)
@@ -79,20 +80,20 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
 
 def best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]
                   ) -> tuple[tuple[str, float], ...]:
-    """Return the best phrases with their weights, the best one first."""
+    """Return the best phrases and their weights, best first."""
     similarities = {
         text: float(similarity) for texts, rows in phrases
         for text, similarity in zip(texts, rows @ mean, strict=True)}
     best = sorted(similarities, key=lambda text: -similarities[text])[:_LABELS]
     weights = np.exp(_CLIP_SCALE * np.array([similarities[text] - similarities[best[0]]
                                              for text in best]))
-    # the file holds five digits, and no weight of 0
+    # the map file stores five digits and allows no weight of 0
     weights = np.maximum(weights / weights.sum(), 1e-4)
     return tuple(zip(best, weights.tolist(), strict=True))
 
 
 def choose_medoids(crops: NDArray[np.float32], weights: NDArray[np.float64]) -> list[int]:
-    """Return at most five rows that stand for all m crops (m, d): each next one helps most."""
+    """Choose at most five medoids of m crops (m, d), greedily by their gain in cosine."""
     cosines = crops @ crops.T
     nearest = np.full(len(crops), -1.0)
     chosen: list[int] = []
@@ -107,7 +108,7 @@ def choose_medoids(crops: NDArray[np.float32], weights: NDArray[np.float64]) -> 
 
 
 def _unit_rows(rows: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return rows scaled to unit length, and their lengths; a row of the length 0 stays."""
+    """Return rows scaled to unit length, and their lengths; a row of zeros is unchanged."""
     rows = rows.astype(np.float32)
     lengths = np.asarray(np.linalg.norm(rows, axis=1), dtype=np.float32)
     return np.asarray(rows / np.where(lengths > 0.0, lengths, 1.0)[:, None]), lengths

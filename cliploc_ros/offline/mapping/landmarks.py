@@ -8,9 +8,9 @@ bounding box on the plane z = 1 is, with d = z^2 - N_zz,
 
     u +- sqrt(u^2 + (N_xx - x^2) / d),   u = (x z - N_xz) / d,
 
-and the same in y. Shapes change by S' = B exp(D) B^T with a symmetric D: six numbers that are
-free of the singularities of angles (a sphere has no orientation), and whose diagonal doubles the
-logarithms of the semi-axes.
+and the same in y. Shapes change by S' = B exp(D) B^T with a symmetric D: six numbers without
+the singularities of angles (a sphere has no orientation). The diagonal of D is twice the change of
+the logarithms of the semi-axes.
 """
 
 from collections import Counter
@@ -36,10 +36,10 @@ _COLUMNS = np.array([0, 1, 2, 1, 2, 2])
 
 @compiled
 def project_box(rotation, translation, center, basis, box):
-    """Write the box of an ellipsoid on the plane z = 1; return whether it is wholly in front.
+    """Write the box of an ellipsoid on the plane z = 1; return whether it is entirely in front.
 
     Rotation and translation are those of camera_from_map. The box (4,) is left, top, right,
-    bottom; it is untouched where the ellipsoid is not wholly in front.
+    bottom; it is not written if the ellipsoid is not entirely in front.
     """
     r = rotation
     x = r[0, 0] * center[0] + r[0, 1] * center[1] + r[0, 2] * center[2] + translation[0]
@@ -71,7 +71,7 @@ def project_box(rotation, translation, center, basis, box):
 
 @compiled
 def linearize_box(rotation, translation, center, basis, box, by_landmark, by_pose):
-    """Write the box of an ellipsoid and its derivatives; return whether it is wholly in front.
+    """Write the box of an ellipsoid and its derivatives; return whether it is entirely in front.
 
     The derivatives of the edges are by_landmark (4, 9) by the centre in the map and by D, and
     by_pose (4, 6) by a small motion of the map in the camera: p' = p + v + w x p.
@@ -160,7 +160,7 @@ def box_iou(first, second, bounds):
 def move_ellipsoid(center, basis, step, new_center, new_basis):
     """Write an ellipsoid moved by a step (9,) of its numbers.
 
-    exp(D) is taken to the second order of D / 2 and squared, so that shapes stay positive
+    exp(D) is computed as the square of exp(D / 2) to second order, so that shapes stay positive
     definite. The new basis is orthogonal: its columns are the semi-axes.
     """
     half = np.empty((3, 3))
@@ -185,13 +185,13 @@ class Landmarks(NamedTuple):
     centers: NDArray[np.float64]  #: (L, 3): [m]
     #: (L, 3, 3): their columns are the semi-axes [m], see cliploc_ros.offline.mapping.landmarks
     bases: NDArray[np.float64]
-    classes: NDArray[np.int64]  #: (L,): detector classes; -1: one that no box has
-    #: (k, 2): a landmark and another class that a detector gives it, each pair once
+    classes: NDArray[np.int64]  #: (L,): detector classes; -1: a class without boxes
+    #: (k, 2): a landmark and a further class that a detector gives it, each pair once
     others: NDArray[np.int64] = _NO_NAMES
 
     @property
     def names(self) -> NDArray[np.int64]:
-        """Return each landmark with each of its classes (m, 2), without those that no box has."""
+        """Return the pairs (m, 2) of a landmark and one of its classes, without class -1."""
         own = np.stack([np.arange(len(self.classes)), self.classes], axis=1)
         return np.concatenate([own[self.classes >= 0], self.others])
 
@@ -217,7 +217,7 @@ class Landmarks(NamedTuple):
         return semi_axes, Rotation.from_matrix(rotations).as_quat()
 
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Landmarks':
-        """Return some of the landmarks."""
+        """Return the landmarks in the given rows."""
         places = np.full(len(self.classes), -1, dtype=np.int64)
         places[rows] = np.arange(len(places[rows]))
         others = np.stack([places[self.others[:, 0]], self.others[:, 1]], axis=1)
@@ -226,9 +226,9 @@ class Landmarks(NamedTuple):
 
 
 def landmarks_of_map(landmark_map: LandmarkMap, class_names: Sequence[str]) -> Landmarks:
-    """Return the landmarks of a map with those of their classes that are among the named ones.
+    """Return the landmarks of a map, each with those of its classes that are in class_names.
 
-    A landmark without any gets -1.
+    A landmark without such a class gets -1.
     """
     numbers = {name: number for number, name in enumerate(class_names)}
     rotations = Rotation.from_quat(landmark_map.quats_xyzw).as_matrix()
@@ -248,14 +248,14 @@ def classes_of(landmark_map: LandmarkMap, row: int) -> tuple[str, ...]:
 
 
 def group_boxes(shown: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
-    """Return the boxes of each of a number of landmarks, in ascending order."""
+    """Return the rows of the boxes of each landmark, in ascending order."""
     order = np.argsort(shown, kind='stable')
     bounds = np.searchsorted(shown[order], np.arange(count + 1))
     return [order[bounds[number]:bounds[number + 1]] for number in range(count)]
 
 
 def unused_ids(class_names: Sequence[str], used: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return an id for each landmark, its class and a number, that is not among those used."""
+    """Return an unused id for each landmark, made of its class and a number."""
     taken, counts, ids = set(used), Counter[str](), list[str]()
     for name in class_names:
         word = ''.join(char if char.isalnum() else '_' for char in name)

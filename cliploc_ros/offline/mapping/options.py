@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The choices that building and checking a map leave to their user."""
+"""Options of building and checking a map."""
 
 from dataclasses import dataclass, field
 
@@ -11,19 +11,19 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.vocabulary.vocabulary import common_name
 
-#: Frames this near in time are of one instant [s], and the share of a pose's error that they have
-#: in common where errors have no time constant.
+#: Frames within this time are simultaneous [s]; the share of a pose error that simultaneous frames
+#: have in common if errors have no time constant.
 INSTANT_S, _KEPT_AT_ONCE = 1e-3, 0.999
 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """How the errors of given poses behave."""
+    """Model of the errors of given poses."""
 
     #: Standard deviations on each axis [m] [deg]
     sigma_m: float
     sigma_deg: float
-    #: Time constant with which an error forgets itself [s]; 0: every frame errs on its own
+    #: Time constant of the decay of an error [s]; 0: the errors of frames are independent
     correlation_s: float = 3.0
 
     @property
@@ -32,9 +32,9 @@ class PoseErrors:
         return np.repeat([self.sigma_m, np.radians(self.sigma_deg)], 3)
 
     def kept(self, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the share of an error that is left after times (n,) [s].
+        """Return the share of an error that remains after times (n,) [s].
 
-        Frames of one instant are of several cameras of one robot, and err alike.
+        Simultaneous frames are from several cameras of one robot, so they share their errors.
         """
         if self.correlation_s > 0.0:
             return np.asarray(np.exp(-seconds / self.correlation_s))
@@ -43,24 +43,24 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class OdometryErrors:
-    """How the errors of odometry grow, as a random walk.
+    """Model of the errors of odometry: a random walk.
 
-    All defaults are guesses; the angle of a Husky's wheels is off by .2 to .4 of them (python -m
-    studies.sensors). A wrong scale is no random walk, and is not covered.
+    The defaults are not measured; the errors of the angle of a Husky's wheels are .2 to .4 of them
+    (python -m studies.sensors). A wrong scale is not a random walk, and is not covered.
     """
 
     #: Standard deviations on each axis after a metre [m] [deg]
     sigma_m: float = 0.03
     sigma_deg: float = 1.5
-    #: A radian of turning counts as this number of metres: wheels move then, too
+    #: A radian of rotation counts as this number of metres, since wheels then move, too
     metres_per_radian: float = 0.5
-    #: Of each step, for stamps and interpolation [m] [deg]
+    #: Least deviations of each step, from stamps and interpolation [m] [deg]
     floor_m: float = 0.002
     floor_deg: float = 0.1
 
     def sigmas(self, distances_m: NDArray[np.float64], angles: NDArray[np.float64]
                ) -> NDArray[np.float64]:
-        """Return deviations (m, 2) [m] [rad] after ways (m,) [m] with turns (m,) [rad]."""
+        """Return deviations (m, 2) [m] [rad] after distances (m,) [m] and rotations (m,) [rad]."""
         ways = (distances_m + self.metres_per_radian * angles)[:, None]
         sigmas = np.hypot([self.floor_m, self.floor_deg],
                           np.sqrt(ways) * [self.sigma_m, self.sigma_deg])
@@ -70,7 +70,7 @@ class OdometryErrors:
 _ODOMETRY_ERRORS = OdometryErrors()
 
 
-#: Classes of COCO that leave their place by themselves, or are thrown and driven.
+#: Classes of COCO that move by themselves, or are thrown or driven.
 MOVING_CLASSES = (
     'person', 'bird', 'cat', 'dog', 'horse', 'sheep', 'cow', 'elephant', 'bear', 'zebra',
     'giraffe', 'sports ball', 'frisbee', 'kite', 'skateboard', 'car', 'motorcycle', 'airplane',
@@ -86,23 +86,23 @@ class MappingOptions:
     #: Share of the frames showing a landmark's place in which it must be detected. Chance
     #: arrangements of boxes are seen rarely, but so are objects that others hide.
     min_seen_ratio: float = 0.03
-    min_baseline_deg: float = 20.0  #: Least angle between two of its directions [deg]
-    #: Greatest deviation of a centre [m]; of a large landmark, see evidence.MAX_SIGMA_SHARE
+    min_baseline_deg: float = 20.0  #: Least angle between two directions to a landmark [deg]
+    #: Greatest deviation of a centre [m]; for large landmarks, see evidence.MAX_SIGMA_SHARE
     max_position_sigma_m: float = 0.08
-    #: Refine the poses with the landmarks, as far as they may be off; None: poses are exact
+    #: Refine the poses with the landmarks, given these errors; None: poses are exact
     pose_errors: PoseErrors | None = None
-    #: Without pose_errors, estimate them, and refine the poses where they are significant
+    #: Without pose_errors, estimate them, and refine the poses if they are significant
     estimate_pose_errors: bool = False
-    #: Of odometry between frames, which joins the poses while they are refined
+    #: Errors of the odometry between frames, which constrains the poses in their refinement
     odometry_errors: OdometryErrors = _ODOMETRY_ERRORS
     refine_mount: bool = False  #: Correct the mount of the camera, which all poses share
-    #: What the map says of itself: its coordinate frame, and where it comes from
+    #: The coordinate frame and the origin that the map file names
     frame_id: str = 'map'
     source: str = 'build_map'
     random_seed: int = 0  #: Equal seed and input give equal output
 
     def moves(self, name: str) -> bool:
-        """Return whether objects of a class move, under whatever name a detector has for it."""
+        """Return whether objects of a class move, whichever name a detector has for the class."""
         moving = set(map(str.lower, self.moving_classes))
         return name.lower() in moving or common_name(name) in moving
 
@@ -120,14 +120,15 @@ class CheckOptions:
     #: Of the relocalizer that will use the map
     relocalizer: RelocalizerOptions = field(default_factory=RelocalizerOptions)
     folds: int = 5  #: Cross-validation: each fold is judged with landmarks fitted to the others
-    #: Folds take blocks of this length in turn [s]; a fold is not fitted to frames this near to
-    #: one that it judges [s]
+    #: Blocks of this length are assigned to the folds in turn [s]; frames within the gap of a
+    #: judged frame
+    #: are not used to fit the landmarks that judge it [s]
     block_s: float = 4.0
     gap_s: float = 1.0
-    frames: int = 100  #: The most recorded frames that are relocalized
-    #: Of the grid of camera positions [m]; larger where there would be too many positions
+    frames: int = 100  #: Greatest number of recorded frames that are relocalized
+    #: Spacing of the grid of camera positions [m]; increased if there are too many positions
     spacing_m: float = 0.5
-    #: The most positions of the grid, and the directions in which the camera looks at each
+    #: Greatest number of grid positions, and number of camera headings at each
     max_positions: int = 150
     headings: int = 12
     camera_height_m: float | None = None  #: Of the grid [m]; None: as in the recording
@@ -136,18 +137,18 @@ class CheckOptions:
     random_seed: int = 0  #: Equal seed and input give equal output
 
     def __post_init__(self) -> None:
-        """Refuse values that an option does not allow."""
+        """Refuse values outside the range of an option."""
         for name, low, high in (('folds', 2, 100), ('frames', 1, 1_000_000),
                                 ('max_positions', 1, 100_000), ('headings', 1, 360),
                                 ('spacing_m', 0.01, 1e4), ('block_s', 1e-3, 1e6)):
             if not low <= getattr(self, name) <= high:
-                raise OptionsError(f'{name}: {getattr(self, name)} must lie within {low:g} and '
+                raise OptionsError(f'{name}: {getattr(self, name)} must lie between {low:g} and '
                                    f'{high:g}')
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What a map has to reach. The values are guesses from a few maps of one office."""
+    """Thresholds that a map has to reach: guesses from a few maps of one office."""
 
     #: Held-out share of the boxes that a landmark of their class explains, and their median IoU
     min_explained: float = 0.6
@@ -155,9 +156,10 @@ class Thresholds:
     min_accepted: float = 0.4  #: Share of the recorded frames that the relocalizer accepts
     #: Share of the recorded frames and grid views in which it accepts a wrong pose
     max_misled: float = 0.01
-    #: Share of the grid positions near the recording in which it accepts some heading
+    #: Share of the grid positions near the recording with an accepted heading
     min_positions: float = 0.4
-    #: The same by objects alone, where keyframes carry the rest; below, it is a map of keyframes
+    #: The same share by objects alone, for maps with keyframes; below it, a map is "keyframes
+    #: only"
     min_by_objects: float = 0.1
     #: Share of the landmarks with a serious fault, each counted as often as it was seen
     max_faulty: float = 0.15

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Estimate from the boxes how far the given poses are off, and what this leaves in a map.
+"""Estimate the errors of the given poses from the boxes, and the errors they leave in a map.
 
-Errors of a pose move all boxes of a frame together; errors of the detector move each box on its
-own. The estimate maximizes the marginal likelihood of the boxes over the standard deviations of
-the poses, the time for which an error lasts, and the scale s of the edges' deviations (empirical
-Bayes; Laplace's approximation, MacKay, "Bayesian Interpolation", 1992). With H the normal
-equations of the boxes about the best landmarks and poses, b their gradient, and Q the information
+Errors of a pose move all boxes of a frame together; errors of the detector move each box
+independently. The estimate maximizes the marginal likelihood of the boxes over the standard
+deviations of the poses, the time constant of their errors, and the scale s of the edges'
+deviations (empirical Bayes; Laplace's approximation, MacKay, "Bayesian Interpolation", 1992).
+With H the normal equations of the boxes at the best landmarks and poses, b their gradient, and Q
+the information
 of the process of pose errors e (see cliploc_ros.offline.mapping.joint),
 
     -log p = r' W r / 2 s^2 + N log s + e' Q e / 2 - b' (H / s^2 + Q)^-1 b / 2
@@ -35,31 +36,33 @@ from cliploc_ros.offline.mapping.landmarks import POSE_SIZE, Landmarks, group_bo
 from cliploc_ros.offline.mapping.options import INSTANT_S, PoseErrors
 from cliploc_ros.offline.mapping.views import Views
 
-# The estimate uses at most this number of frames and landmarks: more add time, hardly precision.
+# Greatest numbers of frames and landmarks in the estimate: more take time but add little
+# precision.
 _MAX_FRAMES, _MAX_LANDMARKS = 200, 25
-# They are from the middle of a long recording: frames far apart show no landmark in common.
+# Of a long recording, only the middle is used: frames far apart have no landmark in common.
 _MAX_SPAN = 3000
 _MIN_FRAMES, _MIN_LANDMARKS, _MIN_BOXES = 20, 3, 3
-# Smaller errors than these stay. A guess: motion capture and clock of TUM fr3 are estimated to be
+# Smaller errors than these are not refined. A guess: motion capture and clock of TUM fr3 are
+# estimated to be
 # off by 6 mm and 0.2 degrees.
 _HARMLESS = PoseErrors(0.01, 0.3)
-# A wide start lets poses follow their boxes; from a narrow one, far boxes count as outliers.
+# A wide start lets poses follow their boxes; a narrow one would make distant boxes outliers.
 _START = PoseErrors(0.1, 2.0, 0.3)
 _ROUNDS, _REFINEMENTS, _EVALUATIONS = 3, 6, 40
 # Bounds of sigma [m] [deg], time constant [s] and scale of the edges' deviations.
 _LOWEST = np.log([0.001, 0.02, 0.05, 0.3])
 _HIGHEST = np.log([1.0, 20.0, 100.0, 5.0])
-# Errors of poses in one span of time are alike, the default of PoseErrors.correlation_s [s].
+# Poses within this time have similar errors [s]: the default of PoseErrors.correlation_s.
 _POSE_ERROR_S = 3.0
-# Boxes that are matched wrongly before the poses are refined bend the map: parts of it are off by
-# this many times the mean error of their poses. Chosen on maps of TUM fr3 from poses off by 5
+# Boxes that are matched wrongly before the poses are refined bend the map: the error of a part
+# is this multiple of the mean error of its poses. Chosen on maps of TUM fr3 from poses off by 5
 # and 10 cm over 3 s (seeds 0 to 4 of studies/speed/pose_errors.py).
 _BENDING = 1.6
 
 
 def significant_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.int64]
                             ) -> PoseErrors | None:
-    """Return how the errors of the given poses seem to behave; None where they do no harm."""
+    """Estimate the errors of the given poses; None if they are negligible or unknown."""
     errors = estimate_pose_errors(given, landmarks, shown, given)
     if errors is None or (errors.sigma_m < _HARMLESS.sigma_m
                           and errors.sigma_deg < _HARMLESS.sigma_deg):
@@ -68,15 +71,15 @@ def significant_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[n
 
 
 def estimated_note(errors: PoseErrors) -> str:
-    """Return notes for the user about estimated errors of the poses."""
-    return (f'poses are off by about {100 * errors.sigma_m:.1f} cm and {errors.sigma_deg:.1f} '
-            f'degrees on each axis for {errors.correlation_s:.1f} s, estimated from the boxes; '
-            'refined')
+    """Return a note for the user about the estimated errors of the poses."""
+    return (f'the poses have errors of about {100 * errors.sigma_m:.1f} cm and '
+            f'{errors.sigma_deg:.1f} degrees on each axis over {errors.correlation_s:.1f} s, '
+            'estimated from the boxes; they are refined')
 
 
 def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                          start: Views) -> PoseErrors | None:
-    """Return how the errors of the given poses seem to behave; None with too few boxes.
+    """Estimate the errors of the given poses; None with too few boxes.
 
     The landmarks were fitted to the poses of start.
     """
@@ -86,7 +89,7 @@ def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.i
     chosen = chosen[counts[chosen] >= _MIN_BOXES]
     if len(frames) < _MIN_FRAMES or len(chosen) < _MIN_LANDMARKS:
         return None
-    numbers = np.full(len(counts) + 1, -1)  # the last one is that of no landmark
+    numbers = np.full(len(counts) + 1, -1)  # the last entry is for boxes without a landmark
     numbers[chosen] = np.arange(len(chosen))
     shown, landmarks = numbers[shown[rows]], landmarks.select(chosen)
     views, refined = _pick(given, frames, rows), _pick(start, frames, rows)
@@ -103,7 +106,7 @@ def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.i
 
 
 def _sample(views: Views) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return one frame of each of some viewpoints, evenly chosen, and the rows of their boxes."""
+    """Return one frame of each of an even sample of viewpoints, and the rows of their boxes."""
     order = np.argsort(views.viewpoints, kind='stable')
     _, firsts, counts = np.unique(views.viewpoints[order], return_index=True, return_counts=True)
     middles = np.sort(order[firsts + counts // 2])
@@ -115,7 +118,7 @@ def _sample(views: Views) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _pick(views: Views, frames: NDArray[np.int64], rows: NDArray[np.int64]) -> Views:
-    """Return some frames with their rows, each of full weight."""
+    """Return views of the given frames and rows of boxes, each frame with full weight."""
     offsets = np.searchsorted(rows, views.offsets)
     return views._replace(
         rotations=views.rotations[frames], translations=views.translations[frames],
@@ -135,8 +138,8 @@ def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: ND
     The boxes are linearized at refined poses and landmarks.
     """
     frames, size = len(given.rotations), len(landmarks.centers)
-    nothing = PosePrior(np.zeros((frames, POSE_SIZE)), np.zeros((frames, POSE_SIZE)))
-    problem = Problem(refined, shown, nothing)
+    no_prior = PosePrior(np.zeros((frames, POSE_SIZE)), np.zeros((frames, POSE_SIZE)))
+    problem = Problem(refined, shown, no_prior)
     errors = pose_errors(given, refined)
     _, equations = problem.linearize(State(refined, landmarks, errors))
     joint = problem.coupling(equations.of_boxes, frames, size).toarray()
@@ -171,11 +174,12 @@ def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: ND
 
 def left_by_poses(views: Views, changes: NDArray[np.float64], shown: NDArray[np.int64],
                   count: int) -> NDArray[np.float64]:
-    """Return by how much errors of the poses displace each landmark on each axis (count,) [m].
+    """Return the displacement of each landmark by errors of the poses, on each axis (count,) [m].
 
-    The part that a landmark's frames have in common stays: the mean of as many independent errors
-    as there are spans of time in which it was seen. Changes (F, 6) are the squares of the changes
-    by refinement; 0 where the poses were taken as they are.
+    The mean error over the frames of a landmark remains. Errors are independent between the spans
+    of time in which it was seen. Changes (F, 6) are the squares of the changes by refinement; 0
+    where the
+    poses were not refined.
     """
     squares = np.zeros(count)
     for row, boxes in enumerate(group_boxes(shown, count)):
@@ -188,19 +192,19 @@ def left_by_poses(views: Views, changes: NDArray[np.float64], shown: NDArray[np.
 
 def shared_by_neighbours(views: Views, shown: NDArray[np.int64], count: int, errors: PoseErrors
                          ) -> NDArray[np.float64]:
-    """Return by how much each landmark's part of the map is off as a whole (count, 2) [m] [deg].
+    """Return the error of the part of the map around each landmark (count, 2) [m] [deg].
 
-    The part is the landmarks that some frame shows together with it, and the frames that saw any
-    of them. It is displaced on each axis, and turned about the cameras that saw it. The mean of
-    errors of a stationary process of deviation sigma that forgets itself as exp(-|t - s| / tau)
-    has, over n frames, the variance
+    The part consists of the landmarks that some frame shows together with this one, and of the
+    frames that saw any of them. It is displaced on each axis, and rotated about the cameras that
+    saw it. For a stationary process of deviation sigma and correlation exp(-|t - s| / tau), the
+    mean error over n frames has the variance
 
-        sigma^2 / n_eff,   1 / n_eff = sum of exp(-|t_i - t_j| / tau) over i and j, over n^2.
+        sigma^2 / n_eff,   1 / n_eff = (sum over i and j of exp(-|t_i - t_j| / tau)) / n^2.
     """
     rows = np.nonzero(shown >= 0)[0]
     seen = csr_matrix((np.ones(len(rows), dtype=np.int32), (views.frames[rows], shown[rows])),
                       shape=(len(views.rotations), count))
-    # frames (F, L) that saw a landmark which is seen together with each
+    # (F, L): the frame saw a landmark that some frame shows together with this one
     near = (seen @ ((seen.T @ seen) > 0).astype(np.int32)).tocsc()
     near.sort_indices()
     shares = np.array([_share_left(
@@ -211,9 +215,9 @@ def shared_by_neighbours(views: Views, shown: NDArray[np.int64], count: int, err
 
 @compiled
 def _share_left(stamps_s, weights, correlation_s):
-    """Return the share of the variance that the weighted mean of some errors keeps.
+    """Return the variance of the weighted mean error, as a share of the variance of one error.
 
-    Stamps ascend.
+    The stamps ascend.
     """
     before, total, squares = 0.0, 0.0, 0.0
     for place in range(len(stamps_s)):

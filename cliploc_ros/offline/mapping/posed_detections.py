@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.core.observation import Detections
 
-# A focal length and a principal point that differ by less are of one camera that focuses.
+# Intrinsics that differ by a smaller share belong to one camera that refocuses.
 _SAME_CAMERA = 0.02
 _PER_BOX = ('bboxes_xyxy', 'classes', 'scores', 'depths', 'depth_spreads', 'embeddings',
             'open_edges')
@@ -22,13 +22,13 @@ _PER_BOX = ('bboxes_xyxy', 'classes', 'scores', 'depths', 'depth_spreads', 'embe
 
 @dataclass(frozen=True)
 class PosedDetections:
-    """Detections of F frames with their poses: n boxes of C classes, in the order of time.
+    """Detections and poses of F frames in the order of time: n boxes of C classes.
 
-    The frames of several cameras of one robot interleave.
+    The frames of several cameras of one robot are interleaved.
     """
 
     cameras: tuple[Camera, ...]  #: Of the undistorted images
-    map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses to map with
+    map_from_camera: NDArray[np.float64]  #: (F, 4, 4): the poses used for mapping
     stamps_s: NDArray[np.float64]  #: (F,): times of the images [s], ascending
     #: (F + 1,): frame f has the boxes from frame_offsets[f] up to frame_offsets[f + 1]
     frame_offsets: NDArray[np.int64]
@@ -36,21 +36,21 @@ class PosedDetections:
     class_names: tuple[str, ...]  #: The C detector classes
     classes: NDArray[np.int64]  #: (n,): index of each box's class
     scores: NDArray[np.float64]  #: (n,): detector confidences, 0 to 1
-    #: (n,): depth of what each box shows, along z of the camera, and half the distance between its
-    #: 16th and 84th percentile [m]; NaN where unknown
+    #: (n,): depth of the object in each box, along z of the camera, and half the distance between
+    #: its 16th and 84th percentile [m]; NaN where unknown
     depths: NDArray[np.float32] | None = None
     depth_spreads: NDArray[np.float32] | None = None
     embeddings: NDArray[np.float16] | None = None  #: (n, d): of the crops, unit rows
     encoder_key: str = ''  #: Identifies the encoder of the embeddings
-    #: (F, 4, 4): the same cameras by odometry, which drifts but does not jump; NaN where unknown
+    #: (F, 4, 4): camera poses by odometry, which drifts but does not jump; NaN where unknown
     odom_from_camera: NDArray[np.float64] | None = None
-    #: (n, 4): the edge lay at the border of the image, so the object may extend beyond it. For a
-    #: lens with distortion, whose border is not a straight line of the undistorted image; None: an
-    #: edge is open at the border of that.
+    #: (n, 4): the edge lay at the border of the original image, so the object may extend beyond
+    #: it. Needed for a distorted lens, as the border is not straight in the undistorted image.
+    #: None: edges at the border of the undistorted image are open.
     open_edges: NDArray[np.bool_] | None = None
-    #: (F,): the row of each frame's camera among the cameras; None: all are of the first
+    #: (F,): the row of each frame's camera in `cameras`; None: all frames are of the first one
     camera_rows: NDArray[np.int64] | None = None
-    camera_names: tuple[str, ...] = ('',)  #: Of the cameras; '' where the only one has no name
+    camera_names: tuple[str, ...] = ('',)  #: Of the cameras; '' for a single unnamed one
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -69,7 +69,7 @@ class PosedDetections:
 
     @cached_property
     def by_camera(self) -> NDArray[np.int64]:
-        """Return the frames (F,) camera after camera, those of each in the order of time."""
+        """Return the frames (F,) sorted by camera, and by time within each camera."""
         return np.argsort(self.frame_cameras, kind='stable')
 
     def camera_of(self, frame: int) -> Camera:
@@ -83,7 +83,7 @@ class PosedDetections:
             self.class_names[kind] for kind in self.classes[rows]), self.scores[rows])
 
     def name_of(self, frame: int) -> str:
-        """Return the name of a frame's camera; '' where there is one without a name."""
+        """Return the name of a frame's camera; '' for a single unnamed camera."""
         return self.camera_names[self.frame_cameras[frame]]
 
     @property
@@ -92,9 +92,9 @@ class PosedDetections:
         return self.map_from_camera[self.frame_cameras == 0]
 
     def every(self, step: int, first: int = 0) -> NDArray[np.int64]:
-        """Return each n-th frame of each camera, in the order of time.
+        """Return every n-th frame of each camera, in the order of time.
 
-        Of interleaved frames alone, each n-th one may be of the same camera.
+        Taking every n-th of the interleaved frames could select the frames of a single camera.
         """
         return np.sort(self.by_camera[first::step])
 
@@ -112,13 +112,13 @@ class PosedDetections:
             camera_rows=None if self.camera_rows is None else self.camera_rows[frames])
 
     def select_boxes(self, boxes: NDArray[np.bool_]) -> 'PosedDetections':
-        """Return all frames with some of their boxes: those of a mask (n,)."""
+        """Return all frames with the boxes that a mask (n,) selects."""
         counts = np.bincount(self.frames[boxes], minlength=len(self))
         return replace(
             self, frame_offsets=np.cumsum(np.concatenate([[0], counts])), **self._of(boxes))
 
     def _of(self, boxes: NDArray[Any]) -> dict[str, Any]:
-        """Return the arrays that have a row for each box, with some of the rows."""
+        """Return the given rows of all arrays that have a row for each box."""
         arrays = {name: getattr(self, name) for name in _PER_BOX}
         return {name: None if array is None else array[boxes] for name, array in arrays.items()}
 
@@ -127,31 +127,33 @@ class PosedDetections:
         return replace(self, map_from_camera=map_from_camera)
 
     def moved(self, scale: float, rotation: NDArray[np.float64]) -> 'PosedDetections':
-        """Return the same detections with other poses, see move_poses."""
+        """Return the same detections with scaled and rotated poses, see move_poses."""
         return self.with_poses(move_poses(self.map_from_camera, scale, rotation))
 
 
 def group_cameras(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], NDArray[np.int64]]:
-    """Return the cameras that stand for those of single images, and the row (F,) of each image.
+    """Merge the cameras of F images; return the merged cameras and the row (F,) of each image.
 
-    Cameras of one size that focus in other ways share one.
+    Cameras of one image size whose intrinsics differ only by refocusing are merged.
     """
     found: list[Camera] = []
     rows = {}
-    for one in dict.fromkeys(cameras):
-        def is_near(other: Camera, one: Camera = one) -> bool:
-            differences = np.array([one.fx - other.fx, one.fy - other.fy, one.cx - other.cx,
-                                    one.cy - other.cy]) / other.fx
-            return ((one.width, one.height) == (other.width, other.height)
+    for camera in dict.fromkeys(cameras):
+        def is_near(other: Camera, camera: Camera = camera) -> bool:
+            differences = np.array([camera.fx - other.fx, camera.fy - other.fy,
+                                    camera.cx - other.cx, camera.cy - other.cy]) / other.fx
+            return ((camera.width, camera.height) == (other.width, other.height)
                     and bool(np.abs(differences).max() < _SAME_CAMERA))
-        rows[one] = next((row for row, other in enumerate(found) if is_near(other)), len(found))
-        if rows[one] == len(found):
-            found.append(one)
-    return tuple(found), np.array([rows[one] for one in cameras], dtype=np.int64)
+        rows[camera] = next((row for row, other in enumerate(found) if is_near(other)),
+                            len(found))
+        if rows[camera] == len(found):
+            found.append(camera)
+    return tuple(found), np.array([rows[camera] for camera in cameras], dtype=np.int64)
 
 
 def names_of_group(cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return a name for each of several cameras of a folder, by its size; '' for a single one."""
+    """Return a name for each camera of a folder, by its image size; '' for a single camera."""
     if len(cameras) == 1:
         return ('',)
-    return tuple(f'{number}: {one.width}x{one.height}' for number, one in enumerate(cameras, 1))
+    return tuple(f'{number}: {camera.width}x{camera.height}'
+                 for number, camera in enumerate(cameras, 1))

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit the landmarks of a given map to the boxes of a recording.
 
-No landmark is found here: the map says what there is and about where, the boxes say where
-exactly.
+No landmarks are added: the map gives their classes and approximate positions, and the boxes refine
+them.
 """
 
 from dataclasses import dataclass, replace
@@ -29,15 +29,17 @@ from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 
-# Boxes overlap less with a landmark that is off than with a fitted one. The first rounds take
-# them from this IoU on.
+# Boxes overlap less with a displaced landmark than with a fitted one, so the first rounds
+# associate boxes from these lower IoUs on.
 _FIRST_IOUS = (0.05, 0.1)
-#: A map lies in the recording's coordinate frame if, as given, it explains this share of the boxes
-#: that it explains after fitting. On the frames of TUM fr3, maps with errors of 10 cm on each axis
+#: A map is in the recording's coordinate frame if, as given, it explains at least this share
+#: of the boxes that it explains after fitting. On the frames of TUM fr3, maps with errors of 10 cm
+#: on each axis
 # reach .70; maps that are off by 30 cm, 30 degrees or a scale of .8 reach at most .37.
 LEAST_EXPLAINED = 0.45
-# A landmark that moves farther than this, and than twice its greatest semi-axis, shows another
-# object. On the same frames, with errors of 15 cm on each axis, right ones move .49 m at most.
+# A landmark that moves farther than this, and than twice its greatest semi-axis, was fitted to
+# another object. On the same frames, with errors of 15 cm on each axis, correctly fitted landmarks
+# move by .49 m at most.
 _MAX_MOVE_M = 0.5
 
 
@@ -45,12 +47,12 @@ _MAX_MOVE_M = 0.5
 class RefitMap:
     """A map fitted to a recording: L landmarks in the order of the given map."""
 
-    landmark_map: LandmarkMap  #: All L landmarks. Those with a reason are as they were given.
-    #: Why a landmark could not be fitted; None where it was fitted, or was not chosen
+    landmark_map: LandmarkMap  #: All L landmarks; those with a reason are unchanged
+    #: Why a landmark could not be fitted; None if it was fitted, or was not chosen
     reasons: tuple[str | None, ...]
-    #: (L,): the landmark that each is one thing with; else its own row
+    #: (L,): the landmark that is the same object as each one; its own row if there is none
     part_of: NDArray[np.int64]
-    notes: tuple[str, ...]  #: What is wrong with the recording
+    notes: tuple[str, ...]  #: Problems with the recording
     #: Share of the boxes of the map's classes that a landmark explains
     explained_before: float
     explained: float
@@ -63,15 +65,16 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
               chosen: NDArray[np.bool_] | None = None) -> RefitMap:
     """Fit the chosen landmarks of a map to the boxes that show them.
 
-    Ids, labels, classes and class weights stay; a landmark that is one thing with others gets
-    theirs, too. Landmarks that are not chosen stay as they are, and keep the boxes that show them.
+    Ids, labels, classes and class weights are kept; a landmark that is the same object as others
+    also gets theirs. Landmarks that are not chosen are unchanged, and keep the boxes that show
+    them.
 
     Parameters
     ----------
     detections : PosedDetections
         In the coordinate frame of the map.
     chosen : ndarray (L,) of bool, optional
-        Landmarks to fit; all without it.
+        Landmarks to fit; default: all.
 
     Raises
     ------
@@ -106,14 +109,14 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     share_settled = explained_boxes(views, settled.select(is_own)).explained / share_known
     if share_before < LEAST_EXPLAINED * share_settled:
         raise MappingError(
-            f'the map does not lie where the boxes are: it explains {share_before:.0%} of them '
-            f"as given, and {share_settled:.0%} after fitting; bring it into the recording's "
-            'coordinate frame and to metres first')
+            f'the map does not match the boxes: it explains {share_before:.0%} of them as given, '
+            f"and {share_settled:.0%} after fitting; transform it to the recording's coordinate "
+            'frame, and to metres, first')
     if not (is_fitted | ~chosen).any():
         raise MappingError(
-            f'no landmark can be fitted, the first one because: {reasons[0]}; as given, the map '
-            f'explains {share_before:.0%} of the boxes: is it in their coordinate frame?')
-    # boxes of what is not fitted may belong to what is
+            f'no landmark can be fitted; for the first one, {reasons[0]}; as given, the map '
+            f'explains {share_before:.0%} of the boxes: check its coordinate frame')
+    # boxes of landmarks that were not fitted may belong to fitted ones
     landmarks = settled._replace(
         centers=np.where(is_fitted[:, None], settled.centers, given.centers),
         bases=np.where(is_fitted[:, None, None], settled.bases, given.bases))
@@ -138,7 +141,7 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
 
 def _reasons(views: Views, given: Landmarks, landmarks: Landmarks, part_of: NDArray[np.int64],
              evidence: Evidence, landmark_map: LandmarkMap) -> list[str | None]:
-    """Return why each landmark could not be fitted; None where it was."""
+    """Return why each landmark could not be fitted; None if it was."""
     reasons = reasons_against(landmarks, evidence, MappingOptions())
     moved_m = np.linalg.norm(landmarks.centers - given.centers, axis=1)
     sizes_m = np.linalg.norm(given.bases, axis=1).max(axis=1)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How large objects of a class are: evidence on landmarks, and on the scale of a map."""
+"""Sizes of objects by class: evidence on landmarks, and on the scale of a map."""
 
 from collections.abc import Iterable, Sequence
 from functools import cache
@@ -16,8 +16,8 @@ from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.views import NO_SIZE
 from cliploc_ros.offline.vocabulary.vocabulary import common_name
 
-# The scale of a map is told by as many classes as this. A whole map is off by more than this
-# factor before it is named: ellipsoids enclose objects loosely, or show parts of them. Guesses.
+# Least number of classes to estimate the scale of a map, and the least factor that is reported:
+# ellipsoids enclose objects loosely, or only parts of them. Guesses.
 _LEAST_CLASSES, _OFF = 3, 1.8
 # A landmark this many times longer than nearly all objects of its class is not one of them: its
 # boxes show several things. On five recordings nothing right exceeds 1.4, faults begin at 1.66.
@@ -32,12 +32,12 @@ class Size(NamedTuple):
 
     @property
     def most_m(self) -> float:
-        """Return the extent that nearly no object exceeds [m]."""
+        """Return the extent that almost no object exceeds [m]."""
         return self.extent_m * self.factor
 
 
 def size_of_class(name: str) -> Size | None:
-    """Return the size of objects of a class, which may have capitals; None: it has no size."""
+    """Return the size of objects of a class, ignoring the case of its name; None if unknown."""
     return _sizes().get(common_name(name))
 
 
@@ -65,9 +65,9 @@ def reasons_by_size(names: Sequence[str], extents_m: NDArray[np.float64]) -> lis
 
 
 def log_sizes(names: Iterable[str]) -> NDArray[np.float64]:
-    """Return how large objects of classes are (C, 2), as Views.sizes has it.
+    """Return the sizes of objects of the classes (C, 2), in the form of Views.sizes.
 
-    The factor within which nearly all objects lie counts as two standard deviations.
+    The factor that covers almost all objects counts as two standard deviations.
     """
     sizes = [size_of_class(name) for name in names]
     return np.array([NO_SIZE if size is None else
@@ -82,11 +82,11 @@ def _sizes() -> dict[str, Size]:
 
 
 def scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
-    """Return how many times too large a map is by the sizes of its objects.
+    """Estimate from the sizes of its objects by what factor a map is too large.
 
-    The median over classes of the median over their landmarks counts. Those that were seen from
-    one side are longer towards the camera than their objects, and do not count. None: too few
-    tell, or they fit.
+    The estimate is the median over classes of the median over their landmarks. Landmarks that were
+    seen from one side only are ignored: they are longer towards the camera than their objects.
+    None: too few classes have a size, or the sizes fit.
     """
     ratios: dict[str, list[float]] = {}
     sides = [detail.baseline_deg for detail in landmark_map.details] or [None] * len(landmark_map)

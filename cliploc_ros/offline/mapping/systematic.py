@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Corrections that all boxes share: other intrinsics, another mount or another clock.
+"""Find corrections that all boxes share: of the intrinsics, the mount or the clock.
 
-Each cause is a small correction x that all boxes share, fitted on its own next to a free
-correction of each landmark, which would hide it. With J the derivatives of the edges by x, those
-by the landmarks projected out, and robust weights W, each step is
+Each cause is a small correction x that all boxes share. It is fitted separately, together with
+free corrections of the landmarks, which may have absorbed a part of it. With J the derivatives of
+the edges by x, after projecting out those by the landmarks, and robust weights W, each step is
 
     dx = -S^-1 J^T W r,   S = J^T W J,   cov x = S^-1 (sum of g g^T) S^-1,
 
-where g are the gradients J^T W r of single viewpoints: edges of one viewpoint err alike, and the
-sum takes that into account (the sandwich estimator, White 1980).
+where g are the gradients J^T W r of single viewpoints. The errors of edges in one viewpoint are
+correlated, which the sum takes into account (the sandwich estimator, White 1980).
 """
 
 from dataclasses import dataclass, replace
@@ -29,16 +29,17 @@ from cliploc_ros.offline.mapping.views import Views
 _MIN_BOXES = 100
 _MAX_BOXES = 8_000
 _STEPS, _REFIT_STEPS = 8, 5
-# Deviations from zero that count, with at least this effect on the images [px], if the cause
-# removes this share of the robust cost. Guesses; on TUM fr3 the true camera removes 0.008.
+# A correction is significant at this many standard deviations from zero, with at least this effect
+# on the images [px], if its cause removes this share of the robust cost. Guesses; on TUM fr3 with
+# its true camera, 0.008 is removed.
 _SIGNIFICANT = 5.0
 _NOTABLE_PX = 1.0
 _MIN_EXPLAINED = 0.015
-# Beyond this, a change of the focal length is no small correction.
+# Greatest relative change of a focal length.
 _MAX_STRETCH = 0.5
 # Standard deviations of a mount that somebody measured with a ruler: 5 cm, 3 degrees. A guess.
 _MOUNT_PRIOR = np.repeat([0.05, np.radians(3.0)], 3)
-# A part that the boxes leave more uncertain than this share of the prior is not observable.
+# A component whose deviation is greater than this share of the prior's is not observable.
 _OBSERVABLE = 0.5
 _MOUNT = ('x (right)', 'y (down)', 'z (forward)', 'rotation about x', 'rotation about y',
           'rotation about z')
@@ -55,11 +56,11 @@ class Correction:
     #: The correction that fits best, and its standard deviation, in the unit
     value: float
     deviation: float
-    #: By how much the correction moves a point 300 px off the middle, or at 2 m [px]
+    #: Displacement by the correction of a point 300 px off the image centre, or at 2 m [px]
     effect_px: float
     is_significant: bool
     explained: float  #: Share of the robust cost of all edges that its cause removes, 0 to 1
-    #: It is hardly significant any more once the cause that explains most is corrected
+    #: It is no longer significant once the cause that explains most is corrected
     follows: bool = False
 
 
@@ -73,7 +74,7 @@ class _Cause(NamedTuple):
     effects_px: tuple[float, ...]  # of one shown unit
     camera: Camera
     boxes: NDArray[np.bool_]  # (n,): those of the camera
-    # (F, 6, G): how the map moves in the cameras; None: the numbers are intrinsics
+    # (F, 6, G): motion of the map in the cameras per unit of each number; None: intrinsics
     motions: NDArray[np.float64] | None
 
     def differentiate(self, views: Views, linear: Linear) -> NDArray[np.float64]:
@@ -81,7 +82,7 @@ class _Cause(NamedTuple):
         if self.motions is not None:
             return np.einsum('mep,mpg->meg', linear.by_pose,
                              self.motions[views.frames[linear.rows]])
-        # a measured edge e = (px - c) / f gets smaller with f and c, its residual greater
+        # a measured edge e = (px - c) / f decreases with f and c, so its residual increases
         edges, stiffness = views.edges[linear.rows], views.stiffness[linear.rows]
         by_number = np.zeros((len(edges), 4, 4))
         for axis, focal in enumerate((self.camera.fx, self.camera.fy)):
@@ -97,13 +98,13 @@ class _Cause(NamedTuple):
         scale = np.tile(1.0 + np.clip(values[:2], -_MAX_STRETCH, _MAX_STRETCH), 2)
         shift = np.tile(values[2:] / [self.camera.fx, self.camera.fy], 2)
         own = self.boxes[:, None]
-        # deviations are in pixels: else a longer focal length would shrink all residuals
+        # deviations are in pixels: otherwise, a longer focal length would shrink all residuals
         return views._replace(edges=np.where(own, (views.edges - shift) / scale, views.edges),
                               stiffness=views.stiffness * np.where(own, scale, 1.0))
 
 
 class _Fit(NamedTuple):
-    """A cause that fits best: its numbers, and the views and landmarks with them."""
+    """The best fit of a cause: its corrections, and the corrected views and landmarks."""
 
     corrections: tuple[Correction, ...]
     views: Views
@@ -116,10 +117,10 @@ class _Fit(NamedTuple):
 
 def find_corrections(detections: PosedDetections, views: Views, landmarks: Landmarks,
                      shown: NDArray[np.int64]) -> list[Correction]:
-    """Return the corrections that fit the edges best; none of a camera with too few boxes.
+    """Return the corrections that fit the edges best; none for cameras with too few boxes.
 
-    The landmarks are fitted to these boxes. Each camera is corrected on its own, while the
-    landmarks fit the boxes of all.
+    The landmarks are fitted to these boxes. Each camera is corrected separately, while the
+    landmarks fit the boxes of all cameras.
     """
     shown, found = _sample(shown), list[Correction]()
     for number, camera in enumerate(detections.cameras):
@@ -128,7 +129,7 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
         name = f' of {detections.camera_names[number]}' if len(detections.cameras) > 1 else ''
         causes = _causes(camera, views, number)
         fits = [_fit(cause, views, landmarks, shown) for cause in causes]
-        best = max(fits, key=lambda one: one.is_significant * one.corrections[0].explained)
+        best = max(fits, key=lambda fit: fit.is_significant * fit.corrections[0].explained)
         for cause, fit in zip(causes, fits, strict=True):
             follows = False
             if fit is not best and fit.is_significant:
@@ -141,7 +142,7 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
 
 
 def _causes(camera: Camera, views: Views, number: int) -> tuple[_Cause, ...]:
-    """Return the causes of residuals of a camera, given its number among the cameras."""
+    """Return the possible causes of residuals of a camera, given its number among the cameras."""
     focal = 0.5 * (camera.fx + camera.fy)
     degree_px = float(np.radians(1.0)) * focal
     own = views.cameras == number
@@ -152,7 +153,7 @@ def _causes(camera: Camera, views: Views, number: int) -> tuple[_Cause, ...]:
                               'principal point cy'),
                ('%', '%', 'px', 'px'), (100.0, 100.0, 1.0, 1.0), (3.0, 3.0, 1.0, 1.0),
                *of_camera, None),
-        # the numbers move the map in the camera: the camera moves against it
+        # the numbers move the map in the camera, so the camera moves the opposite way
         _Cause('mount', tuple(f'mount {name}' for name in _MOUNT), ('cm',) * 3 + ('deg',) * 3,
                (-100.0,) * 3 + (-float(np.degrees(1.0)),) * 3,
                (focal / 200.0, focal / 200.0, 1.5, degree_px, degree_px,
@@ -163,7 +164,7 @@ def _causes(camera: Camera, views: Views, number: int) -> tuple[_Cause, ...]:
 
 
 def _twists(views: Views, is_own: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return how the map moves in a camera (F, 6) [m/s] [rad/s], by central differences."""
+    """Return the velocity of the map in a camera (F, 6) [m/s] [rad/s], by central differences."""
     rotations, translations = views.rotations, views.translations
     own = np.nonzero(is_own)[0]
     later, earlier = np.arange(len(rotations)), np.arange(len(rotations))
@@ -186,7 +187,7 @@ def _move_map(views: Views, motions: NDArray[np.float64]) -> Views:
 
 
 class _Descent(NamedTuple):
-    """The numbers (G,) of a cause that fit best, their deviations, and what fits them."""
+    """The best-fitting numbers (G,) of a cause, their deviations, and the corrected state."""
 
     values: NDArray[np.float64]
     deviations: NDArray[np.float64]
@@ -200,14 +201,14 @@ def _descend(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[n
              ) -> _Descent:
     """Return the best-fitting values of a cause, from a start.
 
-    The prior (G,) has inverse variances about zero. The descent ends after a step below the
+    The prior (G,) holds inverse variances about zero. The descent ends after a step below the
     precision times the deviations.
     """
     values, views = start, cause.apply(given, start) if start.any() else given
     linear = linearize_boxes(views, shown, landmarks)
 
     def cost_of(linear: Linear, values: NDArray[np.float64]) -> float:
-        # the prior's cost on the scale of _cost_of, whose residuals have LOSS_SCALE
+        # the prior's cost on the scale of _cost_of, whose residuals are divided by LOSS_SCALE
         return _cost_of(linear) + float((prior * values ** 2).sum()) / LOSS_SCALE ** 2
 
     for _ in range(steps):
@@ -225,8 +226,8 @@ def _descend(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[n
 
 def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> _Fit:
     """Return the best-fitting values of a cause."""
-    nothing = np.zeros(len(cause.names))
-    found = _descend(cause, given, landmarks, shown, nothing, nothing, _STEPS, 0.2)
+    zeros = np.zeros(len(cause.names))
+    found = _descend(cause, given, landmarks, shown, zeros, zeros, _STEPS, 0.2)
     own = cause.boxes[found.linear.rows]
     before = _cost_of(linearize_boxes(given, shown, landmarks), own)
     explained = max(0.0, 1.0 - _cost_of(found.linear, own) / max(before, 1e-12))
@@ -243,7 +244,7 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.in
 
 
 def _cost_of(linear: Linear, rows: NDArray[np.bool_] | slice = slice(None)) -> float:
-    """Return the robust cost of residuals; their weight is 1 / (1 + r^2 / c^2)."""
+    """Return the robust cost of residuals, whose weights are 1 / (1 + r^2 / c^2)."""
     weights = linear.weights[rows]
     return float(-np.log(weights[weights > 0.0]).sum())
 
@@ -269,14 +270,14 @@ def _solve(views: Views, derivatives: NDArray[np.float64], linear: Linear,
 
 def _without_landmarks(derivatives: NDArray[np.float64], linear: Linear
                        ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return derivatives and residuals, less what corrections of the landmarks explain."""
+    """Project corrections of the landmarks out of the derivatives and the residuals."""
     free, residuals = derivatives.copy(), linear.residuals.copy()
     for rows in group_boxes(linear.numbers, int(linear.numbers.max()) + 1):
         if len(rows) == 0:
             continue
         by_landmark, weights = linear.by_landmark[rows], linear.weights[rows]
         normal = np.einsum('mei,me,mej->ij', by_landmark, weights, by_landmark)
-        normal += 0.5 * np.eye(LANDMARK_SIZE)  # weak, as the prior on the axes
+        normal += 0.5 * np.eye(LANDMARK_SIZE)  # as weak as the prior on the axes
         mixed = np.einsum('mei,me,meg->ig', by_landmark, weights, free[rows])
         pull = np.einsum('mei,me,me->i', by_landmark, weights, residuals[rows])
         free[rows] -= by_landmark @ np.linalg.solve(normal, mixed)
@@ -287,9 +288,9 @@ def _without_landmarks(derivatives: NDArray[np.float64], linear: Linear
 class MountCorrection(NamedTuple):
     """A correction of the mount of the camera: one small motion that all frames share.
 
-    It has a prior about zero. Some motions do not show every part of it: a robot that turns about
-    the vertical only cannot tell a higher camera from a lower floor. Such a part stays with the
-    prior, near zero, and the report names it.
+    It has a prior about zero. Some motions do not reveal every component: a robot that only turns
+    about the vertical cannot distinguish a higher camera from a lower floor. The prior keeps such
+    a component near zero, and the report names it.
     """
 
     views: Views  #: With the correction applied
@@ -299,7 +300,7 @@ class MountCorrection(NamedTuple):
     deviations: NDArray[np.float64]
 
     def lines(self) -> list[str]:
-        """Return the corrections, and the parts that this motion does not show."""
+        """Return the corrections, and the components that this motion does not reveal, as text."""
         turn = Rotation.from_matrix(self.given_from_corrected[:3, :3]).as_rotvec()
         factors = np.repeat([100.0, np.degrees(1.0)], 3)
         values = np.concatenate([self.given_from_corrected[:3, 3], turn]) * factors
@@ -318,10 +319,10 @@ def refine_mount(detections: PosedDetections, given: Views, landmarks: Landmarks
                  shown: NDArray[np.int64], start: Views) -> MountCorrection:
     """Return the correction of the mount of the only camera that fits the boxes best.
 
-    The landmarks are fitted to the poses of start: the given views, or those of an earlier
+    The landmarks are fitted to the poses of start: the given views, or the views of an earlier
     correction.
     """
-    # by how much the map was moved in the cameras (6,): translation, rotation
+    # motion of the map in the cameras from given to start (6,): translation, rotation
     turn = start.rotations[0] @ given.rotations[0].T
     values = np.concatenate([start.translations[0] - turn @ given.translations[0],
                              Rotation.from_matrix(turn).as_rotvec()])
@@ -333,7 +334,7 @@ def refine_mount(detections: PosedDetections, given: Views, landmarks: Landmarks
 
 
 def _sample(shown: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the landmark that each of some boxes shows, -1 for the others, evenly chosen."""
+    """Return the landmark that each of an even sample of boxes shows, -1 for all other boxes."""
     rows = np.nonzero(shown >= 0)[0]
     rows, sample = rows[::max(1, -(-len(rows) // _MAX_BOXES))], np.full(len(shown), -1)
     sample[rows] = shown[rows]

@@ -1,27 +1,28 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The vertical of a recording, by how its cameras were held."""
+"""Estimate the vertical of a recording from the tilt of its cameras."""
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-# Images look along the ground; a camera that only turns about its own x axis tells no vertical.
+# Cameras look along the ground; one that only turns about its own x axis shows no vertical.
 _LEAST_SPREAD = np.sin(np.radians(8.0)) ** 2
 _MOST_SHARE = 0.25
 _LEAST_UPRIGHT = 0.5
-# A vertical by the tilt of hand-held cameras is as good as this.
+# Accuracy of a vertical that is estimated from the tilt of hand-held cameras.
 _MOST_TILT_DEG = 5.0
 #: Why a recording cannot be levelled.
-NO_VERTICAL = ('the cameras do not tell the vertical: they turn too little, or were held on their '
-               'side; leave out `level`')
+NO_VERTICAL = ('the vertical is unknown: the cameras turn too little, or were held on their side; '
+               'leave out `level`')
 
 
 def find_vertical(poses: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Return the direction (3,) that points up in the poses' coordinate frame.
 
-    People hold a camera level: its x axis is horizontal, so up is the direction with the least
-    share of the x axes, and the upper edge of the image points there on average.
+    People hold a camera level, with its x axis horizontal. Up is therefore the direction along
+    which the x axes have the least extent, and in which the upper edge of the image points on
+    average.
 
     Parameters
     ----------
@@ -30,7 +31,7 @@ def find_vertical(poses: NDArray[np.float64]) -> NDArray[np.float64] | None:
     Returns
     -------
     ndarray or None
-        None where the cameras do not tell: they never turn, or are held on their side.
+        None if the vertical is unknown: the cameras never turn, or are held on their side.
     """
     level, image_up = poses[:, :3, 0], -poses[:, :3, 1]
     shares, directions = np.linalg.eigh(level.T @ level / len(level))
@@ -52,17 +53,17 @@ def rotation_to_z(up: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
 
 
 def find_tilt(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], float] | None:
-    """Return the rotation (3, 3) that turns z up, and how far off it is [deg].
+    """Return the rotation (3, 3) that turns z up, and its angle [deg].
 
-    None where the cameras with poses (n, 4, 4) do not tell, see find_vertical.
+    None if the vertical of the poses (n, 4, 4) is unknown, see find_vertical.
     """
     up = find_vertical(poses) if len(poses) else None
     return None if up is None else rotation_to_z(up)
 
 
 def tilt_note(poses: NDArray[np.float64]) -> str:
-    """Return a note where z is off the vertical of the cameras; '' elsewhere."""
+    """Return a note if z is off the vertical of the cameras, '' otherwise."""
     found = find_tilt(poses)
     return '' if found is None or found[1] < _MOST_TILT_DEG else (
         f'z is {found[1]:.0f} degrees off the vertical of the cameras: heights and views from '
-        'above mean nothing; build_map --level turns it up')
+        'above are meaningless; build_map --level corrects it')

@@ -3,9 +3,10 @@
 """Find landmarks among the boxes of one class: sequential RANSAC over pairs of boxes.
 
 A pair of boxes with enough parallax gives a hypothesis: a sphere where the rays of their centres
-meet, fitted to the eight edges. Its support are the frames with a box that it overlaps well. The
-hypothesis with the greatest support is fitted to that support and takes its boxes away; then the
-next. Every box is the seed of some hypotheses, so that rare objects get their share.
+meet, fitted to the eight edges. Its support is the set of frames with a box that it overlaps well.
+The hypothesis with the greatest support is fitted to it, its boxes are removed, and the search
+continues. Every box is the seed of some hypotheses, so that rarely detected objects are found,
+too.
 """
 
 from dataclasses import replace
@@ -30,23 +31,26 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.sizes import log_sizes
 from cliploc_ros.offline.mapping.views import Views
 
-# How far the centre lies behind the surface, in radii that the box suggests, and the standard
-# deviation of this share. Guesses: 1 for a ball, 0 for a picture on a wall.
+# Distance of the centre behind the visible surface, as a share of the radius that the box
+# suggests, and its standard deviation. Guesses: the share is 1 for a ball, 0 for a picture on a
+# wall.
 _CENTER_SHARE, _CENTER_SIGMA = 0.6, 0.5
-# Error of the measured depth itself, as a share of it.
+# Relative error of the measured depth.
 _DEPTH_SIGMA = 0.05
-# Landmarks with this much parallax tell the scale of depth without it.
+# Landmarks with at least this parallax are located without depth, and give its scale.
 _LEAST_BASELINE_DEG = 20.0
 _LEAST_LANDMARKS = 3
 # A scale this far from 1 is a wrong unit, not an error of calibration.
 _UNIT_FACTOR = 1.6
-# A smaller error of scale is below what this estimate can tell.
+# Smaller errors of scale are within the error of this estimate.
 _LEAST_CORRECTION = 0.02
 
-# With depth a landmark may deviate this much [m]: along the rays, which its boxes hardly show.
-# Chosen on the kitchen's frames, where half of it leaves out a sixth of the explained boxes.
+# Greatest deviation of a landmark with depth [m]; it lies along the rays, where boxes hardly
+# constrain it. Chosen on the kitchen's frames, where half this limit leaves out a sixth of the
+# explained boxes.
 _MAX_POSITION_SIGMA_M = 0.15
-# Angles between the rays of a pair: less leaves the depth open, more shows other sides.
+# Range of the angle between the rays of a pair: below it, the depth is uncertain; above it, the
+# boxes show different sides of the object.
 _PARALLAX_DEG = (5.0, 75.0)
 _GREATEST_COSINE, _LEAST_COSINE = (float(value) for value in np.cos(np.radians(_PARALLAX_DEG)))
 _MAX_GAP_S = 30.0
@@ -55,24 +59,24 @@ _MAX_GAP_S = 30.0
 _MAX_MISS = 0.6
 _MAX_RADIUS_RATIO = 1.6
 _MIN_DEPTH_M = 0.1
-# Hypotheses that each box is the seed of, and the steps in which each is fitted.
+# Number of hypotheses with each box as seed, and of steps in which each is fitted.
 _PAIRS_PER_BOX, _PAIR_STEPS = 3, 6
-#: A frame supports a landmark that overlaps one of its boxes more than this.
+#: A frame supports a landmark if one of its boxes overlaps it by more than this IoU.
 SUPPORT_IOU = 0.45
 
 
 def options_with_depth(options: MappingOptions) -> MappingOptions:
-    """Return options for boxes with depth: the deviation of a position replaces parallax."""
+    """Return options for boxes with depth: they limit the deviation, not the parallax."""
     return replace(options, min_baseline_deg=0.0, max_position_sigma_m=max(
         options.max_position_sigma_m, _MAX_POSITION_SIGMA_M))
 
 
 def add_depths(views: Views, detections: PosedDetections,
                scales: NDArray[np.float64] | None = None) -> Views:
-    """Return views that know how deep the centre of each box's object lies, and class sizes.
+    """Add the depth of the object's centre for each box, and the sizes of classes, to views.
 
-    With depth, boxes of one side place a landmark, but leave open how long it is along the rays.
-    The scales are true depth divided by measured depth, of each camera; None: all are 1.
+    With depth, boxes from one side locate a landmark, but do not constrain its length along the
+    rays. The scales are true depth divided by measured depth, for each camera; None: all are 1.
     """
     assert detections.depths is not None
     scale = 1.0 if scales is None else scales[views.cameras[views.frames]]
@@ -80,7 +84,7 @@ def add_depths(views: Views, detections: PosedDetections,
     spreads = (np.zeros_like(surfaces) if detections.depth_spreads is None
                else scale * detections.depth_spreads)
     radii = box_radii(views, np.arange(len(surfaces)))
-    # the half extent of a box at the centre's depth, which lies deeper by a share of it
+    # the centre lies deeper than the surface by a share of the box's half extent at its depth
     centers = surfaces / np.maximum(0.2, 1.0 - _CENTER_SHARE * radii)
     sigmas = np.sqrt(np.square(_DEPTH_SIGMA * centers) + np.square(spreads)
                      + np.square(_CENTER_SIGMA * radii * centers))
@@ -91,14 +95,14 @@ def add_depths(views: Views, detections: PosedDetections,
 
 
 def box_radii(views: Views, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the half extents (m,) of boxes on the plane z = 1, geometric means of both."""
+    """Return the half extents (m,) of boxes on the plane z = 1: geometric means over both axes."""
     extents = views.edges[rows, 2:] - views.edges[rows, :2]
     return np.asarray(0.5 * np.sqrt(np.prod(np.maximum(extents, 0.0), axis=1)))
 
 
 def depth_hypotheses(views: Views, rows: NDArray[np.int64]
                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return centres (h, 3) and bases (h, 3, 3) of spheres where depth says that objects are."""
+    """Return centres (h, 3) and bases (h, 3, 3) of spheres at the measured depths of boxes."""
     rows = rows[views.depth_stiffness[rows] > 0.0]
     edges, depths, frames = views.edges[rows], views.depths[rows], views.frames[rows]
     points = np.concatenate([0.5 * (edges[:, :2] + edges[:, 2:]), np.ones((len(rows), 1))], axis=1)
@@ -111,10 +115,10 @@ def depth_hypotheses(views: Views, rows: NDArray[np.int64]
 
 def scaled_depths(views: Views, detections: PosedDetections, landmarks: Landmarks,
                   shown: NDArray[np.int64]) -> tuple[Views, list[str]]:
-    """Return the views with depth of the right scale, and notes; each camera has its own scale.
+    """Return the views with depth, corrected by a scale for each camera, and notes.
 
-    The landmarks are fitted to boxes only; those with enough parallax tell the scale.
-    MappingError: a scale is so far off that depth must have another unit.
+    The landmarks are fitted to boxes only. Those with enough parallax determine the scale.
+    MappingError: a scale is so far off that the unit of depth must be wrong.
     """
     baselines_deg = gather_evidence(views, landmarks, shown).baseline_deg
     measured = add_depths(views, detections)
@@ -127,18 +131,18 @@ def scaled_depths(views: Views, detections: PosedDetections, landmarks: Landmark
         of = f' of {name}' if len(kept) > 1 else ''
         if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
             raise MappingError(
-                f'measured depth{of} is {1.0 / scale:.3g} times what boxes and poses say: wrong '
-                f'unit? multiply `depth_unit` by {scale:.3g}, check the poses are in metres, or '
-                'leave depth out')
+                f'measured depth{of} is {1.0 / scale:.3g} times the depth by boxes and poses: '
+                f'wrong unit? multiply `depth_unit` by {scale:.3g}, check that the poses are in '
+                'metres, or leave depth out')
         kept[number] = scale
-        notes.append(f'measured depth{of} is {1.0 / scale:.3f} times what boxes and poses say; '
-                     'it is corrected by that')
+        notes.append(f'measured depth{of} is {1.0 / scale:.3f} times the depth by boxes and '
+                     'poses; it is corrected by this factor')
     return (add_depths(views, detections, kept) if notes else measured), notes
 
 
 def _depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
                  baselines_deg: NDArray[np.float64]) -> float | None:
-    """Return true depth divided by measured depth; None where too few landmarks tell.
+    """Return true depth divided by measured depth; None if too few landmarks determine it.
 
     The array shown (n,) is -1 for boxes of other cameras.
     """
@@ -156,9 +160,10 @@ def _depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
 
 def triangulate(views: Views, rows: NDArray[np.int64], min_viewpoints: int,
                 rng: np.random.Generator) -> Landmarks:
-    """Return landmarks that explain boxes of one class, given in the order of time.
+    """Find landmarks that explain boxes of one class, given in the order of time.
 
-    Each is the hypothesis that covers the most free boxes; a box belongs to at most one.
+    Each landmark is the hypothesis that covers the most free boxes. A box belongs to at most one
+    landmark.
     """
     if len(rows) < min_viewpoints:
         return Landmarks.none()
@@ -199,7 +204,7 @@ def triangulate(views: Views, rows: NDArray[np.int64], min_viewpoints: int,
 def _settle(views: Views, free_rows: NDArray[np.int64], support: NDArray[np.int64],
             center: NDArray[np.float64], basis: NDArray[np.float64]
             ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Fit a hypothesis to its support as long as that grows; return ellipsoid and support."""
+    """Fit a hypothesis to its support while the support grows; return ellipsoid and support."""
     frames, starts = np.unique(views.frames[free_rows], return_index=True)
     starts = np.append(starts, len(free_rows))
     for _ in range(5):
@@ -216,7 +221,7 @@ def _settle(views: Views, free_rows: NDArray[np.int64], support: NDArray[np.int6
 
 @compiled
 def _pair_hypotheses(views, rows, seeds, draws):
-    """Return centres (h, 3) and bases (h, 3, 3) of pairs: each seed with a random partner."""
+    """Return centres (h, 3) and bases (h, 3, 3) of pairs, each of a seed and a random partner."""
     centers, bases = np.empty((len(seeds), 3)), np.empty((len(seeds), 3, 3))
     origins, rays, radii = _rays_of(views, rows)
     stamps = views.stamps_s[views.frames[rows]]
@@ -267,7 +272,7 @@ def _rays_of(views, rows):
 
 @compiled
 def _meet(origins, rays, radii, first, second, point):
-    """Write the point where two rays meet; return the object's radius, 0 where they do not."""
+    """Write the point where two rays meet; return the object's radius, 0 if they do not meet."""
     cosine = (rays[first, 0] * rays[second, 0] + rays[first, 1] * rays[second, 1]
               + rays[first, 2] * rays[second, 2])
     if not _LEAST_COSINE <= cosine <= _GREATEST_COSINE:
@@ -288,16 +293,16 @@ def _meet(origins, rays, radii, first, second, point):
     radius = 0.5 * (radius_first + radius_second)
     miss = 0.0
     for i in range(3):
-        one = origins[first, i] + depth_first * rays[first, i]
-        other = origins[second, i] + depth_second * rays[second, i]
-        miss += (one - other) ** 2
-        point[i] = 0.5 * (one + other)
+        on_first = origins[first, i] + depth_first * rays[first, i]
+        on_second = origins[second, i] + depth_second * rays[second, i]
+        miss += (on_first - on_second) ** 2
+        point[i] = 0.5 * (on_first + on_second)
     return radius if miss < (_MAX_MISS * radius) ** 2 else 0.0
 
 
 @compiled
 def _support(views, rows, frames, starts, center, basis):
-    """Return the best box (s,) of each frame that overlaps an ellipsoid well."""
+    """Return the best box (s,) in each frame that supports an ellipsoid."""
     found = np.empty(len(frames), dtype=np.int64)
     count = 0
     box = np.empty(4)

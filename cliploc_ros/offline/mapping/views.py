@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Posed detections as the kernels of mapping read them: boxes and poses on the plane z = 1."""
+"""Arrays of posed detections for the kernels of mapping: boxes and poses on the plane z = 1."""
 
 from typing import NamedTuple
 
@@ -12,11 +12,11 @@ from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE
 
-#: In Views.sizes.
+#: Entry of Views.sizes for a class without a known size.
 NO_SIZE = (np.inf, 1.0)
 # An edge this near to the image border is open: the object may extend beyond it.
 _BORDER_PX = 3.0
-# Two frames less than this apart in both show a landmark from one viewpoint.
+# Frames that are closer than both limits share a viewpoint.
 _VIEWPOINT_DISTANCE_M = 0.1
 _VIEWPOINT_ANGLE_DEG = 5.0
 # No robot or person with a camera is faster.
@@ -24,25 +24,25 @@ _MAX_SPEED_M_PER_S = 10.0
 _MAX_TURN_DEG_PER_S = 720.0
 _LEAST_JUMP_M, _LEAST_JUMP_DEG = 0.5, 30.0
 _MAX_EMPTY_SHARE = 0.5
-# A camera that moves by more than this, seen from the first one, is on no rig with it.
+# A camera that moves by more than this relative to the first one is not on a rig with it.
 _MOST_PLAY_M = 0.5
 
 
 class Views(NamedTuple):
-    """F frames with n boxes. Everything in the image is on the plane z = 1."""
+    """F frames with n boxes. Image coordinates are on the plane z = 1."""
 
     #: (F, 3, 3), (F, 3): of camera_from_map
     rotations: NDArray[np.float64]
     translations: NDArray[np.float64]
     stamps_s: NDArray[np.float64]  #: (F,): [s]
     cameras: NDArray[np.int64]  #: (F,): number of the camera of each frame
-    #: (F, 3): where each camera is in the map's axes, seen from the first camera at that time [m]:
-    #: a rigid rig errs as a whole, so that a turn of it moves this camera, too
+    #: (F, 3): offset of each camera from the first camera at that time, in the map's axes [m]. The
+    #: rig is rigid: an error of its rotation also displaces this camera.
     levers: NDArray[np.float64]
     #: (F,): number of the viewpoint of each frame, ascending for each camera: frames that a camera
-    #: took without moving share one
+    #: took without moving share a viewpoint
     viewpoints: NDArray[np.int64]
-    #: (F,): one over the number of frames of the same viewpoint: their boxes err alike
+    #: (F,): one over the number of frames of the viewpoint, as the errors of their boxes are equal
     weights: NDArray[np.float64]
     offsets: NDArray[np.int64]  #: (F + 1,): first box of each frame
     #: (n,): of each box
@@ -58,12 +58,12 @@ class Views(NamedTuple):
     depths: NDArray[np.float64]
     depth_stiffness: NDArray[np.float64]
     #: (n, 2): logarithm of half the longest extent [m] of objects of the box's class and its
-    #: inverse standard deviation, see cliploc_ros.offline.mapping.sizes; of recordings with depth
+    #: inverse standard deviation, see cliploc_ros.offline.mapping.sizes; only with depth
     sizes: NDArray[np.float64]
 
     @property
     def centers(self) -> NDArray[np.float64]:
-        """Return where the cameras were (F, 3) [m]."""
+        """Return the centres of the cameras (F, 3) [m]."""
         return np.asarray(-np.einsum('fji,fj->fi', self.rotations, self.translations))
 
     @property
@@ -76,7 +76,7 @@ class Views(NamedTuple):
 
     @property
     def without_sizes(self) -> 'Views':
-        """Return the same views with classes of no known size."""
+        """Return the same views without the sizes of classes."""
         return self._replace(sizes=np.tile(NO_SIZE, (len(self.frames), 1)))
 
     def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'Views':
@@ -99,12 +99,13 @@ class Views(NamedTuple):
 
 
 def make_views(detections: PosedDetections) -> Views:
-    """Return the arrays of posed detections that the kernels read."""
+    """Convert posed detections to the arrays that the kernels read."""
     boxes_px, is_open = detections.bboxes_xyxy, detections.open_edges
     of_boxes = detections.frame_cameras[detections.frames]
-    sizes = np.array([[one.width, one.height] * 2 for one in detections.cameras], dtype=np.float64)
-    focals = np.array([[one.fx, one.fy] * 2 for one in detections.cameras])
-    principals = np.array([[one.cx, one.cy] * 2 for one in detections.cameras])
+    sizes = np.array([[camera.width, camera.height] * 2 for camera in detections.cameras],
+                     dtype=np.float64)
+    focals = np.array([[camera.fx, camera.fy] * 2 for camera in detections.cameras])
+    principals = np.array([[camera.cx, camera.cy] * 2 for camera in detections.cameras])
     bounds_px = np.concatenate([0.0 * sizes[:, :2], sizes[:, 2:]], axis=1)
     if is_open is None:
         boxes_px = np.clip(boxes_px, 0.0, sizes[of_boxes])
@@ -129,7 +130,7 @@ def make_views(detections: PosedDetections) -> Views:
 
 
 def at_border(boxes_px: NDArray[np.float64], sizes: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which edges of boxes (n, 4) lie at the border of their images.
+    """Return a mask (n, 4) of the edges of boxes that lie at the border of their images.
 
     The sizes (n, 4), or (4,), are width, height, width, height [px].
     """
@@ -140,9 +141,9 @@ def at_border(boxes_px: NDArray[np.float64], sizes: NDArray[np.float64]) -> NDAr
 def _levers(detections: PosedDetections) -> NDArray[np.float64]:
     """Return the levers (F, 3) of Views [m].
 
-    A camera's place on the rig is the median of where it was, seen from the first camera, whose
-    poses are interpolated. Of a camera that moves on its robot it is an approximation. Cameras
-    that move on their own, as those of a folder of photos, have none.
+    The position of a camera on the rig is the median of its positions relative to the first
+    camera, whose poses are interpolated. This is an approximation for a camera that moves on its
+    robot. Cameras that move independently, like those of a folder of photos, have no levers.
     """
     cameras, poses = detections.frame_cameras, detections.map_from_camera
     levers, first = np.zeros((len(cameras), 3)), np.nonzero(cameras == 0)[0]
@@ -167,7 +168,7 @@ def _inverses(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
-    """Return a mask (F,) of a number of frames of each viewpoint at most, evenly chosen."""
+    """Return a mask (F,) that keeps an even sample of at most `most` frames of each viewpoint."""
     order = np.argsort(views.viewpoints, kind='stable')
     _, starts, of_frames, counts = np.unique(
         views.viewpoints[order], return_index=True, return_inverse=True, return_counts=True)
@@ -179,10 +180,10 @@ def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
 
 
 def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:
-    """Return which viewpoint each of F frames belongs to, ascending from 0, camera by camera.
+    """Return the number of the viewpoint (F,) of each frame, ascending from 0, camera by camera.
 
-    A viewpoint ends with the first frame of its camera that differs from its first one by 10 cm or
-    5 degrees.
+    A new viewpoint begins as soon as a frame differs from the first frame of the current one by
+    more than 10 cm or 5 degrees.
     """
     poses, cameras = detections.map_from_camera, detections.frame_cameras
     viewpoints = np.zeros(len(poses), dtype=np.int64)
@@ -214,14 +215,13 @@ def check_input(detections: PosedDetections, views: Views,
         raise MappingError(f'the camera took {viewpoints} viewpoints, at least '
                            f'{min_viewpoints} are needed; move it around the objects, and '
                            'check that the poses are those of the images')
-    # the pose moves faster than any camera does
     jumps = np.sort(np.concatenate([
         _jumps(detections.map_from_camera[own], detections.stamps_s[own])
         for own in (views.cameras == number for number in range(len(detections.cameras)))]))
     notes = []
     if len(jumps):
         notes.append(f'the poses jump {len(jumps)} times, first at {jumps[0]:.2f} s; check the '
-                     'localization that they come from')
+                     'localization that produced them')
     empty = float(np.mean(np.diff(detections.frame_offsets) == 0))
     if empty > _MAX_EMPTY_SHARE:
         notes.append(f'{empty:.0%} of the frames have no detections; check the detector')
@@ -232,7 +232,7 @@ def check_input(detections: PosedDetections, views: Views,
 
 
 def _jumps(poses: NDArray[np.float64], stamps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the stamps [s] of those of one camera's poses that it is too slow to reach."""
+    """Return the stamps [s] at which the poses of one camera move faster than any camera."""
     seconds = np.maximum(np.diff(stamps), 1e-3)
     distances = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     traces = np.einsum('fij,fij->f', poses[1:, :3, :3], poses[:-1, :3, :3])

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Advice in words: what to do about a map, the most urgent first.
+"""Advise how to improve a map, the most urgent advice first.
 
-Causes come before what they lead to: a robot that is misled in a place with a double does not need
-an advice of its own.
+Causes come before their effects: a robot that is misled in a place that looks like another one
+needs no separate advice.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,23 +18,24 @@ from cliploc_ros.offline.mapping.check.relocalization import Trial, refused_span
 from cliploc_ros.offline.mapping.check.report import SERIOUS, Advice, CheckReport, GridCheck
 
 _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
-# A shorter run of refused frames is not a side of a room.
+# Shorter runs of refused frames, and smaller areas of the grid, get no advice.
 _MIN_SPAN = 2
 # Cosine of the angle between views of one side: 45 degrees, a guess.
 _ONE_SIDE = 0.7
 _FEW_LANDMARKS = 3
-# Fewer frames of a landmark leave others unmapped, if besides more than this share of the boxes
-# belongs to none. Guesses, between maps of fr3 from every 10th and from every 30th frame.
+# More views are needed if landmarks have fewer frames (median) and more than this share of the
+# boxes belongs to none. Guesses, between maps of fr3 from every 10th and from every 30th frame.
 _FEW_FRAMES, _MANY_UNEXPLAINED = 12, 0.12
-# A wrong pose this near to where a double would put the camera is due to the double [m]. A guess.
+# A wrong pose within this distance of the pose that a look-alike implies is due to the look-alike
+# [m]. A guess.
 _SAME_POSE_M = 1.0
-# A camera sees a place from this far, twice the radius of what counts as one place [m].
+# Distance from which a camera sees a place: twice the radius of a place [m].
 _SIGHT_M = 2.0 * RADIUS_M
 _NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight', 'nine', 'ten')
 
 
 def give_advice(report: CheckReport) -> list[Advice]:
-    """Return advice, in one or two sentences each."""
+    """Return pieces of advice, each of one or two sentences."""
     advice = [*_on_scale(report), *_on_look_alikes(report), *_on_landmarks(report),
               *_on_corrections(report),
               *_on_misled(report), *_on_spans(report), *_on_grid(report)]
@@ -50,7 +51,7 @@ def _on_scale(report: CheckReport) -> Iterator[Advice]:
 
 
 def _some(advice: Sequence[Advice], what: str) -> list[Advice]:
-    """Return the first ones, and how many more there are."""
+    """Return the first pieces of advice, and how many more there are."""
     more = [Advice(f'and {len(advice) - _MOST_OF_A_KIND} more {what}')]
     return [*advice[:_MOST_OF_A_KIND], *(more if len(advice) > _MOST_OF_A_KIND else [])]
 
@@ -105,7 +106,7 @@ def _on_corrections(report: CheckReport) -> Iterator[Advice]:
             'mount': 'measure how the camera is mounted on the robot',
             'stamps': 'check the clock and the delay of the images'}
     best = max(found, key=lambda one: one.explained)
-    # those of one fit, of one camera: what is wrong with it makes others look wrong, too
+    # only one cause of one camera: its error makes other causes look wrong, too
     cause, of_best = best.cause, [one for one in found if (one.cause, one.explained) == (
         best.cause, best.explained)]
     numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (± {one.deviation:.2f})'
@@ -121,20 +122,20 @@ def _on_corrections(report: CheckReport) -> Iterator[Advice]:
 
 
 def _on_misled(report: CheckReport) -> Iterator[Advice]:
-    wrong = [one for one in _misled(report)
-             if not any(_takes_for(one, pair) for pair in report.look_alikes)]
-    for one in sorted(wrong, key=lambda one: -(one.error_m or 0.0))[:_MOST_MISLED]:
-        yield Advice(f'a robot at {_place(one.position)} looking {_heading(one)} would be misled '
-                     f'by {one.error_m:.1f} m: raise the parameter min_confidence, or map more '
-                     'distinct objects there', view=one)
+    wrong = [trial for trial in _misled(report)
+             if not any(_takes_for(trial, pair) for pair in report.look_alikes)]
+    for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))[:_MOST_MISLED]:
+        yield Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be '
+                     f'misled by {trial.error_m:.1f} m: raise the parameter min_confidence, or '
+                     'map more distinct objects there', view=trial)
     if len(wrong) > _MOST_MISLED:
-        yield Advice(f'and {len(wrong) - _MOST_MISLED} more views that mislead')
+        yield Advice(f'and {len(wrong) - _MOST_MISLED} more views that mislead a robot')
 
 
 def _on_spans(report: CheckReport) -> Iterator[Advice]:
     if report.recording is None:
         return
-    sides: list[list[list[Trial]]] = []  # runs that show one side are told once
+    sides: list[list[list[Trial]]] = []  # runs of the same side are reported once
     for run in refused_spans(report.recording.trials):
         if len(run) < _MIN_SPAN:
             continue
@@ -145,14 +146,14 @@ def _on_spans(report: CheckReport) -> Iterator[Advice]:
             same.append(run)
     for side in sides[:_MOST_OF_A_KIND]:
         run = side[0]
-        seen, halfway = int(np.median([one.landmarks for one in run])), run[len(run) // 2]
+        seen, halfway = int(np.median([trial.landmarks for trial in run])), run[len(run) // 2]
         if run[0].stamp_s is None or run[-1].stamp_s is None:
             continue
         if seen > _FEW_LANDMARKS and _sees_double(halfway.position, report):
             continue
         first = report.recording.trials[0].stamp_s or 0.0
         middle = 0.5 * (run[0].stamp_s + run[-1].stamp_s) - first
-        center = np.mean([one.position for one in run], axis=0)
+        center = np.mean([trial.position for trial in run], axis=0)
         what = 'record this side' if seen <= _FEW_LANDMARKS else (
             'describe these objects better in their labels, or record this side again')
         frames = f'{len(run)} frames' if len(side) == 1 else (
@@ -163,7 +164,7 @@ def _on_spans(report: CheckReport) -> Iterator[Advice]:
 
 
 def _is_one_side(first: Sequence[Trial], second: Sequence[Trial]) -> bool:
-    """Return whether two runs of frames look the same way at nearly the same place."""
+    """Return whether two runs of frames look in the same direction at nearly the same place."""
     one, other = first[len(first) // 2], second[len(second) // 2]
     return bool(np.linalg.norm(one.position - other.position) < RADIUS_M
                 and one.forward @ other.forward > _ONE_SIDE)
@@ -183,8 +184,8 @@ def _on_grid(report: CheckReport) -> Iterator[Advice]:
                          'from there', view=grid.trials[fullest])
     if report.keyframes is not None:
         yield from _some([
-            Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when the '
-                   'layer is made again, or rely on the landmarks')
+            Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when you '
+                   'record again, or rely on the landmarks')
             for rows in _areas(grid, report.keyframes.without)], 'areas that no keyframe reaches')
 
 
@@ -214,7 +215,7 @@ def _sees_double(position: NDArray[np.float64], report: CheckReport) -> bool:
 
 
 def _areas(grid: GridCheck, dead: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return rows of a grid as areas of neighbours, the largest first."""
+    """Group rows of a grid into areas of neighbours, the largest first."""
     if len(dead) == 0:
         return []
     cells = np.round((grid.positions[:, :2] - grid.positions[:, :2].min(axis=0))
@@ -237,7 +238,7 @@ def _place(point: NDArray[np.float64] | tuple[float, ...]) -> str:
 
 
 def _heading(trial: Trial) -> str:
-    """Return where a camera looks, as an angle from the map's x axis."""
+    """Describe the heading of a camera as an angle from the map's x axis."""
     return f'to {np.degrees(np.arctan2(trial.forward[1], trial.forward[0])):.0f} degrees'
 
 

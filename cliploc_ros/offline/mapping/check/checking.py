@@ -54,12 +54,12 @@ from cliploc_ros.offline.simulation import DetectorModel, guess_detector
 _NOTES = (
     'similarities of crops and labels are simulated, except for queries: labels of equal text '
     'look equal, and labels that share words look alike',
-    'the grid assumes that the map is right and that walls hide nothing that the recording did '
-    'not show to be hidden')
+    'the grid assumes that the map is correct and that walls hide only landmarks that were hidden '
+    'in the recording')
 _NO_RECORDING = (
-    'no recording: the detector is a guess that finds 60 % of the objects in view within 5 m, in '
+    'no recording: the detector is assumed to find 60 % of the objects in view within 5 m, in '
     'images of 640 x 480 px with a focal length of 525 px')
-# A robot's camera is this much above or below those of the recording at most [m], a guess.
+# Greatest difference in height between a robot's camera and those of the recording [m]. A guess.
 _HEIGHT_MARGIN_M = 0.3
 
 
@@ -77,17 +77,17 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     queries : sequence of PosedObservation
         Observations with recorded similarities to the map's labels.
     thresholds : Thresholds, optional
-        What the map has to reach.
+        The thresholds that the map has to reach.
     layer : KeyframeLayer, optional
         The keyframes next to the map.
     image_of : callable, optional
-        Returns the undistorted image (h, w, 3) of a frame of the recording, red first; None where
-        it is missing. With a layer, frames are relocalized by keyframes, too.
+        Returns the undistorted image (h, w, 3), RGB, of a frame of the recording; None if it is
+        missing. With a layer, frames are relocalized by keyframes, too.
 
     Raises
     ------
     MappingError
-        The recording says nothing of this map; the message says what to correct.
+        The recording does not fit this map; the message says what to correct.
     """
     options, tell = options or CheckOptions(), progress or (lambda stage, share: None)
     notes, views, witness, recording = [*_NOTES], None, None, None
@@ -106,14 +106,14 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
                   for number in range(len(detections.cameras))]
         model = models[0]
         if len(models) > 1:
-            notes.append(f'the grid has one camera, {detections.camera_names[0]}, the first of '
+            notes.append(f'the grid uses one camera, {detections.camera_names[0]}, the first of '
                          f'{len(models)}')
         recording = _check_recording(
             landmark_map, detections, views, witness, models, options, tell,
             None if layer is None or image_of is None else RecordedKeyframes(layer, image_of))
         notes += _notes_on(recording)
     tilt = '' if detections is None else tilt_note(detections.map_from_camera)
-    notes.append(tilt or _where_cameras_can_be(recorded))  # of a tilted map, heights mean nothing
+    notes.append(tilt or _where_cameras_can_be(recorded))  # a tilted map has no true heights
     overlaps = find_map_overlaps(landmark_map, witness, views)
     places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
                        options)
@@ -136,9 +136,9 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
 
 def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headings: int
                ) -> GridCheck:
-    """Return the result of trials on a grid, or on its first positions.
+    """Summarize trials on a grid, or on its first positions.
 
-    The trials were made with the model, heading by heading of each position.
+    The trials were made with the model, position by position, in the order of headings.
     """
     count = len(trials) // headings
     trials = trials[:count * headings]
@@ -151,7 +151,7 @@ def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headin
 
 
 def _told(trials: Iterator[Trial], count: int, tell: Tell) -> list[Trial]:
-    """Return trials, a number of which is expected, and tell the share that is done."""
+    """Collect `count` trials and report progress."""
     done = []
     for trial in trials:
         done.append(trial)
@@ -165,7 +165,7 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
     tell('cross-validating', 0.0)
     folds, blocks, held_out = [], [], []
     for fold in make_folds(views, witness, options):
-        # a box whose landmark no other part of the recording shows says nothing of the map
+        # a box whose landmark no other part of the recording shows does not test the map
         is_known = (witness.shown < 0) | np.isin(witness.shown, fold.rows)
         ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames) & is_known]
         folds.append(fold)
@@ -192,33 +192,33 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
 
 
 def _where_cameras_can_be(recorded: NDArray[np.float64] | None) -> str:
-    """Return what is known of where the cameras (F, 4, 4) of accepted poses can be."""
-    known = 'accepted poses may lie anywhere: the map does not know where cameras can be'
+    """Return a note on the range of accepted poses, given recorded poses (F, 4, 4)."""
+    known = 'accepted poses may lie anywhere: the map does not limit where cameras can be'
     if recorded is None:
-        return f'{known}, and no recording tells their heights: set `height_range_m`'
+        return f'{known}, and there is no recording with their heights: set `height_range_m`'
     low, high = recorded[:, 2, 3].min(), recorded[:, 2, 3].max()
     return (f'{known}; those of the recording were {low:.2f} to {high:.2f} m high. For a camera '
-            f'of such a height, set `height_range_m` to [{low - _HEIGHT_MARGIN_M:.1f}, '
+            f'at this height, set `height_range_m` to [{low - _HEIGHT_MARGIN_M:.1f}, '
             f'{high + _HEIGHT_MARGIN_M:.1f}]')
 
 
 def _notes_on(recording: RecordingCheck) -> list[str]:
-    """Return why some figures of a recording do not count."""
+    """Return notes on the figures that cannot be judged by this recording."""
     notes = []
     if not recording.can_judge_boxes:
-        notes.append(f'cross-validation cannot judge boxes: of {recording.as_given.boxes}, other '
-                     f'parts of the recording show the objects of {recording.held_out.boxes}')
+        notes.append('cross-validation cannot judge boxes: other parts of the recording show the '
+                     f'objects of {recording.held_out.boxes} of {recording.as_given.boxes}')
     if not recording.can_judge_frames:
         notes.append(f'cross-validation cannot judge frames: other parts of the recording show '
                      f'the objects of {len(recording.judged)} of {len(recording.trials)}; the '
-                     'verdict takes simulated boxes; pass each place twice to know better')
+                     'verdict uses simulated boxes; pass each place twice for a better test')
     return notes
 
 
 def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:
     shared = set(landmark_map.class_ids) & set(detections.class_names)
     if not shared:
-        return ("the recording's classes are none of the map's "
+        return ('the recording has none of the classes of the map '
                 f'({", ".join(sorted(set(landmark_map.class_ids))[:3])}): use the detector that '
                 'the map was made with')
     return ('no box of the recording overlaps a landmark of its class: check that poses and map '

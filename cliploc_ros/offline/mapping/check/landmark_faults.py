@@ -29,30 +29,31 @@ from cliploc_ros.offline.mapping.sizes import size_of_class
 from cliploc_ros.offline.mapping.views import Views
 from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
-# A class has so many words at most to be looked for in labels.
+# Greatest number of words of a class name that is looked for in labels.
 _MOST_WORDS = 3
-# A thinner landmark was seen from one side, or is a sheet: boxes tell little of its position.
+# A thinner landmark was seen from one side, or is a sheet: boxes hardly constrain its position.
 _MIN_THINNESS = 0.05
 # A landmark is missing if this number of frames should show it and none does.
 _MIN_EXPECTED = 10
-# A landmark that its boxes put farther away than all of these is in the wrong place. Guesses.
+# A landmark is misplaced if its boxes put it farther away than all three limits. Guesses.
 _MIN_OFFSET_M, _OFFSET_SHARE, _OFFSET_SIGMAS = 0.1, 0.3, 4.0
 
 
 class Overlap(NamedTuple):
-    """Two landmarks that lie in one another."""
+    """Two overlapping landmarks."""
 
     #: Rows in the map
     first: int
     second: int
     distance: float  #: Normalized, see cliploc_ros.core.geometry.ellipsoid.STANDS_IN
-    #: They are one thing: no frames show two. Where no frame shows either, by a common class.
+    #: They are the same object: frames do not show two objects. Landmarks without any box are
+    #: duplicates if they have a class in common.
     is_duplicate: bool
 
 
 @dataclass(frozen=True, kw_only=True)
 class LandmarkCheck:
-    """What is known of one landmark. Values that nothing tells are None."""
+    """The findings on one landmark. Unknown values are None."""
 
     landmark_id: str
     label: str
@@ -66,36 +67,36 @@ class LandmarkCheck:
     baseline_deg: float | None = None
     #: Standard deviation of its centre on the worst axis [m]
     position_sigma_m: float | None = None
-    #: From its centre to where its boxes put it [m]; None where they may put it anywhere
+    #: Distance from its centre to its position by the boxes [m]; None if they do not determine it
     offset_m: float | None = None
     median_iou: float | None = None  #: Of its boxes
     thinness: float  #: Least semi-axis divided by the greatest one
-    #: Landmarks that lie in it, and their normalized distances
+    #: Landmarks that overlap it, and their normalized distances
     overlaps: tuple[tuple[str, float], ...]
     faults: tuple[str, ...] = ()  #: The faults and what to do, the worst first
     severity: float = 0.0  #: 0: nothing; 1 and more: a serious fault
-    weight: float = 1.0  #: Frames that it was mapped from; 1 for all if the map does not say it
+    weight: float = 1.0  #: Number of frames it was mapped from; 1 for all if unknown
 
 
 class Witness(NamedTuple):
-    """The evidence of a recording about a map."""
+    """The evidence that a recording gives on a map."""
 
     class_names: tuple[str, ...]  #: Of the recording
     landmarks: Landmarks  #: Of the map, with the recording's classes
     shown: NDArray[np.int64]  #: (n,): the landmark that each box shows, -1 for none
     evidence: Evidence
-    #: (L,): frames that should show each landmark, those without a box included
+    #: (L,): frames that should show each landmark, including landmarks without a box
     expected: NDArray[np.int64]
     fitted: Landmarks  #: The landmarks fitted to the boxes that show them
     fitted_sigmas: NDArray[np.float64]  #: (L,): deviations of these centres [m]
 
 
 def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str, ...]) -> Witness:
-    """Return the evidence of a recording about a map."""
+    """Return the evidence that a recording gives on a map."""
     landmarks = landmarks_of_map(landmark_map, class_names)
     shown = associate(views, landmarks)
     evidence = gather_evidence(views, landmarks, shown)
-    # a landmark that nothing shows may be hidden
+    # a landmark without a box may be hidden
     sight = look_for(views, landmarks, shown, np.ones(len(landmarks.centers), dtype=np.bool_))
     expected = np.where(evidence.support == 0, sight.expected_frames, evidence.expected)
     fitted = fit_landmarks(views, landmarks, shown)
@@ -105,7 +106,7 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
 
 def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views: Views | None
                       ) -> list[Overlap]:
-    """Return the landmarks of a map that stand in one another, the nearest first."""
+    """Return the overlapping landmarks of a map: duplicates first, then the nearest."""
     doubles, shown = set[tuple[int, int]](), np.empty(0, dtype=np.int64)
     if witness is not None and views is not None:
         shown, doubles = witness.shown, {*find_doubles(views, witness.landmarks, witness.shown)}
@@ -114,7 +115,7 @@ def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views:
     found = [Overlap(first, second, distance, (first, second) in doubles
                      if is_shown[[first, second]].any() else bool(names[first] & names[second]))
              for first, second, distance in close_pairs(landmarks_of_map(landmark_map, ()))]
-    return sorted(found, key=lambda one: (not one.is_duplicate, one.distance))
+    return sorted(found, key=lambda overlap: (not overlap.is_duplicate, overlap.distance))
 
 
 def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
@@ -125,9 +126,9 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
     """
     ids, classes = landmark_map.landmark_ids, landmark_map.class_ids
     partners: list[list[tuple[int, Overlap]]] = [[] for _ in ids]
-    for one in overlaps:
-        partners[one.first].append((one.second, one))
-        partners[one.second].append((one.first, one))
+    for overlap in overlaps:
+        partners[overlap.first].append((overlap.second, overlap))
+        partners[overlap.second].append((overlap.first, overlap))
     supports = [detail.support for detail in landmark_map.details]
     misspelt = (misspelt_classes(classes, shipped_classes()) if witness is None
                 else misspelt_classes(classes, witness.class_names, all_known=True))
@@ -141,9 +142,9 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             landmark_id=ids[row], label=landmark_map.labels[row], class_id=classes[row],
             center=(x, y, z), **_support(landmark_map, row, witness),
             thinness=float(semi_axes.min() / semi_axes.max()),
-            overlaps=tuple((ids[other], one.distance) for other, one in others))
+            overlaps=tuple((ids[other], overlap.distance) for other, overlap in others))
         faults = [(1.5, f'is the same object as {ids[other]}: delete one of them')
-                  for other, one in others if one.is_duplicate]
+                  for other, overlap in others if overlap.is_duplicate]
         if hint := misspelt.get(classes[row]):
             faults.append((1.0, f"may have a misspelt class: '{classes[row]}'{hint}")
                           if witness is None else
@@ -155,7 +156,7 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             faults += _support_faults(check, float(np.linalg.norm(semi_axes)))
         faults += [(0.4, f'lies in {ids[other]} of class {classes[other]}: one object under two '
                          'classes, or one on the other; keep one if it is one object')
-                   for other, one in others if witness is None and not one.is_duplicate]
+                   for other, overlap in others if witness is None and not overlap.is_duplicate]
         size, extent_m = size_of_class(classes[row]), 2.0 * float(semi_axes.max())
         if size is not None and extent_m > size.most_m:
             faults.append((1.2, f'is {extent_m:.2g} m long, and no {classes[row]} is longer than '
@@ -165,15 +166,15 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             faults.append((0.3, f'is a sheet: its axes have the ratio {check.thinness:.3f}; '
                                 'record it from another side, or give it thickness'))
         if other := _class_of_label(check.label, check.class_id, by_words):
-            faults.append((0.6, f"is labelled '{check.label:.60}', a {other} by that, and has the "
-                                f'class {check.class_id}: correct the wrong one'))
-        faults.sort(key=lambda one: -one[0])
+            faults.append((0.6, f"is labelled '{check.label:.60}', which names a {other}, but "
+                                f'its class is {check.class_id}: correct the wrong one'))
+        faults.sort(key=lambda fault: -fault[0])
         checks.append(replace(
             check, faults=tuple(text for _, text in faults),
             severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0,
             weight=float(weights[row]) if len(weights) else 1.0))
-    return sorted(checks, key=lambda one: (
-        -one.severity, 1.0 if one.seen_ratio is None else one.seen_ratio))
+    return sorted(checks, key=lambda check: (
+        -check.severity, 1.0 if check.seen_ratio is None else check.seen_ratio))
 
 
 def _words(text: str) -> list[str]:
@@ -182,9 +183,9 @@ def _words(text: str) -> list[str]:
 
 def _class_of_label(label: str, class_id: str, by_words: Mapping[tuple[str, ...], str]
                     ) -> str | None:
-    """Return a class that a label names, in singular or plural, unless it names its own, too.
+    """Return a class that a label names, in singular or plural, unless it also names its own.
 
-    `by_words` has the classes of the map by their words.
+    `by_words` maps the words of a class name to the class.
     """
     if any(word in label.casefold() for word in _words(class_id)):
         return None
@@ -200,7 +201,7 @@ def _class_of_label(label: str, class_id: str, by_words: Mapping[tuple[str, ...]
 
 
 def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> dict[str, Any]:
-    """Return the numbers of a landmark's support: from a recording, or from the map itself."""
+    """Return the support of a landmark by field, from a recording or from the map itself."""
     given = landmark_map.details[row] if landmark_map.details else LandmarkDetails()
     if witness is None:
         return {'support': given.support, 'seen_ratio': given.seen_ratio,
@@ -213,7 +214,7 @@ def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> di
     return {'support': int(evidence.support[row]), 'expected': expected,
             'seen_ratio': float(evidence.seen_ratio[row]),
             'baseline_deg': float(evidence.baseline_deg[row]),
-            # what the map says of itself is what localization reckons with
+            # localization uses the map's own value
             'position_sigma_m': float(evidence.position_sigma[row])
             if given.position_sigma is None else given.position_sigma,
             'offset_m': offset if is_told else None,
@@ -221,7 +222,7 @@ def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> di
 
 
 def _support_faults(check: LandmarkCheck, size_m: float) -> list[tuple[float, str]]:
-    """Return the faults of a landmark's support, with a weight each."""
+    """Return the faults of a landmark's support, each with its severity."""
     support, expected, ratio = check.support, check.expected, check.seen_ratio
     if support == 0:
         if expected is not None and expected < _MIN_EXPECTED:

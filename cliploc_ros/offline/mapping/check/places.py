@@ -13,18 +13,19 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.options import CheckOptions
 
 _MARGIN_M = 0.5
-# Without a recording; guesses.
+# Without a recording. Guesses.
 _GUESSED_MARGIN_M = 1.5
-_GUESSED_HEIGHT_M = 0.3   # above the middle landmark
+_GUESSED_HEIGHT_M = 0.3   # above the median landmark
 _GUESSED_PITCH_DEG = -10.0
-# Landmarks farther out than all but this share do not widen the grid.
+# The outermost landmarks, this share on each side, do not widen the grid.
 _OUTLYING = 0.03
-# Positions within this of the recording's path are near it [m].
+# Positions within this distance of the recording's path are near it [m].
 _NEAR_M = 1.0
-#: Places are so far apart: each is the surroundings of a landmark [m].
+#: A place is the area within this radius of a landmark [m].
 RADIUS_M = 2.0
-# Places that repeat fewer of each other's landmarks do so by chance; labels tell them apart. The
-# share of find_alike, which only proposes rivals of a pose, would report most offices and shops.
+# Places that share fewer landmarks look alike by chance, and labels tell them
+# apart. With the share of find_alike, which only proposes rivals of a pose, most offices and shops
+# would be reported.
 _LEAST_SHARE = 0.6
 
 
@@ -33,7 +34,7 @@ class Grid:
     """P positions with H headings each."""
 
     positions: NDArray[np.float64]  #: (P, 3): [m]
-    is_near: NDArray[np.bool_]  #: (P,): the recording, if there is one, passed near
+    is_near: NDArray[np.bool_]  #: (P,): near the path of the recording, if there is one
     #: (P * H, 4, 4): map_from_camera, heading by heading of each position
     poses: NDArray[np.float64]
     spacing_m: float
@@ -41,12 +42,12 @@ class Grid:
 
 def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
               options: CheckOptions) -> Grid:
-    """Return the grid of a map.
+    """Return the grid of camera positions for a map.
 
     Parameters
     ----------
     recorded : ndarray (F, 4, 4), optional
-        Poses map_from_camera of a recording: they give height, pitch and extent.
+        Poses map_from_camera of a recording, which determine height, pitch and extent.
     """
     low, high = np.quantile(landmark_map.centers, [_OUTLYING, 1.0 - _OUTLYING], axis=0)
     if recorded is None:
@@ -61,7 +62,7 @@ def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
     if options.camera_height_m is not None:
         height = options.camera_height_m
     positions, spacing = _positions(low[:2] - margin, high[:2] + margin, height, options)
-    # Tell which positions lie in a landmark.
+    # positions inside a landmark are left out
     inside = np.zeros(len(positions), dtype=np.bool_)
     for center, upper in zip(landmark_map.centers, landmark_map.shapes, strict=True):
         xx, xy, xz, yy, yz, zz = upper
@@ -86,7 +87,7 @@ def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
 
 def _positions(low: NDArray[np.float64], high: NDArray[np.float64], height: float,
                options: CheckOptions) -> tuple[NDArray[np.float64], float]:
-    """Return positions between two corners, and their spacing: larger than asked for if needed."""
+    """Return positions between two corners, and their spacing, which is increased if needed."""
     spacing = options.spacing_m
     while (counts := np.maximum(1, np.ceil((high - low) / spacing)).astype(int)
            ).prod() > options.max_positions:
@@ -104,18 +105,18 @@ class LookAlike:
     #: The middles of the places [m]
     first: tuple[float, float, float]
     second: tuple[float, float, float]
-    #: Landmarks of the first place, and those of the second place that they look like
+    #: Pairs of a landmark of the first place and the landmark of the second that it looks like
     matched: tuple[tuple[str, str], ...]
-    landmarks: int  #: The landmarks of the first place
+    landmarks: int  #: Number of landmarks of the first place
     share: float  #: Share of these that are matched, 0 to 1
-    same_labels: int  #: Matched landmarks whose labels are equal, so that no crop tells them apart
-    turn_deg: float  #: About the vertical, from the first place to the second [deg]
+    same_labels: int  #: Number of pairs with equal labels, which no crop tells apart
+    turn_deg: float  #: Rotation about the vertical, from the first place to the second [deg]
 
 
 def find_look_alikes(landmark_map: LandmarkMap) -> list[LookAlike]:
     """Return the pairs of places that look alike, the most alike first.
 
-    A place that looks the same after a turn by more than 45 degrees counts as well.
+    A place that looks the same after a rotation by more than 45 degrees counts as well.
     """
     ids, labels = landmark_map.landmark_ids, landmark_map.labels
     found: list[LookAlike] = []
@@ -132,15 +133,16 @@ def find_look_alikes(landmark_map: LandmarkMap) -> list[LookAlike]:
                              strict=True))
             found.append(LookAlike(
                 tuple(position.tolist()), tuple((move[:3, :3] @ position + move[:3, 3]).tolist()),
-                tuple((ids[one], ids[other]) for one, other in pairs), len(alike.landmarks),
-                float(matched.mean()), sum(labels[one] == labels[other] for one, other in pairs),
+                tuple((ids[first], ids[second]) for first, second in pairs), len(alike.landmarks),
+                float(matched.mean()),
+                sum(labels[first] == labels[second] for first, second in pairs),
                 float(np.degrees(np.arctan2(move[1, 0], move[0, 0])))))
     kept: list[LookAlike] = []
-    for one in sorted(found, key=lambda one: (-len(one.matched) * one.share, -one.share)):
-        if not any((_near(one.first, other.first) and _near(one.second, other.second))
-                   or (_near(one.first, other.second) and _near(one.second, other.first))
+    for pair in sorted(found, key=lambda pair: (-len(pair.matched) * pair.share, -pair.share)):
+        if not any((_near(pair.first, other.first) and _near(pair.second, other.second))
+                   or (_near(pair.first, other.second) and _near(pair.second, other.first))
                    for other in kept):
-            kept.append(one)
+            kept.append(pair)
     return kept
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Relocalize in recorded frames, and in simulated ones.
+"""Relocalize recorded frames and simulated frames in a map.
 
 Cross-validation over time: recorded frames are judged with landmarks fitted to other blocks of the
 recording. Simulated frames have the errors of the recording's detector.
@@ -48,15 +48,15 @@ LANDMARKS_FOR_A_POSE = 3
 
 Verdict = Literal['accepted', 'refused', 'misled']
 Tell = Callable[[float], None]
-#: Returns the undistorted image (h, w, 3) of a recorded frame, red first; None without one.
+#: Returns the undistorted image (h, w, 3), RGB, of a recorded frame; None if it is missing.
 ImageOf = Callable[[int], NDArray[np.uint8] | None]
 
 
 class Fold(NamedTuple):
-    """A part of a recording, and the map without it."""
+    """A part of a recording, and the map fitted to the other parts."""
 
     frames: NDArray[np.int64]  #: (k,): the frames to judge
-    #: (l,): the landmarks of the whole map that the other frames suffice for
+    #: (l,): the landmarks of the whole map that the other frames suffice to fit
     rows: NDArray[np.int64]
     landmarks: Landmarks  #: These landmarks, fitted to the other frames
     training: NDArray[np.bool_]  #: (F,): these other frames
@@ -69,7 +69,10 @@ class RecordedKeyframes(NamedTuple):
     image_of: ImageOf
 
     def recognizer(self, detections: PosedDetections, frame: int) -> ImageRecognizer | None:
-        """Return the keyframe search of a frame, without keyframes of its time; None without."""
+        """Return the keyframe search of a frame, excluding keyframes near it in time.
+
+        None: there is no other keyframe, or no image.
+        """
         is_other = np.abs(detections.stamps_s[_frames_of(self.layer, detections)]
                           - detections.stamps_s[frame]) > _SAME_TIME_S
         image = self.image_of(frame) if is_other.any() else None
@@ -79,11 +82,13 @@ class RecordedKeyframes(NamedTuple):
 
 
 def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
-    """Return the folds of a recording, each with the map as the others show it.
+    """Yield the folds of a recording, each with the map fitted to the other folds.
 
-    Folds take blocks of time in turn, at least one block each. A landmark that fits its boxes is
-    fitted again, to the boxes outside of the fold; it is left out if they are too few. A landmark
-    that does not fit its boxes, or has none, stays as it is: a robot would use it as it is.
+    Blocks of time are assigned to the folds in turn, at least one to each. A landmark that fits
+    its
+    boxes is fitted again, to the boxes outside the fold; it is left out if they are too few. A
+    landmark that does not fit its boxes, or has none, is unchanged,
+    as a robot would use it.
     """
     stamps_s = views.stamps_s
     elapsed = stamps_s - stamps_s[0]
@@ -95,7 +100,7 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
         judged = np.nonzero(of_frames == number)[0]
         if len(judged) == 0:
             continue
-        # frames within a gap of one that is judged train nothing
+        # frames within a gap of a judged frame are not used for fitting
         times = stamps_s[judged]
         after = np.searchsorted(times, stamps_s).clip(0, len(times) - 1)
         nearest = np.minimum(np.abs(times[after] - stamps_s),
@@ -112,9 +117,9 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
 
 def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
                      witness: Witness, camera: int = 0) -> DetectorModel:
-    """Return the detector of a recording, on the images of one of its cameras.
+    """Return a model of the detector of a recording, for the images of one of its cameras.
 
-    A landmark that was never detected does not exist: the model never detects it.
+    The model never detects a landmark that was never detected in the recording.
     """
     landmarks, cameras = witness.landmarks, views.centers
     frames = detections.every(-(-len(detections) // _MAX_SAMPLED_FRAMES))
@@ -141,7 +146,7 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
         unknown = detections.detections_of(frame).select(np.nonzero(is_clutter[slice(
             *detections.frame_offsets[frame:frame + 2])])[0])
         clutter.append((unknown.bboxes_xyxy, unknown.class_ids))
-    # the robust deviation of closed edges, in standard deviations
+    # the robust deviation of edges that are not open, in expected standard deviations
     linear = linearize_boxes(views, witness.shown, landmarks)
     residuals = np.abs(linear.residuals[linear.weights > 0.0])
     scale = float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
@@ -160,28 +165,27 @@ class PosedObservation(NamedTuple):
 
 @dataclass(frozen=True)
 class Trial:
-    """One relocalization and its verdict."""
+    """One relocalization attempt and its verdict."""
 
     #: 'accepted' (a right pose), 'refused', or 'misled' (a wrong pose was accepted)
     verdict: Verdict
-    #: (3,): of the camera in the map [m], and the direction in which it looks
+    #: (3,): position of the camera in the map [m], and the direction in which it looks
     position: NDArray[np.float64]
     forward: NDArray[np.float64]
-    #: Boxes, and the landmarks of the map among them
+    #: Number of boxes, and of those that show landmarks of the map
     detections: int
     landmarks: int
     estimate: NDArray[np.float64] | None  #: (3,): position of the best pose [m]
     error_m: float | None
     reason: str  #: Of a refusal
     stamp_s: float | None = None  #: Of a recorded frame [s]
-    #: Of a recorded frame: the verdict without keyframes, where they were used; and whether the
-    #: other frames show enough of its objects to judge the map by it, whatever the verdict
+    #: Of a recorded frame: the verdict without keyframes, if they were used; and whether the other
+    #: frames show enough of its objects to judge the map by it
     by_objects: Verdict | None = None
     is_judged: bool = True
-    result: Relocalization | None = None  #: The whole answer
-
+    result: Relocalization | None = None  #: The complete result
     def as_dict(self) -> dict[str, Any]:
-        """Return the trial as plain values, for JSON, without the whole answer."""
+        """Return the trial as plain values, for JSON, without the complete result."""
         values = {field.name: getattr(self, field.name) for field in fields(self)
                   if field.name != 'result'}
         return {name: value.round(4).tolist() if isinstance(value, np.ndarray) else value
@@ -190,9 +194,9 @@ class Trial:
 
 def simulated(detections: PosedDetections, frame: int, shown: NDArray[np.int64],
               labels: LabelModel, seed: int) -> Observation:
-    """Return the observation of a recorded frame, with simulated similarities, equal each time.
+    """Return the observation of a recorded frame, with simulated, reproducible similarities.
 
-    shown (n,) has the landmark of each box of the recording, -1 for none.
+    shown (n,) is the landmark of each box of the recording, -1 for none.
     """
     found, rows = detections.detections_of(frame), slice(*detections.frame_offsets[
         frame:frame + 2])
@@ -203,10 +207,10 @@ def simulated(detections: PosedDetections, frame: int, shown: NDArray[np.int64],
 def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
                   shown: NDArray[np.int64], folds: Sequence[Fold], options: CheckOptions,
                   tell: Tell, keyframes: RecordedKeyframes | None = None) -> list[Trial]:
-    """Relocalize recorded frames in the map that the other frames show, in the order of time.
+    """Relocalize recorded frames in maps fitted to other frames; return the trials by time.
 
-    Boxes, poses and images are the recording's, similarities are simulated; shown (n,) has the
-    landmark of each box, -1 for none. The callable tell is told the share that is done.
+    Boxes, poses and images are those of the recording, similarities are simulated. shown (n,) is
+    the landmark of each box, -1 for none. tell is called with the progress, 0 to 1.
     """
     labels = LabelModel.of(landmark_map)
     chosen = set(sample_frames(detections, options.frames).tolist())
@@ -247,18 +251,18 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
                 trial = replace(judge(ImageRecognizer(localizer, features)),
                                 by_objects=trial.verdict)
             trials.append(replace(trial, is_judged=is_judged))
-    return sorted(trials, key=lambda one: one.stamp_s or 0.0)
+    return sorted(trials, key=lambda trial: trial.stamp_s or 0.0)
 
 
 def _frames_of(layer: KeyframeLayer, detections: PosedDetections) -> NDArray[np.int64]:
-    """Return the recorded frame (K,) that is nearest to each keyframe, in place and direction."""
+    """Return the recorded frame (K,) nearest to each keyframe, by position and direction."""
     places, queries = (np.column_stack([poses[:, :3, 3], poses[:, :3, 2], poses[:, :3, 0]])
                        for poses in (detections.map_from_camera, layer.map_from_camera))
     return np.asarray(cKDTree(places).query(queries)[1])
 
 
 def sample_frames(detections: PosedDetections, limit: int) -> NDArray[np.int64]:
-    """Return at most a limit of frames, evenly spread over the cameras and over time."""
+    """Return at most `limit` frames, evenly spread over the cameras and over time."""
     count = len(detections)
     step = max(1, -(-count // limit))
     return detections.every(step, min(step // 2, count - 1))
@@ -266,9 +270,9 @@ def sample_frames(detections: PosedDetections, limit: int) -> NDArray[np.int64]:
 
 def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
               options: CheckOptions) -> Iterator[Trial]:
-    """Relocalize simulated frames, one at each step.
+    """Relocalize a simulated frame for each pose; yield the trials.
 
-    The model has what there is to see, the map what the relocalizer knows; poses (k, 4, 4) are
+    The model generates the detections, and the relocalizer knows the map; poses (k, 4, 4) are
     the true map_from_camera.
     """
     labels, relocalizer = LabelModel.of(landmark_map), make_relocalizer(landmark_map, options)
@@ -283,10 +287,11 @@ def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np
 
 def try_observations(landmark_map: LandmarkMap, observations: Sequence[PosedObservation],
                      options: CheckOptions) -> Iterator[Trial]:
-    """Relocalize observations with recorded similarities, one at each step."""
+    """Relocalize observations with recorded similarities; yield the trials."""
     relocalizer = make_relocalizer(landmark_map, options)
-    for one, pose, stamp_s in observations:
-        yield try_view(relocalizer, one, pose, len(one.detections), options, stamp_s)
+    for observation, pose, stamp_s in observations:
+        yield try_view(relocalizer, observation, pose, len(observation.detections), options,
+                       stamp_s)
 
 
 def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:
@@ -298,7 +303,7 @@ def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:
 def refused_spans(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
     """Yield the runs of recorded frames without an accepted right pose, the longest first.
 
-    Frames that do not tell are left out.
+    A frame that cannot be judged ends a run as well.
     """
     runs: list[list[Trial]] = [[]]
     for trial in trials:
@@ -318,7 +323,7 @@ def make_relocalizer(landmark_map: LandmarkMap, options: CheckOptions) -> Reloca
 def try_view(relocalizer: Relocalizer, observation: Observation,
              map_from_camera: NDArray[np.float64], landmarks: int, options: CheckOptions,
              stamp_s: float | None = None, recognizer: ImageRecognizer | None = None) -> Trial:
-    """Relocalize in one view whose pose is known, with so many landmarks of the map in it."""
+    """Relocalize one view of known pose; `landmarks` is the number of landmarks in it."""
     up = map_from_camera[2, :3] if options.use_vertical else None  # the map's z in the camera
     result = relocalizer.relocalize([replace(observation, up_in_camera=up)], recognizer)
     estimate, error_m = result.map_from_camera, None

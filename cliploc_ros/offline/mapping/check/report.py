@@ -22,18 +22,18 @@ from cliploc_ros.offline.mapping.evidence import BoxQuality
 from cliploc_ros.offline.mapping.options import Thresholds
 from cliploc_ros.offline.mapping.systematic import Correction
 
-#: A map whose objects alone are accepted at fewer of the positions is one of keyframes.
+#: If a map misses this measure alone, its verdict is "keyframes only".
 BY_OBJECTS = 'positions with a heading accepted by objects alone'
 #: A landmark of this severity has a serious fault.
 SERIOUS = 1.0
 
 
 class Advice(NamedTuple):
-    """What to do, and where it is to be seen."""
+    """What to do, and the landmarks or view that show why."""
 
     text: str
-    landmarks: tuple[str, ...] = ()  #: Ids of the landmarks that it is about
-    view: Trial | None = None  #: The view that it is about
+    landmarks: tuple[str, ...] = ()  #: Ids of the landmarks that it concerns
+    view: Trial | None = None  #: The view that it concerns
 
 
 class Measure(NamedTuple):
@@ -42,7 +42,7 @@ class Measure(NamedTuple):
     name: str
     value: float
     limit: float
-    is_most: bool  #: The value may be the limit at most; else it has to be the limit at least
+    is_most: bool  #: The limit is the greatest allowed value; otherwise it is the least
     unit: Literal['share', 'number', 'count'] = 'share'
 
     @property
@@ -51,7 +51,7 @@ class Measure(NamedTuple):
         return self.value > self.limit if self.is_most else self.value < self.limit
 
     def show(self, value: float) -> str:
-        """Return a value in words, with enough digits to show that it is beyond its limit."""
+        """Format a value, with enough digits to tell a missed value from its limit."""
         if self.unit != 'share':
             return f'{value:.4g}'
         told_apart = _percent(self.value, 2) != _percent(self.limit, 2)
@@ -60,10 +60,10 @@ class Measure(NamedTuple):
 
 @dataclass(frozen=True)
 class BlockQuality:
-    """The boxes of one fold, judged with landmarks fitted to the others."""
+    """The boxes of one fold, judged with landmarks fitted to the other folds."""
 
     frames: int
-    landmarks: int  #: Landmarks that the other folds suffice for
+    landmarks: int  #: Landmarks that the other folds suffice to fit
     boxes: BoxQuality
 
 
@@ -75,16 +75,16 @@ class RecordingCheck:
     boxes: int
     duration_s: float
     path_xyz: NDArray[np.float64]  #: (F, 3): where the camera went [m]
-    #: Of the map as it is. If it was built from this recording, it was fitted to these boxes.
+    #: With the map as it is. A map built from this recording was fitted to these boxes.
     as_given: BoxQuality
     held_out: BoxQuality  #: Cross-validated over time
     folds: tuple[BlockQuality, ...]
     trials: tuple[Trial, ...]  #: Recorded frames in cross-validated maps, in the order of time
-    #: The same poses in the map as it is, with simulated boxes: as many should be accepted as with
-    #: recorded ones, else the grid is too optimistic or too pessimistic
+    #: The same poses in the map as it is, with simulated boxes. As many should be accepted as with
+    #: recorded boxes: otherwise the grid is too optimistic or too pessimistic.
     simulated: tuple[Trial, ...]
     corrections: tuple[Correction, ...]
-    edge_scale: float  #: Deviation of box edges, in units of build_map's assumption
+    edge_scale: float  #: Deviation of box edges, relative to the assumption of build_map
 
     @property
     def judged(self) -> tuple[Trial, ...]:
@@ -93,12 +93,12 @@ class RecordingCheck:
 
     @property
     def can_judge_frames(self) -> bool:
-        """Return whether cross-validation tells how many frames are accepted."""
+        """Return whether enough frames can be judged by cross-validation."""
         return 2 * len(self.judged) >= len(self.trials)
 
     @property
     def can_judge_boxes(self) -> bool:
-        """Return whether the other parts of the recording show the landmarks of most boxes."""
+        """Return whether other parts of the recording show the landmarks of most boxes, too."""
         return 2 * self.held_out.boxes >= self.as_given.boxes
 
     def as_dict(self) -> dict[str, Any]:
@@ -119,10 +119,10 @@ class RecordingCheck:
 class GridCheck(Grid):
     """Relocalization over a grid of camera positions."""
 
-    #: (P,): headings of each position in which a right, and a wrong pose is accepted
+    #: (P,): number of headings at each position with an accepted right pose, and a wrong pose
     accepted: NDArray[np.int64]
     misled: NDArray[np.int64]
-    #: (P, H): how many landmarks the detector finds on average, by heading
+    #: (P, H): average number of landmarks that the detector finds, by heading
     visible: NDArray[np.float64]
     trials: tuple[Trial, ...]  #: Heading by heading of each position
 
@@ -159,13 +159,13 @@ class GridCheck(Grid):
 
 @dataclass(frozen=True)
 class KeyframeCheck:
-    """What the keyframes next to a map reach."""
+    """The coverage by the keyframes next to a map."""
 
     keyframes: int
     points: int
     #: (F,): recorded frames within reach of a keyframe; empty without a recording
     recorded: NDArray[np.bool_]
-    headings: NDArray[np.int64]  #: (P,): headings of each grid position within reach
+    headings: NDArray[np.int64]  #: (P,): number of headings within reach, by grid position
     grid: Grid
 
     @property
@@ -190,22 +190,22 @@ class KeyframeCheck:
 
 
 class Carried(NamedTuple):
-    """Of recorded frames or places: where a robot can be localized, and by which evidence."""
+    """Numbers of recorded frames or positions by the evidence that localizes a robot there."""
 
     what: str
     by_objects: int
-    by_keyframes: int  #: By these only
+    by_keyframes: int  #: By keyframes only
     not_at_all: int
 
     def __str__(self) -> str:
-        """Return them in words."""
-        return (f'by objects {self.by_objects}, only by keyframes {self.by_keyframes}, not at all '
-                f'{self.not_at_all} of {sum(self[1:])} {self.what}')
+        """Describe the numbers in words."""
+        return (f'{sum(self[1:])} {self.what}: {self.by_objects} localized by objects, '
+                f'{self.by_keyframes} by keyframes only, {self.not_at_all} not localized')
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """The result of a check."""
+    """The result of a check of a map."""
 
     landmarks: tuple[LandmarkCheck, ...]  #: The worst first
     overlaps: tuple[Overlap, ...]
@@ -214,24 +214,24 @@ class CheckReport:
     recording: RecordingCheck | None = None
     #: Recorded queries with recorded similarities; empty without any
     queries: tuple[Trial, ...] = ()
-    measures: tuple[Measure, ...] = ()  #: What decides whether the map is good enough
-    to_do: tuple[Advice, ...] = ()  #: The most urgent first
-    notes: tuple[str, ...] = ()  #: What the figures rest on
-    #: What the keyframes next to the map reach; None without any
+    measures: tuple[Measure, ...] = ()  #: The figures that determine the verdict
+    to_do: tuple[Advice, ...] = ()  #: Advice, the most urgent first
+    notes: tuple[str, ...] = ()  #: Assumptions behind the figures
+    #: Coverage by the keyframes next to the map; None without keyframes
     keyframes: KeyframeCheck | None = None
     map_ids: tuple[str, ...] = ()  #: Ids in the map's order, which overlaps refer to
-    #: How many times too large the map is by the sizes of its objects; None where they fit
+    #: Factor by which the map is too large, by the sizes of its objects; None if they fit
     scale: float | None = None
 
     @property
     def verdict(self) -> str:
-        """Return passed, failed, or keyframes only: all is well but that objects carry nothing."""
+        """Return 'passed', 'failed', or 'keyframes only' if only BY_OBJECTS is missed."""
         missed = [measure.name for measure in self.measures if measure.is_missed]
         return 'passed' if not missed else 'keyframes only' if missed == [BY_OBJECTS] else 'failed'
 
     @property
     def carried(self) -> tuple[Carried, ...]:
-        """Return where a robot can be localized, and by which evidence."""
+        """Return the numbers of frames and positions that localize a robot, by evidence."""
         found = [carried_positions(self.grid, self.keyframes)]
         if self.recording is not None and (judged := self.recording.judged):
             objects = count_by_objects(judged)['accepted']
@@ -243,8 +243,9 @@ class CheckReport:
     @property
     def failures(self) -> tuple[str, ...]:
         """Return the thresholds that the map misses; empty if it is good enough."""
-        return tuple(f'{one.name}: {one.show(one.value)} {">" if one.is_most else "<"} '
-                     f'{one.show(one.limit)}' for one in self.measures if one.is_missed)
+        return tuple(f'{measure.name}: {measure.show(measure.value)} '
+                     f'{">" if measure.is_most else "<"} {measure.show(measure.limit)}'
+                     for measure in self.measures if measure.is_missed)
 
     @property
     def advice(self) -> tuple[str, ...]:
@@ -260,11 +261,11 @@ class CheckReport:
     def _by_images(self) -> list[Trial]:
         """Return the recorded frames that were relocalized by keyframes, too."""
         return [] if self.recording is None else [
-            one for one in self.recording.judged if one.by_objects is not None]
+            trial for trial in self.recording.judged if trial.by_objects is not None]
 
     @property
     def evidence(self) -> str:
-        """Return the source of the accepted poses that count, in words."""
+        """Describe the evidence by which poses are accepted."""
         return 'by objects or keyframes' if self.keyframes is not None and self._by_images else (
             'by objects')
 
@@ -272,8 +273,8 @@ class CheckReport:
     def accepted_positions(self) -> float:
         """Return the share of the grid positions near the recording with an accepted heading.
 
-        A keyframe within reach counts where recorded images were relocalized by the keyframes of
-        other parts of the recording, by the share of them that was accepted.
+        If recorded images were relocalized by keyframes of other parts of the recording, a
+        position with a keyframe within reach counts with the accepted share of these images.
         """
         if self.keyframes is None or not (by_images := self._by_images):
             return self.grid.accepted_positions
@@ -291,23 +292,27 @@ class CheckReport:
     def faulty(self) -> float:
         """Return the share of the landmarks with a serious fault.
 
-        A landmark counts as often as it was seen: one of a few frames is seen as rarely again.
+        Each landmark is weighted by its number of frames: a landmark of few frames will rarely be
+        seen again.
         """
-        return sum(one.weight for one in self.landmarks if one.severity >= SERIOUS) / sum(
+        return sum(landmark.weight for landmark in self.landmarks
+                   if landmark.severity >= SERIOUS) / sum(
             landmark.weight for landmark in self.landmarks)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain values, for JSON."""
         return {
             'passed': self.passed, 'verdict': self.verdict,
-            'carried': [one._asdict() for one in self.carried], 'scale_by_sizes': self.scale,
+            'carried': [carried._asdict() for carried in self.carried],
+            'scale_by_sizes': self.scale,
             'failures': list(self.failures), 'advice': list(self.advice),
             'notes': list(self.notes), 'faulty_landmarks': self.faulty,
             'duplicates': self.duplicates,
             'landmarks': [asdict(landmark) for landmark in self.landmarks],
-            'overlaps': [{'first': self.map_ids[one.first], 'second': self.map_ids[one.second],
-                          'distance': one.distance, 'is_duplicate': one.is_duplicate}
-                         for one in self.overlaps],
+            'overlaps': [{'first': self.map_ids[overlap.first],
+                          'second': self.map_ids[overlap.second],
+                          'distance': overlap.distance, 'is_duplicate': overlap.is_duplicate}
+                         for overlap in self.overlaps],
             'look_alikes': [asdict(look_alike) for look_alike in self.look_alikes],
             'grid': self.grid.as_dict(),
             'recording': None if self.recording is None else self.recording.as_dict(),
@@ -316,7 +321,7 @@ class CheckReport:
 
 
 def carried_positions(grid: GridCheck, keyframes: KeyframeCheck | None) -> Carried:
-    """Return where on a grid near the recording a robot can be localized, by which evidence."""
+    """Count the grid positions near the recording by the evidence that localizes a robot there."""
     by_objects = grid.accepted[grid.is_near] > 0
     reached = np.zeros(len(by_objects), dtype=np.bool_) if keyframes is None else (
         keyframes.headings[grid.is_near] > 0)
@@ -339,7 +344,7 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
                                  limits.min_explained, False),
                          Measure('held-out median IoU', recording.held_out.median_iou,
                                  limits.min_iou, False, 'number')]
-        # without enough judged frames (each object passed only once), simulated boxes stand in
+        # with too few judged frames (each object was passed only once), simulated ones count
         how, trials = ((report.evidence, recording.judged) if recording.can_judge_frames else
                        ('with simulated boxes', recording.simulated))
         measures.append(Measure(f'recorded frames accepted {how}', share(trials, 'accepted'),
@@ -360,11 +365,12 @@ def _percent(value: float, digits: int) -> str:
 
 def count_by_objects(trials: Sequence[Trial]) -> dict[str, int]:
     """Return how many trials are accepted, refused and misled without keyframes."""
-    return count_verdicts([replace(one, verdict=one.by_objects or one.verdict) for one in trials])
+    return count_verdicts([replace(trial, verdict=trial.by_objects or trial.verdict)
+                           for trial in trials])
 
 
 def share(trials: Sequence[Trial], verdict: str) -> float:
-    """Return the share of the trials with a verdict; 0 of none."""
+    """Return the share of the trials with a verdict; 0 without trials."""
     return count_verdicts(trials)[verdict] / len(trials) if trials else 0.0
 
 
@@ -381,7 +387,7 @@ def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
 
 def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
              forward: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which views (n,) have a keyframe within reach.
+    """Return a mask of the views (n,) with a keyframe within reach.
 
     Cameras are at positions (n, 3) [m] and look along unit vectors (n, 3).
     """

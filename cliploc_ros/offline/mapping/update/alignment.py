@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bring the recording's poses into the coordinate frame of the old map.
 
-The recording may have a coordinate frame of its own, a little off, and its poses may have errors:
-they may come from the relocalizer. The landmarks that are still in their places tell both.
+The recording may have a slightly different coordinate frame, and its poses may have errors, as
+they may come from the relocalizer. Both are estimated from the landmarks that are still in their
+places.
 """
 
 from dataclasses import replace
@@ -26,32 +27,32 @@ from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.pose_noise import significant_pose_errors
 from cliploc_ros.offline.mapping.views import Views
 
-# A position is known no better than this [m]: objects are not ellipsoids. A guess.
+# Least deviation of a position [m]: objects are not ellipsoids. A guess.
 _LEAST_SIGMA_M = 0.01
-# Deviation of a centre where the map does not say it [m]. A guess.
+# Deviation of a centre if the map does not give it [m]. A guess.
 _UNKNOWN_SIGMA_M = 0.05
-# An object has moved if it is farther away than all three: [m], in units of its old and new shape
-# (1: they touch), and in standard deviations of both positions. A smaller change is a better fit.
-# Guesses.
+# An object has moved if it is displaced by more than all three: [m], in units of its old and new
+# shape (1: they touch), and in standard deviations of both positions. A smaller displacement only
+# means a better fit. Guesses.
 _LEAST_MOVE_M, LEAST_MOVE_SHAPES, LEAST_MOVE_SIGMAS = 0.1, 0.6, 4.0
 #: A recording that confirms fewer landmarks does not belong to the map.
 MIN_CONFIRMED = 3
 _ROUNDS = 4
-# The first association tolerates an offset.
+# Least IoU of the first association, which tolerates an offset.
 _LOOSE_IOU = 0.1
-# How large an offset may be: the deviations of a weak prior. Guesses.
+# Deviations of the weak prior on an offset. Guesses.
 _OFFSET_SIGMA_M, _OFFSET_SIGMA_DEG = 0.5, 5.0
-# Objects that were nudged by this much do not disturb it [m]. A guess.
+# Objects that were nudged by this much do not disturb the alignment [m]. A guess.
 _NUDGE_M = 0.02
 _SETTLED_M = 1e-3
 _LOSS_SCALE = 2.0
-# The median length of a normal vector of three numbers, and the square that one of six exceeds
-# once in a thousand times: a smaller offset is none.
+# Median length of a normal vector of three numbers, and the squared length that a vector of six
+# exceeds once in a thousand times: smaller offsets are ignored.
 _MEDIAN_LENGTH, _SIGNIFICANT = 1.54, 22.5
 
 
 class OldMap(NamedTuple):
-    """L landmarks of the old map as the recording's classes name them."""
+    """L landmarks of the old map, with the recording's classes."""
 
     map: LandmarkMap  #: With details of each landmark
     landmarks: Landmarks  #: Class -1: no box of the recording has a class of this landmark
@@ -64,7 +65,7 @@ class OldMap(NamedTuple):
 
 
 def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
-    """Return the landmarks of a map for a recording with some classes."""
+    """Return the landmarks of a map, with the classes of a recording."""
     details = old.details or (LandmarkDetails(),) * len(old)
     sigmas = np.array([_UNKNOWN_SIGMA_M if detail.position_sigma is None
                        else detail.position_sigma for detail in details])
@@ -73,19 +74,19 @@ def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
 
 
 class Refits(NamedTuple):
-    """L landmarks where the recording puts them; unchanged where it does not tell."""
+    """L landmarks fitted to the recording; unchanged if it has too few boxes."""
 
     landmarks: Landmarks
-    #: (L, 3, 3): of the centres [m^2]; infinite where the recording does not tell
+    #: (L, 3, 3): of the centres [m^2]; infinite for unchanged landmarks
     covariances: NDArray[np.float64]
 
     def select(self, rows: NDArray[np.int64]) -> 'Refits':
-        """Return some of the landmarks."""
+        """Return the landmarks in the given rows."""
         return Refits(self.landmarks.select(rows), self.covariances[rows])
 
     @property
     def is_known(self) -> NDArray[np.bool_]:
-        """Return which landmarks (L,) the recording places."""
+        """Return a mask of the landmarks (L,) that were fitted."""
         return np.isfinite(self.covariances[:, 0, 0])
 
     @property
@@ -115,14 +116,14 @@ class Aligned(NamedTuple):
     """The recording in the coordinate frame of the map."""
 
     views: Views
-    #: How far the recording's coordinate frame was off, in the middle of the landmarks
+    #: Offset of the recording's coordinate frame, at the mean of the landmarks
     offset_m: float
     offset_deg: float
     #: Root mean square by which the poses were refined after that
     change_m: float
     change_deg: float
-    changes: NDArray[np.float64]  #: (F, 6): by how much each pose was refined [m] [rad]
-    estimated: PoseErrors | None  #: The errors of the poses, where they were estimated
+    changes: NDArray[np.float64]  #: (F, 6): change of each pose by refinement [m] [rad]
+    estimated: PoseErrors | None  #: The errors of the poses, if they were estimated
 
 
 def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
@@ -164,13 +165,13 @@ def _offset(known: OldMap, refits: Refits) -> NDArray[np.float64]:
 
     def residuals(motion: NDArray[np.float64]) -> NDArray[np.float64]:
         turned = Rotation.from_rotvec(motion[3:]).apply(fitted - middle) + middle + motion[:3]
-        # the loss sees one number for each landmark, so that it leaves out those that moved
+        # one number for each landmark, so that the loss suppresses landmarks that moved
         lengths = np.linalg.norm(np.einsum('lij,lj->li', whiten, turned - old), axis=1)
         return np.concatenate([lengths, motion / scales])
 
     found = least_squares(residuals, np.zeros(6), loss='cauchy', f_scale=_LOSS_SCALE)
     lengths, step = found.fun[:-6], np.eye(4)
-    # positions err more than their deviations say: objects are not ellipsoids
+    # errors of positions exceed their deviations, as objects are not ellipsoids
     inflation = max(1.0, float(np.median(lengths)) / _MEDIAN_LENGTH)
     if float(found.x @ (found.jac.T @ found.jac) @ found.x) >= _SIGNIFICANT * inflation ** 2:
         step[:3, :3] = Rotation.from_rotvec(found.x[3:]).as_matrix()
@@ -194,7 +195,7 @@ def _refine(aligned: Views, known: OldMap, errors: PoseErrors, options: MappingO
 
 
 def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits) -> NDArray[np.bool_]:
-    """Tell which landmarks (L,) the recording puts so far away that they must have moved."""
+    """Return a mask of the landmarks (L,) that must have moved, as they are so far off."""
     offsets = found.landmarks.centers - old.centers
     far = found.is_known & (np.linalg.norm(offsets, axis=1) > _LEAST_MOVE_M)
     rows = np.nonzero(far)[0]
@@ -207,6 +208,6 @@ def has_moved(old: Landmarks, sigmas: NDArray[np.float64], found: Refits) -> NDA
 
 
 def deviations(old: Landmarks, sigmas: NDArray[np.float64], found: Refits) -> NDArray[np.float64]:
-    """Return by how many standard deviations (L,) old and new positions of landmarks differ."""
+    """Return the distance (L,) of old and new positions of landmarks, in standard deviations."""
     covariances = found.covariances + np.square(sigmas)[:, None, None] * np.eye(3)
     return normalized_lengths(found.landmarks.centers - old.centers, covariances)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which object of the recording is which landmark of the old map, and what became of the others.
+"""Match objects of the recording with landmarks of the old map, and decide the fates of all.
 
 Every landmark gets at most one object of its class, and every object at most one landmark, so that
 the sum of gains is the greatest possible (Hungarian method). A gain is a log-likelihood ratio of
-look and size, plus a bonus for an object that is where the landmark was. A landmark or an object
-stays alone if it gains nothing.
+appearance and size, plus a bonus for an object in the place of the landmark. Pairs without a
+positive gain are not matched.
 """
 
 from collections.abc import Sequence
@@ -23,38 +23,38 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.alignment import OldMap, has_moved
 from cliploc_ros.offline.mapping.update.judging import Judgement, Shown
 
-# Gains, in nats. Guesses: no look outweighs an object that is seen in its place, but two looks
-# that are exchanged do; and looks decide whether a new object is a missing one.
+# Gains, in nats. Guesses: one dissimilar appearance does not outweigh an object in its place, but
+# two exchanged ones do; appearance decides whether a new object is a missing one.
 _IN_PLACE_GAIN, _NEAR_GAIN, _ELSEWHERE_GAIN = 8.0, 6.0, 4.0
 _MAX_LOOK_GAIN = 5.0
-# Of like objects the nearer one is chosen: the logarithm of a way from this length on [m] counts.
+# Among similar objects the nearest is chosen: the gain falls with log(1 + distance / length [m]).
 _WAY_GAIN, _WAY_M = 1.2, 0.3
-# A landmark that is only doubted has not moved farther than this [m]. A guess.
+# A landmark that is only doubtful has not moved farther than this [m]. A guess.
 _MAX_DOUBTED_MOVE_M = 1.5
-# A landmark that was seen in a greater share of the viewpoints has not moved: a wrong box appears
-# in less. A guess.
+# A landmark that was seen in a greater share of the viewpoints has not moved: false detections
+# appear in fewer viewpoints. A guess.
 _MOST_SEEN_IF_MOVED = 0.05
-# A second choice that gains hardly less makes the first one ambiguous.
+# A match is ambiguous if the gain of another landmark is lower by less than this.
 _AMBIGUOUS_GAIN = 1.0
-# Of the logarithm of an object's size, and the largest difference. Guesses.
+# Deviation of the logarithm of an object's size, and the greatest difference. Guesses.
 _SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.25, 0.8
-# Objects in their place from which the usual similarity of two looks is learned.
+# Least number of objects in their places from which to learn the similarity of embeddings.
 _FEWEST_LOOKS = 8
-# A landmark in its place is doubted if its look fits worse than usual by this many deviations.
+# A landmark in its place is doubtful if its similarity is this many deviations below the usual.
 _DOUBT = 1.0
 
 
 class Fates(NamedTuple):
-    """Rows of L old landmarks by what became of them, and new objects."""
+    """Rows of L old landmarks, by their fate, and new objects."""
 
-    #: of int
+    #: Rows of old landmarks
     confirmed: NDArray[np.int64]
     moved: NDArray[np.int64]
     missing: NDArray[np.int64]
     not_observed: NDArray[np.int64]
-    new: NDArray[np.int64]  #: of int: objects that are no old landmark
+    new: NDArray[np.int64]  #: Objects that are not an old landmark
     objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
-    rivals: dict[int, tuple[int, ...]]  #: Old landmarks that an object could be as well
+    rivals: dict[int, tuple[int, ...]]  #: Other old landmarks that an object could be
 
 
 def decide_fates(known: OldMap, judged: Judgement, objects: Shown, looks: 'Likeness | None'
@@ -65,7 +65,7 @@ def decide_fates(known: OldMap, judged: Judgement, objects: Shown, looks: 'Liken
     elsewhere = found.copy()
     rows = np.nonzero(found)[0]
     elsewhere[rows] = objects.owners[numbers[rows]] != rows
-    # an object that is a little off its place was only mapped badly
+    # an object slightly off its place did not move: it was mapped inaccurately
     rows = np.nonzero(elsewhere)[0]
     elsewhere[rows] = has_moved(known.landmarks.select(rows), known.sigmas[rows],
                                 objects.refits.select(numbers[rows]))
@@ -78,7 +78,7 @@ def decide_fates(known: OldMap, judged: Judgement, objects: Shown, looks: 'Liken
 
 
 class Likeness(NamedTuple):
-    """How landmarks and objects look, in one encoder's space: unit rows, zero if unknown."""
+    """Embeddings of landmarks and objects by one encoder: unit rows, zero if unknown."""
 
     landmarks: NDArray[np.float32]  #: (L, d): of the old map
     objects: NDArray[np.float32]  #: (m, d): of the recording
@@ -94,11 +94,11 @@ class Likeness(NamedTuple):
 
 
 def why_not_comparable(old: LandmarkEmbeddings | None, detections: PosedDetections) -> str:
-    """Return why the looks of a map and a recording cannot be compared; '' if they can."""
+    """Return why the embeddings of a map and a recording cannot be compared; '' if they can."""
     if old is None:
         return 'the map has no image embeddings'
     if detections.embeddings is None or not detections.encoder_key:
-        return 'the recording has no embeddings that name their encoder; let CLIP look at it'
+        return 'the recording has no embeddings that name their encoder; record it with CLIP'
     if old.encoder_key != detections.encoder_key:
         return f"the map's encoder is {old.encoder_key}, the recording's {detections.encoder_key}"
     if old.means.shape[1] != detections.embeddings.shape[1]:
@@ -108,7 +108,7 @@ def why_not_comparable(old: LandmarkEmbeddings | None, detections: PosedDetectio
 
 def compare_looks(old: LandmarkEmbeddings, landmark_ids: Sequence[str],
                   detections: PosedDetections, objects: Shown) -> Likeness:
-    """Return the looks of the old landmarks, by their ids, and of the recording's objects."""
+    """Return the embeddings of the old landmarks, by their ids, and of the recording's objects."""
     of_objects = embed_landmarks([str(number) for number in range(len(objects.owners))],
                                  detections, objects.shown)
     return Likeness(old.in_order(landmark_ids).means.astype(np.float32),
@@ -118,9 +118,9 @@ def compare_looks(old: LandmarkEmbeddings, landmark_ids: Sequence[str],
 def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str],
                      detections: PosedDetections, shown: NDArray[np.int64]
                      ) -> LandmarkEmbeddings | None:
-    """Return the embeddings of the new map: the old ones, and the recording's for the others.
+    """Return the embeddings of the new map: old ones if known, otherwise the recording's.
 
-    The ids are those of the new map, shown (n,) the row there that each box shows, -1 for none.
+    The ids are those of the new map; shown (n,) is the row in it that each box shows, -1 for none.
     """
     kept = None if old is None else old.in_order(landmark_ids)
     if detections.embeddings is None or not detections.encoder_key:
@@ -131,14 +131,14 @@ def renew_embeddings(old: LandmarkEmbeddings | None, landmark_ids: Sequence[str]
     if why_not_comparable(kept, detections):
         return kept
     known = dict(zip(landmark_ids, kept.is_known.tolist(), strict=True))
-    parts = [one.in_order([name for name in landmark_ids if known[name] == is_known])
-             for one, is_known in ((kept, True), (seen, False))]
+    parts = [embeddings.in_order([name for name in landmark_ids if known[name] == is_known])
+             for embeddings, is_known in ((kept, True), (seen, False))]
     return concatenated(parts, parts[0].landmark_ids + parts[1].landmark_ids).in_order(
         landmark_ids)
 
 
 class _LookModel(NamedTuple):
-    """How similar the looks of one object are, and those of two objects of one class."""
+    """Cosines of two embeddings of one object, and of two objects of one class."""
 
     own: float
     other: float
@@ -154,8 +154,8 @@ def _identify(known: OldMap, objects: Shown, judged: Judgement, looks: Likeness 
               ) -> tuple[NDArray[np.int64], dict[int, tuple[int, ...]]]:
     """Return the object (L,) that each old landmark is, -1 for none, and the rivals of objects.
 
-    Landmarks that are gone may be any new object, doubtful ones one that is not far; others only
-    the one in their place or near it.
+    A landmark that is gone may be any new object, and a doubtful one may be a nearby object. Any
+    other landmark can only be the object in its place or near it.
     """
     held = np.nonzero(objects.owners >= 0)[0]
     owners = objects.owners[held]
@@ -192,9 +192,9 @@ def _identify(known: OldMap, objects: Shown, judged: Judgement, looks: Likeness 
 
 
 def _class_groups(known: OldMap, objects: Shown) -> NDArray[np.int64]:
-    """Return a group for each class: the classes of one landmark belong together."""
-    count = 1 + max(int(one.names[:, 1].max(initial=0))
-                    for one in (objects.landmarks, known.landmarks))
+    """Return a group for each class; all classes of a landmark are in one group."""
+    count = 1 + max(int(landmarks.names[:, 1].max(initial=0))
+                    for landmarks in (objects.landmarks, known.landmarks))
     rows, classes = known.landmarks.names.T
     main = known.landmarks.classes[rows]
     links = coo_matrix((np.ones(len(main)), (main, classes)), shape=(count, count))
@@ -202,7 +202,7 @@ def _class_groups(known: OldMap, objects: Shown) -> NDArray[np.int64]:
 
 
 def _learn_looks(objects: Shown, looks: Likeness, groups: NDArray[np.int64]) -> _LookModel | None:
-    """Return how looks compare, learned from the landmarks in their place; None if too few."""
+    """Learn the cosines of embeddings from the landmarks in their place; None if too few."""
     held = np.nonzero(objects.owners >= 0)[0]
     own, other = [np.empty(0)], [np.empty(0)]
     classes = groups[objects.landmarks.classes[held]]
@@ -217,7 +217,7 @@ def _learn_looks(objects: Shown, looks: Likeness, groups: NDArray[np.int64]) -> 
         return None
     middle, elsewhere = float(np.median(same)), float(np.median(different))
     if middle <= elsewhere:
-        return None  # looks tell nothing here
+        return None  # embeddings cannot distinguish objects here
     spreads = [1.4826 * float(np.median(np.abs(values - center)))
                for values, center in ((same, middle), (different, elsewhere))]
     return _LookModel(middle, elsewhere, max(*spreads, 1e-3))
@@ -225,9 +225,9 @@ def _learn_looks(objects: Shown, looks: Likeness, groups: NDArray[np.int64]) -> 
 
 def _gains(known: OldMap, objects: Shown, judged: Judgement, rows: NDArray[np.int64],
            columns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the gains (k, j) by place, class, size and way; -inf where a pair is impossible."""
-    sizes = [np.log(np.sort(np.linalg.norm(one.bases, axis=1), axis=1)[:, 1:]).mean(axis=1)
-             for one in (known.landmarks.select(rows), objects.landmarks.select(columns))]
+    """Return the gains (k, j) by place, class, size and distance; -inf for impossible pairs."""
+    sizes = [np.log(np.sort(np.linalg.norm(landmarks.bases, axis=1), axis=1)[:, 1:]).mean(axis=1)
+             for landmarks in (known.landmarks.select(rows), objects.landmarks.select(columns))]
     change = np.abs(sizes[0][:, None] - sizes[1][None])
     ways_m = np.linalg.norm(known.landmarks.centers[rows][:, None]
                             - objects.landmarks.centers[columns][None], axis=2)

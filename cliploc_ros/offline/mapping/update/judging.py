@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Judge each place of a map by a recording: its object is there, it is gone, or neither.
+"""Judge each place of a map by a recording: its object is there, gone, or neither is certain.
 
-Boxes that no old landmark explains show new objects, which hide old places in turn.
+Boxes that no old landmark explains show new objects, which may hide old places.
 """
 
 from collections.abc import Sequence
@@ -32,51 +32,53 @@ from cliploc_ros.offline.mapping.update.alignment import (
 )
 from cliploc_ros.offline.mapping.views import Views
 
-# A recording in which objects are seen less or more often than before changes all ratios.
+# Range of the factor by which a recording changes all ratios, if its objects are detected more or
+# less often than before.
 _FACTOR_RANGE = (0.3, 2.0)
 _RATIO_RANGE = (0.02, 0.95)
-# Landmarks and viewpoints of each from which the scatter of the ratio is learned, and the least
-# that a usual ratio is worth [views]. Guesses.
-_MEDIAN_SQUARE = 0.455  # of a standard normal variable
+# Least number of landmarks, and of viewpoints of each, to estimate the scatter of the ratios;
+# least weight of a usual ratio [views]. Guesses.
+_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
 _FEW_LANDMARKS, _FEW_VIEWS, _LEAST_WORTH = 5, 3, 0.5
-# Share of the objects that are usually still in their place; of the views in which an object is
-# detected, where neither map nor recording tell; and of those in which a wrong box appears in an
-# empty place. Guesses, as all below.
+# Share of the objects that are usually still in their place; share of the views in which an object
+# is detected, if neither map nor recording give it; share of the views with a false detection in
+# an empty place. Guesses, like all values below.
 _STAYS, _SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.9, 0.03
-# The seen ratio is worth this number of views at most: an object may be hard to see from one side.
+# The seen ratio counts as this number of views at most: an object may be hard to see from one
+# side.
 _PRIOR_VIEWS = 4.0
-# An object is gone, or there, below and above these probabilities of being there; the second one
-# where another object was found in its place.
+# An object is gone if its probability of being there is below the first number, or the second one
+# if another object was found in its place. It is there if the probability is above the third one.
 _GONE_BELOW, _GONE_BELOW_IF_TAKEN, _THERE_ABOVE = 0.05, 0.5, 0.95
-# Nor is an object there that was never seen where one is usually seen from this number of
-# viewpoints: how often an object is seen differs more from recording to recording than the map's
-# seen_ratio says. Measured with studies.updates.
+# An object is also gone if it was never seen, and usually would have been seen from this number of
+# viewpoints: how often an object is seen differs more between recordings than the map's seen_ratio
+# predicts. Measured with studies.updates.
 _USUALLY_SEEN = 4.0
 #: Its place must be in view from this number of viewpoints before an object can be missing.
 LEAST_VIEWS = 5
-# A new landmark must be detected this often, and one in its place, in units of how often the old
-# ones are. The second one was chosen on blocks of TUM fr3, between landmarks that were displaced
-# in the map (at most 0.17) and those that were not (at least 0.2, but for 3 of 47).
+# Least detection rate of a new landmark, and of an old landmark in its place, relative to the
+# usual rate of old landmarks. The second number was chosen on blocks of TUM fr3, between landmarks
+# that were displaced in the map (at most 0.17) and those that were not (at least 0.2, except for 3
+# of 47).
 _MIN_NEW_SHARE, _MIN_SHARE_IN_PLACE = 0.4, 0.15
-# A find of an old landmark that moved is good enough if it was seen from directions so far apart,
-# and however rarely. A guess.
+# Least baseline of a find that may be a moved landmark, however rarely it was detected. A guess.
 _MIN_MOVED_BASELINE_DEG = 10.0
 
 
 class Finds(NamedTuple):
-    """New landmarks: m of them."""
+    """The m finds: objects that no old landmark explains in its place."""
 
     landmarks: Landmarks
     class_ids: tuple[str, ...]
     details: tuple[LandmarkDetails, ...]
-    left_out: tuple[LeftOut, ...]  #: Objects that are not good enough for a map, or are old ones
-    #: Why each is not good enough for a new landmark, only for an old one that moved; '' if it is
+    left_out: tuple[LeftOut, ...]  #: Objects not good enough for a map, or old landmarks
+    #: Why each find may be a moved landmark, but not a new one; '' if it may be a new one
     weak: tuple[str, ...] = ()
 
     def without(self, reasons: Sequence[str | None], sight: Sight) -> 'Finds':
         """Return the finds without those that have a reason (m,), which are left out.
 
-        The last ones in sight are the finds.
+        The last entries of sight are those of the finds.
         """
         kept = [row for row, reason in enumerate(reasons) if reason is None]
         own = sight.select(slice(len(sight.seen) - len(reasons), None))
@@ -90,21 +92,21 @@ class Finds(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """What the recording says: L old landmarks, m finds, n boxes."""
+    """The evidence from a recording with n boxes for L old landmarks and m finds."""
 
     #: (n,): the old landmark that each box shows in its place, L + the find, or -1 for none
     shown: NDArray[np.int64]
     finds: Finds
     sight: Sight  #: Of the old places, then of the finds
     is_gone: NDArray[np.bool_]  #: (L,)
-    is_there: NDArray[np.bool_]  #: (L,): Neither: the recording does not tell
-    #: (L,): not proven to be gone, although boxes put it elsewhere, or hardly any shows it
+    is_there: NDArray[np.bool_]  #: (L,): if neither, the recording is inconclusive
+    #: (L,): not proven to be gone, although boxes place it elsewhere, or hardly any show it
     is_doubtful: NDArray[np.bool_]
 
 
 def judge(detections: PosedDetections, views: Views, known: OldMap, options: MappingOptions
           ) -> Judgement:
-    """Return the recording's evidence for each place of the map, and the other objects it shows.
+    """Judge each place of the map by the recording, and find the other objects that it shows.
 
     The views have poses in the coordinate frame of the map.
     """
@@ -115,7 +117,7 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     beside = {new for new, _, _ in _pairs_between(finds.landmarks, known.landmarks)}
     finds = finds.without([weak if weak and new in beside else None
                            for new, weak in enumerate(finds.weak)], sight)
-    # old landmarks and finds compete for the boxes: an old one may have those of a neighbour
+    # old landmarks and finds compete for the boxes: an old one may have boxes of a neighbour
     shown, _ = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
     refits = refit(views, known.landmarks, np.where(shown < count, shown, -1),
                    options.min_viewpoints)
@@ -123,20 +125,20 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     finds = _with_displaced(finds, refits, displaced, known.map.class_ids)
     shown, sight = _look(views, known, finds, displaced)
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
-    # a new object may be in the place of an old one of which a wrong box remains
+    # a new object may be in the place of an old landmark that still has a false detection
     finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0)
     _, sight = _look(views, known, finds, is_gone)
-    # finds are seen about as often as the old landmarks, which come first
+    # finds should be seen about as often as the old landmarks, which come first in `sight`
     ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
     usual = float(np.median(ratios)) if len(ratios) else 1.0
     least = _MIN_NEW_SHARE * usual
     finds = finds._replace(weak=tuple(
         weak if weak or ratio >= least else f'seen in {100 * ratio:.1f} % of the frames that show '
-        f'its place, not {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of what is usual'
+        f'its place, less than {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of the usual rate'
         for weak, ratio in zip(finds.weak, sight.seen_ratio[count:], strict=True)))
     # new objects hide old places
     shown, sight = _look(views, known, finds, is_gone)
-    # an old landmark is hardly there if a find with more boxes is in its place
+    # an old landmark is probably gone if a find with more boxes is in its place
     boxes = np.bincount(shown[shown >= 0], minlength=count + len(finds.details))
     limits = np.full(count, _GONE_BELOW)
     for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
@@ -156,7 +158,7 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     is_rare = ((own.seen_ratio < _MIN_SHARE_IN_PLACE * usual) & (own.expected >= LEAST_VIEWS))
     is_there = (~is_gone & ~is_rare & (fits >= MIN_MEDIAN_IOU)
                 & (refits.is_known | (_probability_there(known, own) > _THERE_ABOVE)))
-    # boxes put it elsewhere, but may not make a landmark there: then nothing says that it is gone
+    # boxes place it elsewhere, but may not suffice for a find there: then it may not be gone
     is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
         ~is_there & ~is_gone & (is_rare | _is_absent(known, own, _STAYS))
         & (known.landmarks.classes >= 0))
@@ -165,9 +167,9 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
 
 def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
                ) -> NDArray[np.bool_]:
-    """Tell which objects (L,) are in their place with less than some probabilities.
+    """Return a mask of the objects (L,) whose probability of being in place is below the limits.
 
-    A detector that never found a class in this recording may not know it, or not at these sizes.
+    Classes without a box are excluded: the detector may not know them, or not at these sizes.
     """
     is_told = (known.landmarks.classes >= 0) & (sight.expected >= LEAST_VIEWS)
     seen = sight.seen > 0
@@ -179,9 +181,9 @@ def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
 def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
     """Return for each place (L,) the probability that its object is there.
 
-    The recording should show an object in a usual share of the views: that of the old recording,
-    times how much more often the new one shows all objects; without an old one, the share of the
-    landmarks seen in this recording.
+    If it is, the recording shows it in a usual share of the views. It is the share of the old
+    recording, times the factor by which the new one shows all objects more often. Without an old
+    recording, it is the share of the landmarks that this recording shows.
     """
     seen = sight.seen > 0
     share = float(sight.seen[seen].sum()) / max(1.0, float(sight.expected[seen].sum()))
@@ -194,12 +196,12 @@ def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
         factor = np.clip(sight.seen[told].sum() / max(expected, 1e-9), *_FACTOR_RANGE)
         ratios = np.where(np.isnan(given), ratios, factor * ratios)
     ratios = np.clip(ratios, *_RATIO_RANGE)
-    # the usual ratios are worth few views if this recording scatters about them: a beta variable
+    # the usual ratios count as few views if this recording scatters about them: a beta variable
     # of mean r and n views has the variance r (1 - r) / (n + 1)
     certainty, rows = _PRIOR_VIEWS, seen & (sight.expected >= _FEW_VIEWS)
     if np.count_nonzero(rows) >= _FEW_LANDMARKS:
         shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
-        # the median, since objects that are gone are not scatter
+        # the median excludes objects that are gone, which are not scatter
         scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
         certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH,
                                   _PRIOR_VIEWS))
@@ -216,7 +218,7 @@ def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> ND
 
 def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_]
           ) -> tuple[NDArray[np.int64], Sight]:
-    """Return the landmark or find that each box shows, and the sight of all their places."""
+    """Return the old landmark or new find that each box shows, and the sight of all places."""
     places = Landmarks.joined(known.landmarks, finds.landmarks)
     is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
     shown = associate(views, places, among=is_solid)
@@ -224,10 +226,10 @@ def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_]
 
 
 def _free(views: Views, known: OldMap) -> NDArray[np.bool_]:
-    """Tell which boxes (n,) may show new objects: those that no old landmark fits well.
+    """Return a mask of the boxes (n,) that may show new objects: no old landmark fits them well.
 
-    Nor is a box free on a landmark that has at least as many of its own: it may be another name
-    for it.
+    Boxes of other classes on a landmark are excluded if it has at least as many boxes of its
+    classes: they may be another name for it.
     """
     own = associate(views, known.landmarks, MIN_MEDIAN_IOU)
     nameless = find_overlaps(
@@ -244,27 +246,27 @@ def _free(views: Views, known: OldMap) -> NDArray[np.bool_]:
 
 def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool_],
               options: MappingOptions) -> Finds:
-    """Return the landmarks that the free boxes show, for the poses of the views."""
-    nothing = Finds(Landmarks.none(), (), (), ())
+    """Return the landmarks that the free boxes show, with the poses of the views."""
+    no_finds = Finds(Landmarks.none(), (), (), ())
     if not is_free.any():
-        return nothing
+        return no_finds
     posed = detections.with_poses(views.poses).select_boxes(is_free)
     try:
         built = build_map(posed, replace(options, pose_errors=None, estimate_pose_errors=False,
                                          refine_mount=False, min_baseline_deg=min(
                                              options.min_baseline_deg, _MIN_MOVED_BASELINE_DEG)))
     except NothingFoundError as error:
-        return nothing._replace(left_out=error.left_out)
+        return no_finds._replace(left_out=error.left_out)
     return Finds(landmarks_of_map(built.landmark_map, detections.class_names),
                  built.landmark_map.class_ids, built.landmark_map.details, built.report.left_out,
                  tuple('' if (detail.baseline_deg or 0.0) >= options.min_baseline_deg else
-                       f'seen from one side only: {detail.baseline_deg:.1f} degrees, not '
+                       f'seen from one side only: {detail.baseline_deg:.1f} degrees, less than '
                        f'{options.min_baseline_deg:g}' for detail in built.landmark_map.details))
 
 
 def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
                     class_ids: Sequence[str]) -> Finds:
-    """Return the finds with the landmarks that stand a little off their place, if not found."""
+    """Add old landmarks that are slightly displaced to the finds, unless they are among them."""
     rows = np.nonzero(displaced)[0]
     again = {moved for moved, _, _ in _pairs_between(refits.landmarks.select(rows),
                                                      finds.landmarks)}
@@ -278,11 +280,11 @@ def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
 
 def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
                     shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
-    """Return the new landmarks without those that are an old one in its place.
+    """Return the finds without those that are an old landmark in its place.
 
-    An old landmark is in its place if it has a box, and a majority for each box of the new. Of
-    two landmarks that lie in one another, the boxes are those of one object: parts of it, or
-    another name for it. If they only touch, frames that show both tell them apart.
+    An old landmark is in its place if it has a box, and at least `majority` boxes for each box of
+    the find. A find of its class that lies in it shows the same object. So does any other
+    overlapping find, as a part or under another name, unless frames show two objects at once.
     """
     count = len(old.centers)
     boxes = group_boxes(shown, count + len(finds.details))
@@ -298,18 +300,18 @@ def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
 
 
 def _pairs_between(new: Landmarks, old: Landmarks) -> list[tuple[int, int, float]]:
-    """Return pairs of a new and an old landmark that stand in one another, see close_pairs."""
+    """Return pairs of a new and an old landmark that overlap, see close_pairs."""
     count = len(new.centers)
     return [(first, second - count, distance) for first, second, distance
             in close_pairs(Landmarks.joined(new, old)) if first < count <= second]
 
 
 class Shown(NamedTuple):
-    """The objects that the recording shows: m, old landmarks in their places and finds."""
+    """The m objects that the recording shows: old landmarks in their places, and finds."""
 
     refits: Refits  #: Where they are
     owners: NDArray[np.int64]  #: (m,): the old landmark in whose place it was seen, -1 for none
-    #: For each, the old landmarks that it may be although it is a little off their place
+    #: For each object, the old landmarks that it may be although it is slightly off their place
     near: tuple[frozenset[int], ...]
     shown: NDArray[np.int64]  #: (n,): the object that each box shows, -1 for none
     sight: Sight
@@ -323,7 +325,7 @@ class Shown(NamedTuple):
         return self.refits.landmarks
 
     def left_out(self, chosen: NDArray[np.int64]) -> tuple[LeftOut, ...]:
-        """Return the weak finds that are not among the objects chosen."""
+        """Return the weak finds that are not among the chosen objects."""
         return tuple(LeftOut(self.class_ids[row], rounded(self.landmarks.centers[row]),
                              int(self.sight.seen_frames[row]), int(self.sight.seen[row]), weak)
                      for row, weak in enumerate(self.weak) if weak and row not in chosen)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The entry point of an update: a map and a new recording of its place in, a new map out.
 
-Landmarks stay, are fitted again, move, come and go. A landmark keeps its id, labels and classes.
-In its place, it also keeps its ellipsoid, unless the recording knows it better: then the centre
-is the mean of both, each weighted by its inverse variance, and the shape is the new one. A centre
-that differs significantly was nudged: the new one counts alone. An ellipsoid without
-position_sigma was made by hand, and stays.
+Landmarks are kept, refitted, moved, added and removed. A landmark keeps its id, labels and
+classes. In its place, it also keeps its ellipsoid, unless the recording determines it more
+precisely: then the centre is the mean of both, each weighted by its inverse variance, and the
+shape is the new one. If the old ellipsoid does not fit the boxes, the object was nudged: then only
+the new centre counts. An ellipsoid without position_sigma was made by hand, and is kept.
 """
 
 from collections.abc import Callable
@@ -52,32 +52,32 @@ from cliploc_ros.offline.mapping.update.judging import (
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 
 _ROWS_SHOWN = 40
-# A larger offset of the recording's coordinate frame from the map's is noted [m] [deg].
+# Least offset of the recording's coordinate frame from the map's that is reported [m] [deg].
 _LEAST_OFFSET_M, _LEAST_OFFSET_DEG = 0.03, 1.0
 # A recording that confirms a smaller share of the landmarks whose place it shows, or fewer than
 # MIN_CONFIRMED, does not belong to the map. A guess.
 _MIN_CONFIRMED_SHARE = 0.3
-# Nor does one in which a smaller share of the landmarks' boxes fits them well. A guess, between
-# blocks of TUM fr3 (0.96; 0.45 if the map is off by 10 cm on each axis) and a simulated table of
-# which poses are off by 5 cm and a degree (0.28).
+# Nor does a recording in which a smaller share of the landmarks' boxes fits them well. A guess,
+# between blocks of TUM fr3 (0.96; 0.45 if the map is off by 10 cm on each axis) and a simulated
+# table with poses off by 5 cm and a degree (0.28).
 _MIN_WELL_SHARE = 0.35
 
 
 @dataclass(frozen=True)
 class UpdatedLandmark:
-    """What became of one landmark."""
+    """The fate of one landmark."""
 
     landmark_id: str
     label: str
     class_id: str
-    center: tuple[float, float, float]  #: Where it is now; where it was if it is missing [m]
-    distance_m: float  #: By how much its centre changed [m]
-    evidence: str  #: Why
+    center: tuple[float, float, float]  #: Its new position, or its old one if it is missing [m]
+    distance_m: float  #: Displacement of its centre [m]
+    evidence: str  #: The evidence for its fate, in words
     last_seen: float | None = None  #: [s]; None where unknown
-    rivals: tuple[str, ...] = ()  #: Landmarks that this object could be as well
+    rivals: tuple[str, ...] = ()  #: Other landmarks that this object could be
 
     def line(self) -> str:
-        """Return it as one line of text."""
+        """Return the fate as one line of text."""
         x, y, z = self.center
         text = f"{self.landmark_id} '{self.label}' at {x:.2f} {y:.2f} {z:.2f}: {self.evidence}"
         return text + (f'; or it is {", ".join(self.rivals)}: they look alike'
@@ -86,15 +86,15 @@ class UpdatedLandmark:
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """The result of an update in numbers and words."""
+    """The result of an update: figures, the fates of landmarks, and notes."""
 
     #: Of the recording
     frames: int
     viewpoints: int
-    #: How far the recording's coordinate frame was off; it is corrected
+    #: Offset of the recording's coordinate frame, which is corrected
     offset_m: float
     offset_deg: float
-    #: Root mean square by which the poses changed besides
+    #: Root mean square change of the poses by refinement
     pose_change_m: float
     pose_change_deg: float
     confirmed: tuple[UpdatedLandmark, ...]
@@ -102,7 +102,7 @@ class UpdateReport:
     missing: tuple[UpdatedLandmark, ...]
     new: tuple[UpdatedLandmark, ...]
     not_observed: tuple[UpdatedLandmark, ...]
-    #: Those of not_observed that may have gone: hardly seen where their places were in view
+    #: Those of not_observed that may be gone: hardly seen although their places were in view
     doubtful: tuple[UpdatedLandmark, ...]
     left_out: tuple[LeftOut, ...]  #: New objects that are not good enough for the map
     notes: tuple[str, ...]
@@ -121,7 +121,7 @@ class UpdateReport:
         rows += [f'note: {note}' for note in self.notes]
         for name, found in (('moved', self.moved), ('missing', self.missing),
                             ('doubtful', self.doubtful), ('new', self.new)):
-            rows += [f'{name}: {one.line()}' for one in found[:_ROWS_SHOWN]]
+            rows += [f'{name}: {landmark.line()}' for landmark in found[:_ROWS_SHOWN]]
             if len(found) > _ROWS_SHOWN:
                 rows.append(f'{name}: and {len(found) - _ROWS_SHOWN} more, see the report')
         return rows + left_out_lines(self.left_out)
@@ -138,7 +138,7 @@ class UpdatedMap:
     #: (F, 4, 4): the poses in the coordinate frame of the map
     map_from_camera: NDArray[np.float64]
     embeddings: LandmarkEmbeddings | None  #: Image embeddings of the new map
-    #: Landmarks that are missing now, or were before: an object that is back gets its id again
+    #: Landmarks that are missing now, or were before; a returning object gets its old id
     removed: LandmarkMap
 
 
@@ -155,9 +155,9 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     options : MappingOptions, optional
         How new landmarks are built; with pose_errors, poses are refined against the map.
     embeddings : LandmarkEmbeddings, optional
-        How the old landmarks look. Ignored if another encoder looked at the recording.
+        Image embeddings of the old landmarks. Ignored if the recording has another encoder.
     removed : LandmarkMap, optional
-        What earlier updates took out of the map, see UpdatedMap.
+        Landmarks that earlier updates removed from the map, see UpdatedMap.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     unlike = why_not_comparable(embeddings, detections)
     looks = None
     if unlike:
-        notes.append(f'looks are not compared: {unlike}')
+        notes.append(f'image embeddings are not compared: {unlike}')
     elif embeddings is not None:
         looks = compare_looks(embeddings, old.landmark_ids, detections, objects)
     fates = decide_fates(known, judged, objects, looks)
@@ -203,15 +203,15 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         f'{old.landmark_ids[row]} is back: an earlier update had removed it'
         for row in kept[kept >= count]]
     lists = _describe(known.map, updated, objects, fates, judged)
-    lists['new'] = tuple(one for one in lists['new']
-                         if one.landmark_id in without_doubles.landmark_ids)
+    lists['new'] = tuple(landmark for landmark in lists['new']
+                         if landmark.landmark_id in without_doubles.landmark_ids)
     report = UpdateReport(
         frames=len(detections), viewpoints=int(given.viewpoints.max()) + 1,
         offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
         pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
         **lists,
         left_out=tuple(sorted(judged.finds.left_out + objects.left_out(fates.objects),
-                              key=lambda one: -one.support)),
+                              key=lambda landmark: -landmark.support)),
         notes=tuple(notes))
     return UpdatedMap(without_doubles, report, shown, first_new, aligned.views.poses,
                       renew_embeddings(embeddings, without_doubles.landmark_ids, detections,
@@ -220,7 +220,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
 
 
 def _check_belongs(judged: Judgement, count: int, well_share: float) -> None:
-    """Refuse a recording that shows hardly any landmark in its place, or most of them badly."""
+    """Refuse a recording that confirms hardly any landmark, or whose boxes fit badly."""
     is_there = judged.is_there[:count]
     there = int(is_there.sum())
     in_view = int((is_there | (judged.sight.expected[:count] >= LEAST_VIEWS)).sum())
@@ -240,16 +240,17 @@ def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list
         notes.append(estimated_note(aligned.estimated))
     if aligned.offset_m > _LEAST_OFFSET_M or aligned.offset_deg > _LEAST_OFFSET_DEG:
         notes.append(f'the poses are {aligned.offset_m * 100:.1f} cm and {aligned.offset_deg:.1f} '
-                     'degrees off the map as a whole; this is corrected')
+                     'degrees off the map; this offset is corrected')
     unseen = sorted({known.map.class_ids[row]
                      for row in np.nonzero(known.landmarks.classes < 0)[0]})
     if unseen:
         notes.append(f'the recording has no box of the class {", ".join(unseen[:5])}; '
-                     'landmarks of it are kept: the detector may not know it')
+                     'landmarks of this class are kept: the detector may not know it')
     last_seen = max((detail.last_seen or 0.0 for detail in known.map.details), default=0.0)
     if last_seen > float(detections.stamps_s[-1]):
-        notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the map was '
-                     f'last seen at {last_seen:.0f} s: an older recording, or another clock')
+        notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the '
+                     f'landmarks were last seen at {last_seen:.0f} s: an older recording, or '
+                     'another clock')
     return notes
 
 
@@ -265,10 +266,11 @@ def _renew(known: OldMap, views: Views, objects: Shown, fates: Fates, judged: Ju
     new_axes, new_quats = objects.landmarks.axes_and_quats()
     for row in fates.confirmed:
         number = fates.objects[row]
-        one = _looked_for(details[row], objects.sight, number)
+        updated = _looked_for(details[row], objects.sight, number)
         details[row] = replace(
-            one, baseline_deg=max(one.baseline_deg or 0.0, float(evidence.baseline_deg[number])),
-            last_seen=max(one.last_seen or 0.0, float(evidence.last_seen[number])))
+            updated, baseline_deg=max(updated.baseline_deg or 0.0,
+                                      float(evidence.baseline_deg[number])),
+            last_seen=max(updated.last_seen or 0.0, float(evidence.last_seen[number])))
     for row in fates.moved:
         details[row] = _in_new_place(details[row], objects.sight, evidence, fates.objects[row])
     for row in fates.not_observed[judged.is_doubtful[fates.not_observed]].tolist():
@@ -294,16 +296,17 @@ def _renew(known: OldMap, views: Views, objects: Shown, fates: Fates, judged: Ju
         np.concatenate([centers[kept], objects.landmarks.centers[fates.new]]),
         np.concatenate([semi_axes[kept], new_axes[fates.new]]),
         np.concatenate([quats[kept], new_quats[fates.new]]),
-        tuple(every) if any(one != LandmarkDetails() for one in every) else ())
+        tuple(every) if any(detail != LandmarkDetails() for detail in every) else ())
 
 
 def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], first_new: int,
                 class_names: tuple[str, ...]
                 ) -> tuple[LandmarkMap, NDArray[np.int64], int, list[str]]:
-    """Return the new map in which landmarks that are one thing by the recording are one.
+    """Merge the landmarks of the new map that the recording shows to be the same object.
 
-    The older landmark keeps its id and gets the labels and classes of the other; the ellipsoid is
-    that with more boxes. Two old landmarks stay if the recording shows only one of them.
+    The older landmark keeps its id and gets the labels and classes of the other one, and the
+    ellipsoid with more boxes is kept. Two old landmarks are not merged if the recording shows only
+    one of them.
 
     Returns the map, the landmark that each box shows (n,), the row of the first new landmark, and
     notes.
@@ -317,7 +320,8 @@ def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], f
             if counts[shapes[second]] > counts[shapes[first]]:
                 shapes[first] = shapes[second]
             ids = updated.landmark_ids
-            notes.append(f'{ids[second]} is one thing with {ids[first]}, which has its classes')
+            notes.append(f'{ids[second]} is the same object as {ids[first]}, which gets its '
+                         'classes')
     if not notes:
         return updated, shown, first_new, notes
     joined, kept = updated.joined(into), np.unique(into)
@@ -332,7 +336,7 @@ def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], f
 
 
 def _refitted(known: OldMap, views: Views, objects: Shown, fates: Fates) -> dict[int, float]:
-    """Return the weight of the new centre for the confirmed landmarks that are fitted again."""
+    """Return the weight of the new centre for each confirmed landmark that is refitted."""
     rows = np.array([row for row in fates.confirmed
                      if known.map.details[row].position_sigma is not None
                      and objects.refits.is_known[fates.objects[row]]], dtype=np.int64)
@@ -340,7 +344,7 @@ def _refitted(known: OldMap, views: Views, objects: Shown, fates: Fates) -> dict
     renumbered = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
     renumbered[numbers] = np.arange(len(rows))
     before = gather_evidence(views, known.landmarks.select(rows), renumbered[objects.shown])
-    # a fit to other sides of the object differs, too, but then the old ellipsoid fits the boxes
+    # a fit to other sides of the object also differs, but then the old ellipsoid fits the boxes
     nudged = before.median_iou < MIN_MEDIAN_IOU
     old_sigmas, new_sigmas = known.sigmas[rows], objects.refits.sigmas[numbers]
     weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + new_sigmas ** 2))
@@ -359,7 +363,7 @@ def _looked_for(details: LandmarkDetails, sight: Sight, number: int) -> Landmark
 
 def _in_new_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, number: int
                   ) -> LandmarkDetails:
-    """Return the details of a landmark in a new place, by the recording alone."""
+    """Return the details of a landmark in a new place, from the recording alone."""
     return replace(evidence.details(number, details),
                    seen_ratio=float(min(1.0, sight.seen_ratio[number])),
                    last_seen=max(0.0, float(evidence.last_seen[number])))
@@ -387,7 +391,7 @@ def _describe(old: LandmarkMap, updated: LandmarkMap, objects: Shown, fates: Fat
     def moved(row: int) -> str:
         number = fates.objects[row]
         way = float(np.linalg.norm(objects.landmarks.centers[number] - old.centers[row]))
-        left = ('an object of another look is in its old place' if judged.is_there[row]
+        left = ('an object that looks different is in its old place' if judged.is_there[row]
                 else f'old place {in_old_place(row)}')
         return (f'moved by {way:.2f} m: {left}; new place seen in '
                 f'{objects.sight.seen_frames[number]} of {objects.sight.expected_frames[number]}')
@@ -399,7 +403,7 @@ def _describe(old: LandmarkMap, updated: LandmarkMap, objects: Shown, fates: Fat
         'not_observed': listed(fates.not_observed, in_old_place),
         'doubtful': listed(
             fates.not_observed[judged.is_doubtful[fates.not_observed]],
-            lambda row: f'{in_old_place(row)}: it stays; delete it if it is not there'),
+            lambda row: f'{in_old_place(row)}: it is kept; delete it if it is gone'),
         'new': tuple(UpdatedLandmark(
             updated.landmark_ids[place], updated.labels[place], updated.class_ids[place],
             rounded(updated.centers[place]), 0.0, in_place(number),
