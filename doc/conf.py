@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The documentation site. Build it with script/site; rosdoc2 reads this file, too."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -32,3 +33,9 @@ html_static_path = ['_static']
 html_css_files = ['site.css']
 html_title = f'cliploc_ros {release}'
 html_show_sourcelink = False
+
+
+def setup(app):
+    """Name files outside of doc/ instead of linking to them: the site does not have them."""
+    app.connect('source-read', lambda app, page, source: source.__setitem__(0, re.sub(
+        r'\[([^\]]+)\]\(\.\./([^)#]+)[^)]*\)', r'\1 (`\2` in the repository)', source[0])))
