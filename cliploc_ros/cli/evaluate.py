@@ -3,13 +3,15 @@
 """The executable ``evaluate``: the paper's table and figures on your own data."""
 
 import argparse
+import hashlib
 import logging
 import math
 import os
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.options import (
@@ -18,6 +20,7 @@ from cliploc_ros.cli.options import (
     add_reading_options,
     check_folder_options,
     folder_of,
+    given_options,
 )
 from cliploc_ros.command import SEEDS, limit, not_negative, option, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
@@ -46,6 +49,7 @@ examples:
   evaluate --bag office --map office.yaml --methods class_bf auto --no-clip
   evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
+  evaluate --queries office.npz --map office.yaml --methods auto --poses hloc=hloc.txt
   evaluate --bag case_20260101T120000.000_refused.npz --map office.yaml
       answers a request again that ~/record stored; exit code 1: another verdict
 """
@@ -61,15 +65,20 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='evaluate', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Compare methods on the same input. Writes the paper's table as a page, text, "
-        'LaTeX and CSV, results.json, figures and trajectories. Needs no sourced ROS.')
+        'LaTeX and CSV, results.json, run.json with input and options, figures and trajectories. '
+        'Needs no sourced ROS.')
     group = parser.add_mutually_exclusive_group(required=True)
-    option(group, '--queries NPZ', 'recorded boxes and similarities')
+    option(group, '--queries NPZ', 'recorded boxes and similarities; without the options of '
+           'networks and recordings, which would have no effect')
     option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that ~/record '
            'stored (npz), which is answered again', Path)
     add_folders(group)
     option(parser, '--map YAML', 'several maps are searched as one; true poses are in the first',
            nargs='+', required=True)
     option(parser, '--methods M', f'default: {ALL}; see below', default=[ALL], nargs='+')
+    option(parser, '--poses NAME=FILE', 'poses of another program as a further row: TUM format, '
+           'camera (z forward) in the map, stamps of the queries within 10 ms; repeatable',
+           default=[], nargs='+', action='extend')
     option(parser, '--trials', "the paper's %(default)s by default", positive_int, 5)
     option(parser, '--seed', 'of the first trial (%(default)s)', within(*SEEDS), 0)
     option(parser, '--frames', "of a query file; 'all' includes the neighbours of the queries",
@@ -142,6 +151,11 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.offline.evaluation.run import compare_methods
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
+    parser = make_parser()
+    given = given_options(options, {name: parser.get_default(name) for name in vars(options)
+                                    if name != 'ros_args'})
+    if options.queries is not None:
+        _refuse_image_options(options)
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
         raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
     check_folder_options(options)
@@ -164,6 +178,7 @@ def evaluate(options: argparse.Namespace) -> int:
         tilt_deviation_deg=options.tilt_deviation,
         vertical_deviation_deg=max(1.0, options.gravity_noise_deg), crops=options.crops)
     methods = parse_methods(options.methods, paper, len(landmark_map))
+    others = trials.read_given_poses(options.poses, methods)
     options.clip = len(landmark_map) > 0 and _needs_clip(options, methods)
     layer = _read_layer(options, landmark_map, methods)
     if not len(landmark_map) and layer is None:
@@ -183,26 +198,92 @@ def evaluate(options: argparse.Namespace) -> int:
         notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
         print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
 
-    noise_m, noise_deg = options.odometry_noise
+    draws = _with_sensors(options, queries, recorded)
+    compare_methods(landmark_map, draws[0], methods, options.out, trials=options.trials,
+                    workers=options.workers or _cores(), scheduler=options.scheduler,
+                    layer=layer, noisy=draws if len(draws) > 1 else (),
+                    sweep=options.sweep if options.figures else None,
+                    resume=options.resume, frames=recorded.frames,
+                    given=others, about=_describe(options, given, layer is not None),
+                    remarks=[*_notes_on_maps(options), *_notes_on_detector(queries, landmark_map)])
+    return 0
 
-    def sensed(seed: int) -> 'tuple[PosedQuery, ...]':
-        found = queries
+
+def _refuse_image_options(options: argparse.Namespace) -> None:
+    """Refuse options of images and networks beside a query file; OptionsError names them."""
+    of_images = argparse.ArgumentParser()
+    _add_recording_options(of_images)
+    add_reading_options(of_images)
+    defaults = vars(of_images.parse_args([]))
+    del defaults['scheduler']  # of the searches, too
+    if given := given_options(options, defaults):
+        raise OptionsError(f'{", ".join(given)}: no effect on --queries, whose boxes and '
+                           'similarities are recorded; give --bag or a folder')
+
+
+def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
+                  recorded: 'Queries') -> 'list[tuple[PosedQuery, ...]]':
+    """Return the queries with simulated sensors: of each trial if these have noise, else once."""
+    from cliploc_ros.offline.evaluation import trials
+
+    noise_m, noise_deg = options.odometry_noise
+    is_noisy = (options.gravity and options.gravity_noise_deg) or (
+        options.fuse and (noise_m or noise_deg))
+    draws = []
+    for seed in range(options.seed, options.seed + (options.trials if is_noisy else 1)):
+        found = tuple(queries)
         if options.gravity:
             found = trials.with_vertical(found, options.gravity_noise_deg, seed)
         if options.fuse:
             found = trials.with_neighbours(found, [frame.group for frame in recorded], noise_m,
                                            noise_deg, seed)
-        return tuple(one for one in found
-                     if options.frames == 'all' or recorded[one.number].is_main)
-    is_noisy = (options.gravity and options.gravity_noise_deg) or (
-        options.fuse and (noise_m or noise_deg))
-    draws = [sensed(options.seed + trial) for trial in range(options.trials if is_noisy else 1)]
-    compare_methods(landmark_map, draws[0], methods, options.out, trials=options.trials,
-                    workers=options.workers or _cores(), scheduler=options.scheduler,
-                    layer=layer, noisy=draws if is_noisy else (), sweep=options.sweep,
-                    resume=options.resume, figures=options.figures, frames=recorded.frames,
-                    remarks=[*_notes_on_maps(options), *_notes_on_detector(queries, landmark_map)])
-    return 0
+        draws.append(tuple(query for query in found
+                           if options.frames == 'all' or recorded[query.number].is_main))
+    return draws
+
+
+def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: bool
+              ) -> dict[str, Any]:
+    """Return what the results depend on: files, networks and the options that are no defaults."""
+    from cliploc_ros.cli.sources import clip_options, detector_options, source_of
+    from cliploc_ros.core.keyframes.layer import layer_path
+    from cliploc_ros.core.map.landmark_embeddings import embeddings_path
+    from cliploc_ros.models.clip_weights import names_onnx
+
+    files = [options.queries or source_of(options), *options.map,
+             *(word for word in options.methods if word.endswith(('.yaml', '.yml'))),
+             *(word.partition('=')[2] for word in options.poses)]
+    if has_layer:
+        files.append(layer_path(options.map[0]))
+    if options.queries is not None:
+        detector = 'unknown: query files do not name it'
+        similarities = 'unknown: query files do not say whether CLIP or a simulation made them'
+    else:
+        detector, clip = detector_options(options).model, clip_options(options)
+        architecture = '' if names_onnx(clip) else f'{clip.model} '
+        similarities = f'CLIP {architecture}{clip.pretrained}' if options.clip else 'none'
+        files += [options.trajectory, options.model, options.clip_pretrained]
+        if options.clip and options.landmark_embeddings != 'text':
+            files += map(embeddings_path, options.map)
+    words = []
+    for name, value in given.items():
+        values = value if isinstance(value, list) else [value]
+        words += [name, *(str(each) for each in values if not isinstance(each, bool))]
+    return {'sha256': {str(file): _hash(file) for file in files if file and Path(file).exists()},
+            'detector': detector, 'similarities': similarities, 'options': shlex.join(words)}
+
+
+def _hash(path: str | Path) -> str:
+    """Return 12 digits of the SHA-256 of a file, or of all files of a folder, in order of path."""
+    digest = hashlib.sha256()
+    files = sorted(folder / name for folder, _, names in Path(path).walk(follow_symlinks=True)
+                   for name in names)
+    for file in files or [Path(path)]:
+        if file.is_file():
+            with file.open('rb') as content:
+                while block := content.read(2**20):
+                    digest.update(block)
+    return digest.hexdigest()[:12]
 
 
 def _notes_on_detector(queries: 'Sequence[PosedQuery]', landmark_map: 'LandmarkMap') -> list[str]:
@@ -230,12 +311,9 @@ def _notes_on_maps(options: argparse.Namespace) -> list[str]:
 
 
 def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> bool:
-    """Return whether crops are compared with labels; OptionsError: they are, and CLIP may not run.
-
-    A file of queries is for other methods, too.
-    """
+    """Return whether crops are compared with labels; OptionsError: they are, with --no-clip."""
     comparing = [method.name for method in methods if method.options.needs_similarities]
-    if options.clip or options.queries is not None:
+    if options.clip:
         return bool(comparing or options.save_queries)
     if comparing or options.save_queries:
         what = f"method '{comparing[0]}'" if comparing else '--save-queries'
@@ -305,8 +383,6 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
     from cliploc_ros.offline.recording.recorder import EVERY_FRAME
 
     if frames is None:
-        if options.save_queries is not None:
-            raise OptionsError('--save-queries needs --bag or a folder')
         return load_queries(options.queries, landmark_map.landmark_ids)
     from cliploc_ros.cli.sources import recording_options
 

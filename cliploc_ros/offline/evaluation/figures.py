@@ -148,7 +148,7 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
     folder : Path
         Folder of the figures.
     summaries : sequence of Summary
-        Summaries of the results.
+        Summaries of the results. Poses of other programs are in the figures of success only.
     sweep : mapping of str to mapping of int to Summary
         Summaries of each sampling method, by its number of iterations.
     observing_ms : mapping of str to float
@@ -159,7 +159,8 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
     list of Path
         The PNG files; each has an SVG beside it.
     """
-    best = find_best(summaries)
+    searched = [summary for summary in summaries if not summary.is_given]
+    best = find_best(searched)
     found = np.isfinite(best.errors_m)
     reliable = {best.method: (best.confidence[found], best.errors_m[found] < _SUCCESS_M)}
     success = f'success (within {_SUCCESS_M:g} m)'
@@ -171,16 +172,16 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
         'precision_over_recall': _drawn(
             'recall: right poses that are accepted',
             f'precision: accepted poses within {_SUCCESS_M:g} m', _precision_over_recall,
-            summaries),
+            searched),
         'reliability': _drawn('confidence', f'share of poses within {_SUCCESS_M:g} m',
                               draw_reliability, reliable, 'installed calibration'),
         'consistency': _drawn('squared error in its own covariance (NEES)',
-                              'share of accepted poses below', _consistency, summaries),
-        'time_by_stage': _drawn('mean time [ms]', '', _time_by_stage, summaries, observing_ms),
+                              'share of accepted poses below', _consistency, searched),
+        'time_by_stage': _drawn('mean time [ms]', '', _time_by_stage, searched, observing_ms),
         'top_view': _top_view(landmark_map, queries,
                               [one for one in results if one.method == best.method], best.method),
     }
-    if sampled := [summary for summary in summaries if not summary.method.endswith('_bf')]:
+    if sampled := [summary for summary in searched if not summary.method.endswith('_bf')]:
         figures['best_iteration'] = _drawn('iteration that found the best pose', '',
                                            _best_iteration, sampled)
     if sweep:
@@ -225,7 +226,9 @@ def _style(method: str) -> tuple[str, object, str | None]:
     if method in PAPER_METHODS:
         matching, algorithm = method.split('_')
         return _COLORS[matching], *_STYLES[algorithm]
-    return _OTHER_COLORS[sum(method.encode()) % len(_OTHER_COLORS)], '-', 'P'
+    number = sum(method.encode())
+    return (_OTHER_COLORS[number % len(_OTHER_COLORS)],
+            *tuple(_STYLES.values())[number // len(_OTHER_COLORS) % len(_STYLES)])
 
 
 def add_legend(figure: Figure) -> None:

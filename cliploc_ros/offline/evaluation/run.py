@@ -3,11 +3,14 @@
 """Methods compared: all trials on all queries, on all cores or on a cluster, and the files."""
 
 import hashlib
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
 from itertools import batched, chain
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,10 +29,11 @@ from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
 from cliploc_ros.offline.datasets.observations import QueryFrame
+from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.offline.evaluation.report import PAGE, write_report
-from cliploc_ros.offline.evaluation.trials import PosedQuery, Result, run_trial
+from cliploc_ros.offline.evaluation.trials import PosedQuery, Result, given_results, run_trial
 from cliploc_ros.units import NS_PER_S
 
 # A stopped run loses at most this many queries of each core.
@@ -142,10 +146,12 @@ class _MakeSearch:
 
 
 def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
-                    methods: Sequence[Method], out: Path, *, sweep: Sequence[int] = (),
-                    resume: bool = False, figures: bool = True,
-                    frames: Sequence[QueryFrame] = (), remarks: Sequence[str] = (),
-                    **running: Any) -> list[summary.Summary]:
+                    methods: Sequence[Method], out: Path, *, sweep: Sequence[int] | None = (),
+                    resume: bool = False, frames: Sequence[QueryFrame] = (),
+                    remarks: Sequence[str] = (),
+                    given: Mapping[str, TimedPoses] = MappingProxyType({}),
+                    about: Mapping[str, Any] = MappingProxyType({}), **running: Any
+                    ) -> list[summary.Summary]:
     """Run methods, print the table, write all files to a folder; return their summaries.
 
     CliplocError: the run cannot be resumed, or a file cannot be written.
@@ -154,21 +160,27 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     ----------
     out : Path
         An existing folder.
-    sweep : sequence of int
-        Further numbers of iterations for each sampling method, for a figure.
+    sweep : sequence of int, optional
+        Further numbers of iterations for each sampling method, for a figure. None: no figures.
     resume : bool
         Continue an unfinished run.
     frames : sequence of QueryFrame
         Frames of the query file, for the times of detector and CLIP.
     remarks : sequence of str
         Notes on the input, shown with the table.
+    given : mapping of str to TimedPoses
+        Poses of other programs by name: further rows of the table.
+    about : mapping
+        Input and options of the run, for run.json and the tables.
     running
         trials, workers, scheduler, layer, noisy: see run_methods.
     """
+    others = [result for name, poses in given.items()
+              for result in given_results(name, poses, queries)]
     swept = [replace(method, name=f'{method.name}{_AT}{count}',
                      options=replace(method.options, iterations=count))
              for method in methods if not method.draws_nothing
-             for count in sweep if figures and count != method.options.iterations]
+             for count in sweep or () if count != method.options.iterations]
     everything = [*methods, *swept]
     unfinished = out / 'unfinished.jsonl'
     if unfinished.exists() and not resume:
@@ -188,22 +200,38 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
             results = run_methods(landmark_map, everything, queries, done=done, advance=advance,
                                   **running)
         own = [result for result in results if _AT not in result.method]
-        summaries = summary.summarize(own)
-        rows = summary.table_rows(summaries)
         write_trajectories(out / 'trajectories', queries, own)
+        shown = [*own, *others]
+        summaries = summary.summarize(shown)
+        rows = summary.table_rows(summaries)
         remarks = [*remarks, *summary.notes(summaries)]
         print('\n'.join(['', summary.as_text(rows), *remarks, '']), flush=True)
-        write_text(out / 'table.md', '\n\n'.join([summary.as_markdown(rows), *remarks]) + '\n')
-        write_text(out / 'results.json', summary.as_json(own))
-        write_text(out / 'table.tex', summary.as_latex(rows))
+        about = {'version': _version(), 'queries': len(queries), 'landmarks': len(landmark_map),
+                 'seed': methods[0].options.random_seed, **about}
+        facts = list(chain.from_iterable(
+            [(file, f'{name} {digest}') for file, digest in value.items()]
+            if isinstance(value, dict) else [(name, str(value))] for name, value in about.items()))
+        write_text(out / 'run.json', json.dumps(about, indent=1) + '\n')
+        write_text(out / 'table.md', '\n\n'.join([summary.as_markdown(rows), *remarks, '\n'.join(
+            f'- {name}: {value}' for name, value in facts)]) + '\n')
+        write_text(out / 'results.json', summary.as_json(shown))
+        write_text(out / 'table.tex', ''.join(
+            f'% {name}: {value}\n' for name, value in facts) + summary.as_latex(rows))
         write_text(out / 'summary.csv', summary.as_csv(summaries, summary.relative_errors(
-            own, {query.number: query.map_from_camera for query in queries})))
+            shown, {query.number: query.map_from_camera for query in queries})))
         pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
-                         summaries, methods, frames) if figures else []
-        write_report(out, summaries, rows, remarks, pictures)
+                         summaries, methods, frames) if sweep is not None else []
+        write_report(out, summaries, rows, remarks, pictures, facts)
         log.remove()
     print(f'results: {out.resolve() / PAGE}', flush=True)
     return summaries
+
+
+def _version() -> str:
+    try:
+        return version('cliploc_ros')
+    except PackageNotFoundError:  # it runs from its sources
+        return 'unknown'
 
 
 def read_results(log: Log, run: Mapping[str, Any]) -> list[Result]:

@@ -8,7 +8,8 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby, pairwise
+from itertools import groupby, pairwise, zip_longest
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -16,17 +17,24 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
-from cliploc_ros.offline.evaluation.trials import Result
+from cliploc_ros.offline.evaluation.trials import GIVEN, GIVEN_TOLERANCE_MS, Result
 
 #: Limits of success [m]. The paper does not state its own; 1 m reproduces its level.
 LIMITS_M = (0.25, 0.5, 1.0)
 _RESAMPLES = 10_000
-_HEADER = ('matching', 'algorithm', 'success at .25 / .5 / 1 m', 'error [m]: median, mean',
-           'search [ms]', 'accepted', 'precision (95 %)', 'false accepts')
+_HEADER = ('matching', 'algorithm', 'success within .25 / .5 / 1 m',
+           'median error [m], [deg]; mean [m]', 'search [ms]', 'accepted', 'precision (95 %)',
+           'false accepts')
+# In the terminal, headers are wrapped to this width.
+_HEADER_WIDTH = 12
 _WITHIN_NOISE = '~'
 # Columns of methods that use keyframes; the other methods leave them empty.
-_KEYFRAMES = ('pose by objects / keyframes / both', 'keyframe inliers', 'keyframes [ms]')
+_KEYFRAMES = ('from objects / keyframes / both', 'keyframe inliers', 'keyframes [ms]')
 _SOURCES = ('objects', 'keyframes', 'both')
+# Columns of the CSV that poses of another program leave empty.
+_OF_SEARCHES = ('mean_search_ms', 'search_ms_std', 'coverage', 'accepted', 'precision_1m',
+                'precision_1m_low', 'precision_1m_high', 'recall_1m', 'wrongly_accepted',
+                'crops_share')
 _OF_LATEX = {'\\': r'\textbackslash{}', '~': r'\textasciitilde{}', '^': r'\textasciicircum{}',
              '±': r'$\pm$', **{char: rf'\{char}' for char in '&%$#_{}'}}
 
@@ -37,8 +45,9 @@ class Summary:
 
     method: str
     queries: tuple[int, ...]  #: Their numbers
-    #: (t, q): position error of the best pose; infinite if none was found
+    #: (t, q): position and rotation error of the best pose; infinite if none was found
     errors_m: NDArray[np.float64]
+    errors_deg: NDArray[np.float64]
     accepted: NDArray[np.bool_]  #: (t, q)
     confidence: NDArray[np.float64]  #: (t, q)
     search_ms: NDArray[np.float64]  #: (t, q)
@@ -60,6 +69,8 @@ class Summary:
         default_factory=lambda: np.empty((0, 0), dtype=np.int64))
     #: (t, q): the three are empty if no query was compared with keyframes
     keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    #: Whether another program found the poses: there are errors only, no searches and verdicts
+    is_given: bool = False
 
     @property
     def has_keyframes(self) -> bool:
@@ -75,27 +86,37 @@ class Summary:
         return float((self.errors_m < limit_m).mean(axis=1).std())
 
     @property
+    def solved(self) -> float:
+        """Return the share of searches that found any pose."""
+        return float(np.isfinite(self.errors_m).mean())
+
+    @property
     def median_error_m(self) -> float:
-        """Return the median error [m]; a query without a pose counts as infinitely far."""
+        """Return the median position error [m]; the error without a pose is infinite."""
         return float(np.median(self.errors_m))
 
     @property
+    def median_error_deg(self) -> float:
+        """Return the median rotation error [deg]; the error without a pose is infinite."""
+        return float(np.median(self.errors_deg))
+
+    @property
     def mean_error_m(self) -> float:
-        """Return the mean error of the poses found [m]; NaN if there is none."""
+        """Return the mean position error of the poses found [m]; NaN without any."""
         found = self.errors_m[np.isfinite(self.errors_m)]
         return float(found.mean()) if len(found) else float('nan')
 
     @property
-    def error_deviations_m(self) -> tuple[float, float]:
-        """Return the standard deviations of median and mean error over trials [m].
+    def error_deviations(self) -> tuple[float, float, float]:
+        """Return the standard deviations over trials of median [m], median [deg] and mean [m].
 
-        NaN where a trial has no finite one.
+        NaN where a trial has no finite value.
         """
         with np.errstate(invalid='ignore'):
-            medians = np.median(self.errors_m, axis=1)
             means = [errors[np.isfinite(errors)].mean() if np.isfinite(errors).any() else np.nan
                      for errors in self.errors_m]
-            return float(np.std(medians)), float(np.std(means))
+            return (float(np.std(np.median(self.errors_m, axis=1))),
+                    float(np.std(np.median(self.errors_deg, axis=1))), float(np.std(means)))
 
     @property
     def mean_search_ms(self) -> float:
@@ -162,10 +183,11 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
         keyframes = {'sources': column('source'), 'keyframe_inliers': column('keyframe_inliers'),
                      'keyframes_ms': column('keyframes_ms')}
     return Summary(
-        method, queries, column('error_m'), column('accepted'), column('confidence'),
-        column('search_ms'), column('coverage'), column('best_iteration'), column('hypotheses'),
-        column('boxes')[0], column('nees'), float(column('crops_share').mean()),
-        dict(kinds.most_common()), **keyframes)
+        method, queries, column('error_m'), column('error_deg'), column('accepted'),
+        column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
+        column('hypotheses'), column('boxes')[0], column('nees'),
+        float(column('crops_share').mean()), dict(kinds.most_common()),
+        is_given=results[0].source == GIVEN, **keyframes)
 
 
 @dataclass(frozen=True)
@@ -214,12 +236,15 @@ def find_best(summaries: Sequence[Summary], limit_m: float = 1.0) -> Summary:
 def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
     """Return the cells of the table, its header first.
 
-    A '~' marks methods that the queries are too few to separate from the best one. Where a method
-    used keyframes, there are columns for the source of its poses. All summaries are of the same
-    queries.
+    A '~' marks methods that the queries are too few to separate from the best one. A column has
+    the share of solved queries where a method left some unsolved. Where a method used keyframes,
+    there are columns for the source of its poses. All summaries are of the same queries.
     """
     best = find_best(summaries)
     rows = [_HEADER, *(_row(summary, best) for summary in summaries)]
+    if any(summary.solved < 1.0 for summary in summaries):
+        solved = ['solved', *(_rate(summary.solved) for summary in summaries)]
+        rows = [(*row, cell) for row, cell in zip(rows, solved, strict=True)]
     if not any(summary.has_keyframes for summary in summaries):
         return rows
     cells = [(' / '.join(str(int((summary.sources == source).sum())) for source in _SOURCES),
@@ -237,10 +262,14 @@ def _row(one: Summary, best: Summary) -> tuple[str, ...]:
         for limit in LIMITS_M)
     if one is not best and compare(one, best).is_noise:
         rates += f' {_WITHIN_NOISE}'
-    errors = ', '.join(
+    median_m, median_deg, mean_m = (
         f'{value:.{digits}f}' + (f'±{off:.{digits}f}' if several and np.isfinite(off) else '')
-        for value, off, digits in zip((one.median_error_m, one.mean_error_m),
-                                      one.error_deviations_m, (3, 2), strict=True))
+        for value, off, digits in zip(
+            (one.median_error_m, one.median_error_deg, one.mean_error_m), one.error_deviations,
+            (3, 2, 2), strict=True))
+    errors = f'{median_m}, {median_deg}; {mean_m}'
+    if one.is_given:
+        return (matching, algorithm, rates, errors, '', '', '', '')
     cut = '' if one.coverage.min() == 1.0 else f' ({one.coverage.mean():.0%} tried)'
     return (matching, algorithm, rates, errors,
             f'{one.mean_search_ms:.1f}±{one.search_deviation_ms:.1f}{cut}',
@@ -256,12 +285,15 @@ def _rate(value: float) -> str:
 def notes(summaries: Sequence[Summary]) -> list[str]:
     """Return sentences that explain the table."""
     best = find_best(summaries)
-    counts = [len(summary.errors_m) for summary in summaries]
+    counts = [len(summary.errors_m) for summary in summaries if not summary.is_given]
     alone = ' (one of bf and auto, which draw no samples)' if min(counts) < max(counts) else ''
     over = 'trials, of the time over searches' if max(counts) > 1 else 'searches'
     lines = [f'{len(best.queries)} queries, trials: {max(counts)}{alone}; ± is the standard '
              f'deviation over {over}.',
              'Confidences are fitted on simulated worlds.']
+    lines += [f'{one.method}: poses of another program; {np.isinf(one.errors_m).sum()} of '
+              f'{len(one.queries)} queries have none within {GIVEN_TOLERANCE_MS} ms.'
+              for one in summaries if one.is_given]
     lines += [f'{one.method} refused: {_kinds(one)}.' for one in summaries if one.refusals]
     lines += [f'{one.method} compared {one.crops_share:.0%} of the crops of a query with labels, '
               'on average: --crops all compares all.'
@@ -281,10 +313,13 @@ def _kinds(one: Summary) -> str:
 
 def as_text(rows: Sequence[Sequence[str]]) -> str:
     """Return a table for the terminal."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ['  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-             for row in rows]
-    return '\n'.join([lines[0], '-' * len(lines[0]), *lines[1:]])
+    header, *body = rows
+    titles = list(zip_longest(*(wrap(title, _HEADER_WIDTH) for title in header), fillvalue=''))
+    widths = [max(map(len, column)) for column in zip(*titles, *body, strict=True)]
+    rule = ['-' * width for width in widths]
+    return '\n'.join(
+        '  '.join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in [*titles, rule, *body])
 
 
 def as_markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -335,9 +370,10 @@ def as_csv(summaries: Sequence[Summary],
             'method': one.method, 'queries': len(one.queries), 'trials': len(one.errors_m),
             **{f'success_{limit:g}m': one.success(limit) for limit in LIMITS_M},
             **{f'success_{limit:g}m_std': one.success_deviation(limit) for limit in LIMITS_M},
-            'median_error_m': one.median_error_m, 'mean_error_m': one.mean_error_m,
-            **dict(zip(('median_error_m_std', 'mean_error_m_std'), one.error_deviations_m,
-                       strict=True)),
+            'solved': one.solved, 'median_error_m': one.median_error_m,
+            'median_error_deg': one.median_error_deg, 'mean_error_m': one.mean_error_m,
+            **dict(zip(('median_error_m_std', 'median_error_deg_std', 'mean_error_m_std'),
+                       one.error_deviations, strict=True)),
             **dict(zip(('relative_error_m', 'relative_error_deg'),
                        (relative or {}).get(one.method, ('', '')), strict=True)),
             'mean_search_ms': one.mean_search_ms, 'search_ms_std': one.search_deviation_ms,
@@ -354,6 +390,8 @@ def as_csv(summaries: Sequence[Summary],
                          for source in _SOURCES}
             rows[-1] |= {'keyframe_inliers': float(np.median(one.keyframe_inliers)),
                          'keyframes_ms': float(one.keyframes_ms.mean())}
+        if one.is_given:
+            rows[-1] |= dict.fromkeys(_OF_SEARCHES, '')
     return csv_text(rows)
 
 

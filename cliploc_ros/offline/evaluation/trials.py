@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Methods run on queries: the pose that each search found, and its error; simulated sensors."""
+"""Run methods on queries: the pose of each search and its error; simulated sensors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -22,7 +22,12 @@ from cliploc_ros.core.geometry.depth import (
     depth_of,
     half_chord,
 )
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    pose_error,
+    transform_from_pose,
+)
 from cliploc_ros.core.keyframes.localization import (
     ImageFeatures,
     ImageRecognizer,
@@ -35,8 +40,15 @@ from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.offline.datasets.observations import Queries
-from cliploc_ros.offline.evaluation.methods import Method
+from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
+from cliploc_ros.offline.datasets.tum import read_tum_trajectory
+from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS, Method
 from cliploc_ros.units import NS_PER_S
+
+#: Result.source of a pose that another program found.
+GIVEN = 'given'
+#: A query has the given pose nearest in time, at most this far away: the default of evo [ms].
+GIVEN_TOLERANCE_MS = 10
 
 
 @dataclass(frozen=True)
@@ -67,26 +79,27 @@ class Result:
     #: Error of the best pose; None if none was found
     error_m: float | None
     error_deg: float | None
-    score: float  #: Sum of the IoUs of its inliers
-    confidence: float  #: Probability that it is within 1 m, according to the relocalizer
-    nees: float | None  #: Squared error in its own covariance, see normalized_square
-    inliers: int
-    hypotheses: int  #: Number of hypotheses tried
-    best_iteration: int  #: Iteration that found the best pose, from 1
-    coverage: float  #: Share of its samples that the search tried
-    reason: str  #: Reason of the refusal; empty when accepted
-    search_ms: float  #: Search of objects. Only times differ from run to run.
+    score: float = 0.0  #: Sum of the IoUs of its inliers
+    confidence: float = 0.0  #: Probability that it is within 1 m, according to the relocalizer
+    nees: float | None = None  #: Squared error in its own covariance, see normalized_square
+    inliers: int = 0
+    hypotheses: int = 0  #: Number of hypotheses tried
+    best_iteration: int = 0  #: Iteration that found the best pose, from 1
+    coverage: float = 1.0  #: Share of its samples that the search tried
+    reason: str = ''  #: Reason of the refusal; empty when accepted
+    search_ms: float = 0.0  #: Time of the search of objects. Only times differ from run to run.
     crops_share: float = 1.0  #: Share of the crops of its frames that were compared with labels
-    #: With several maps, the map of the pose, which is in the coordinates of the first map: on
-    #: another map, it is far away. Empty for a single map.
+    #: Name of the map that the pose belongs to, where there are several. The pose is in the
+    #: coordinates of the first map, far away if it belongs to another map. Empty for a single map.
     map: str = ''
     refusal_kind: str = ''  #: See cliploc_ros.core.acceptance.verdict; empty when accepted
-    #: What the pose comes from: 'objects', 'keyframes' or 'both'; empty if none was found
+    #: Source of the pose: 'objects', 'keyframes' or 'both'; empty if none was found. GIVEN for all
+    #: results of another program
     source: str = ''
-    #: Points of keyframes that agree on their pose, whatever the pose comes from
+    #: Points of keyframes that agree on the pose of the keyframes, whatever the source
     keyframe_inliers: int = 0
     keyframes_ms: float = 0.0  #: Time of features, matching and the pose from them [ms]
-    keyframe_search: str = 'none'  #: How far it went: 'none', 'fast' or 'thorough'
+    keyframe_search: str = 'none'  #: The last pass over keyframes: 'none', 'fast' or 'thorough'
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, for JSON."""
@@ -170,6 +183,54 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     return results
 
 
+def read_given_poses(words: Iterable[str], methods: Iterable[Method]) -> dict[str, TimedPoses]:
+    """Read the poses of other programs, given as NAME=FILE, by name.
+
+    OptionsError: a word has another form, or its name is that of a method. DatasetError: a file is
+    not a trajectory in TUM format.
+    """
+    taken = {*PAPER_METHODS, AUTO, ALL, *(method.name for method in methods)}
+    found: dict[str, TimedPoses] = {}
+    for word in words:
+        name, _, file = word.partition('=')
+        if not name or not file or '@' in name or '/' in name:
+            raise OptionsError(f"`poses` {word}: expected NAME=FILE, and no '@' or '/' in NAME")
+        if name in taken or name in found:
+            raise OptionsError(f"`poses` {word}: another method is called '{name}'")
+        found[name] = read_tum_trajectory(file)
+    return found
+
+
+def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -> list[Result]:
+    """Return the results of another program, whose poses are of the camera in the map.
+
+    DatasetError: the time span of the poses does not overlap that of the queries.
+    """
+    stamps_ns = [query.observation.stamp_ns for query in queries]
+    tolerance_ns = GIVEN_TOLERANCE_MS * 1_000_000
+    check_clock(poses, min(stamps_ns) - tolerance_ns, max(stamps_ns) + tolerance_ns,
+                f'poses of {name}')
+    results = []
+    for query, stamp_ns in zip(queries, stamps_ns, strict=True):
+        gaps_ns = np.abs(poses.stamps_ns - stamp_ns)
+        row = int(gaps_ns.argmin())
+        pose = (transform_from_pose(poses.positions_xyz[row], poses.quats_xyzw[row])
+                if gaps_ns[row] <= tolerance_ns else None)
+        results.append(Result(
+            name, 0, query.number, stamp_ns / NS_PER_S, len(query.observation.detections),
+            solved=pose is not None, accepted=False, source=GIVEN, **_error(pose, query)))
+    return results
+
+
+def _error(pose: NDArray[np.float64] | None, query: PosedQuery) -> dict[str, Any]:
+    """Return the fields of a result that hold its pose, or None, and the errors of the pose."""
+    if pose is None:
+        return dict.fromkeys(('map_from_camera', 'error_m', 'error_deg'))
+    error_m, error_deg = pose_error(pose, query.map_from_camera)
+    return {'map_from_camera': pose.tolist(), 'error_m': float(error_m),
+            'error_deg': float(error_deg)}
+
+
 def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observation],
                         recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
     """Localize as the node does: with each frame after those before it, crops on demand.
@@ -196,16 +257,12 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery
            found: Relocalization, crops_share: float, recognizer: ImageRecognizer | None
            ) -> Result:
     pose = found.map_from_camera
-    error_m, error_deg = (None, None) if pose is None else pose_error(pose, query.map_from_camera)
     return Result(
         method=method, trial=trial, query=query.number,
         timestamp=float(query.observation.stamp_ns) / NS_PER_S,
         boxes=len(query.observation.detections),
-        solved=found.solved, accepted=found.accepted,
-        map_from_camera=None if pose is None else pose.tolist(),
-        error_m=None if error_m is None else float(error_m),
-        error_deg=None if error_deg is None else float(error_deg), score=float(found.score),
-        confidence=float(found.confidence),
+        solved=found.solved, accepted=found.accepted, **_error(pose, query),
+        score=float(found.score), confidence=float(found.confidence),
         nees=None if pose is None or found.covariance is None
         else normalized_square(pose, found.covariance, query.map_from_camera),
         inliers=len(found.matches), hypotheses=int(found.tried),
