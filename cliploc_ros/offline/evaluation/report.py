@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of compared methods: the best method, the table and all figures."""
+"""Write the page that compares methods: the best method, the table and all figures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,20 +17,20 @@ CAPTIONS = {
     _TOP_VIEW: 'The map from above. A line joins each estimate of this method to its truth.',
     'success_over_threshold': 'Share of poses within a distance of the truth, accepted or not.',
     'success_by_boxes': 'Success by the number of detections in the image.',
-    'precision_over_recall': 'What another least confidence would accept.',
-    'reliability': 'Whether the confidence is true, with 95 % intervals.',
-    'consistency': 'Whether the covariance is true.',
+    'precision_over_recall': 'Precision and recall at other thresholds of the confidence.',
+    'reliability': 'Calibration of the confidence, with 95 % intervals.',
+    'consistency': 'Calibration of the covariance.',
     'time_by_stage': 'Mean time of an answer, by stage.',
-    'best_iteration': 'When the best pose was found.',
-    'success_over_iterations': 'Success over the length of the search.'}
+    'best_iteration': 'Iteration that found the best pose.',
+    'success_over_iterations': 'Success over the number of iterations.'}
 
 
 def write_report(folder: Path, summaries: Sequence[Summary], rows: Sequence[Sequence[str]],
                  remarks: Sequence[str], pictures: Sequence[Path],
                  about: Sequence[tuple[str, str]]) -> None:
-    """Write the page, with the table's rows, its header first, and embedded PNG files.
+    """Write the page. It embeds the pictures, which are PNG files.
 
-    `about` has names and values of the input and the options.
+    `rows` are those of the table, its header first; `about` names and values of input and options.
     """
     best = find_best(summaries)
     wrong, count = best.false_accepts(), best.errors_m.size
