@@ -69,8 +69,8 @@ def make_parser() -> argparse.ArgumentParser:
     group = parser.add_mutually_exclusive_group(required=True)
     option(group, '--queries NPZ', 'recorded boxes and similarities; options of networks and '
            'recordings have no effect on it and are refused')
-    option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that ~/record '
-           'stored (npz), which is answered again', Path)
+    option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that was '
+           'stored by ~/record (npz), to answer it again', Path)
     add_folders(group)
     option(parser, '--map YAML', 'several maps are searched as one; the true poses are in the '
            'first', nargs='+', required=True)
@@ -276,10 +276,13 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
 
 
 def _hash(path: str | Path) -> str:
-    """Return 12 digits of the SHA-256 of a file, or of all files in a folder, sorted by path."""
+    """Return 12 digits of the SHA-256 of a file, or of the files in a folder.
+
+    For a folder, `find -L FOLDER -type f | LC_ALL=C sort | xargs cat | sha256sum` prints the same.
+    """
     digest = hashlib.sha256()
-    files = sorted(folder / name for folder, _, names in Path(path).walk(follow_symlinks=True)
-                   for name in names)
+    files = sorted((folder / name for folder, _, names in Path(path).walk(follow_symlinks=True)
+                    for name in names), key=str)
     for file in files or [Path(path)]:
         if file.is_file():
             with file.open('rb') as content:
@@ -313,7 +316,7 @@ def _notes_on_maps(options: argparse.Namespace) -> list[str]:
 
 
 def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> bool:
-    """Return whether crops are compared with labels. OptionsError: they are, but --no-clip."""
+    """Return whether crops are compared with labels. OptionsError: they are, despite --no-clip."""
     comparing = [method.name for method in methods if method.options.needs_similarities]
     if options.clip:
         return bool(comparing or options.save_queries)

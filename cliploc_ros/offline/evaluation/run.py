@@ -282,7 +282,7 @@ def describe(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], methods: 
 
 
 def _digest(parts: Iterable[object]) -> str:
-    """Return a hash of arrays and of other objects, by their representation."""
+    """Return a hash of arrays and other objects, whose repr is hashed."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray)

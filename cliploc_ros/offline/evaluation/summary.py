@@ -299,7 +299,7 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     lines += [f'{summary.method} refused: {_kinds(summary)}.'
               for summary in summaries if summary.refusals]
     lines += [f'{summary.method} compared {summary.crops_share:.0%} of the crops of a query with '
-              'labels, on average: --crops all compares all.'
+              'labels on average; --crops all compares all crops.'
               for summary in summaries if 0.0 < summary.crops_share < 1.0]
     if any(summary.has_keyframes for summary in summaries):
         lines.append('Keyframes: number of poses from each source, median number of inlier '
@@ -333,14 +333,11 @@ def as_markdown(rows: Sequence[Sequence[str]]) -> str:
 
 def as_latex(rows: Sequence[Sequence[str]]) -> str:
     """Return a table in LaTeX, for the package booktabs."""
-    head, *body = [' & '.join(map(_latex, row)) + r' \\' for row in rows]
+    head, *body = [' & '.join(''.join(_OF_LATEX.get(char, char) for char in cell) for cell in row)
+                   + r' \\' for row in rows]
     columns = 'l' * len(rows[0])
     return '\n'.join([rf'\begin{{tabular}}{{{columns}}}', r'\toprule', head, r'\midrule', *body,
                       r'\bottomrule', r'\end{tabular}', ''])
-
-
-def _latex(text: str) -> str:
-    return ''.join(_OF_LATEX.get(char, char) for char in text)
 
 
 def relative_errors(results: Iterable[Result], truth: Mapping[int, NDArray[np.float64]]

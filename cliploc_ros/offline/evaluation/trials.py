@@ -47,7 +47,7 @@ from cliploc_ros.units import NS_PER_S
 
 #: Result.source of a pose that another program found.
 GIVEN = 'given'
-#: Greatest distance in time of a query and its given pose [ms]: evo's default.
+#: Greatest difference in time between a query and its given pose [ms]: evo's default.
 GIVEN_TOLERANCE_MS = 10
 
 
@@ -204,9 +204,10 @@ def read_given_poses(words: Iterable[str], methods: Iterable[Method]) -> dict[st
 
 
 def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -> list[Result]:
-    """Return results for the poses of the camera in the map that another program found.
+    """Return a result for each query from the poses of another program.
 
-    Each query gets the pose that is nearest in time, within GIVEN_TOLERANCE_MS.
+    The poses are those of the camera in the map. Each query gets the pose that is nearest in time,
+    within GIVEN_TOLERANCE_MS.
     DatasetError: the time span of the poses does not overlap that of the queries.
     """
     stamps_ns = [query.observation.stamp_ns for query in queries]
