@@ -219,8 +219,8 @@ def _refuse_image_options(options: argparse.Namespace) -> None:
     defaults = vars(of_images.parse_args([]))
     del defaults['scheduler']  # searches use it, too
     if given := given_options(options, defaults):
-        raise OptionsError(f'{", ".join(given)}: no effect on --queries, which has recorded boxes '
-                           'and similarities; leave it out, or give --bag or a folder')
+        raise OptionsError(f'{", ".join(given)}: no effect on --queries, whose boxes and '
+                           'similarities are recorded; remove, or give --bag or a folder')
 
 
 def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
@@ -316,7 +316,7 @@ def _notes_on_maps(options: argparse.Namespace) -> list[str]:
 
 
 def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> bool:
-    """Return whether crops are compared with labels. OptionsError: they are, despite --no-clip."""
+    """Return whether CLIP is needed; OptionsError: it is, but --no-clip excludes it."""
     comparing = [method.name for method in methods if method.options.needs_similarities]
     if options.clip:
         return bool(comparing or options.save_queries)
