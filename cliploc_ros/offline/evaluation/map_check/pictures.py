@@ -39,7 +39,7 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
     """Yield the name, the caption and the PNG of each picture."""
     canvas = _Canvas(landmark_map, report)
     yield ('grid', 'Expected relocalization from above. A cell is a camera position. Its shade '
-           'shows the share of headings with a correct, accepted pose, of those with three or more '
+           'is the share of headings with a correct, accepted pose, of those with three or more '
            'detectable landmarks. Ticks show the headings at which a wrong pose was accepted. '
            'Positions inside landmarks and beyond all objects are left out. Numbers refer to the '
            'advice.', png_of(_grid_figure(canvas), _DPI))
