@@ -220,7 +220,7 @@ def _refuse_image_options(options: argparse.Namespace) -> None:
     del defaults['scheduler']  # searches use it, too
     if given := given_options(options, defaults):
         raise OptionsError(f'{", ".join(given)}: no effect on --queries, whose boxes and '
-                           'similarities are recorded; remove, or give --bag or a folder')
+                           'similarities are recorded; remove them, or give --bag or a folder')
 
 
 def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
