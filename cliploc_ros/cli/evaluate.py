@@ -1,15 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``evaluate``: the paper's table and figures on your own data."""
+"""The executable ``evaluate``: the paper's table and figures for your own data."""
 
 import argparse
+import hashlib
 import logging
 import math
 import os
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.options import (
@@ -18,6 +20,7 @@ from cliploc_ros.cli.options import (
     add_reading_options,
     check_folder_options,
     folder_of,
+    given_options,
 )
 from cliploc_ros.command import SEEDS, limit, not_negative, option, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
@@ -25,7 +28,6 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS
 
 if TYPE_CHECKING:
-
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import Frames
@@ -46,13 +48,14 @@ examples:
   evaluate --bag office --map office.yaml --methods class_bf auto --no-clip
   evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
+  evaluate --queries office.npz --map office.yaml --methods auto --poses hloc=hloc.txt
   evaluate --bag case_20260101T120000.000_refused.npz --map office.yaml
       answers a request again that ~/record stored; exit code 1: another verdict
 """
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Evaluate; return the exit code."""
+    """Run ``evaluate``; return the exit code."""
     return run_main(make_parser(), evaluate, args)
 
 
@@ -61,28 +64,34 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='evaluate', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Compare methods on the same input. Writes the paper's table as a page, text, "
-        'LaTeX and CSV, results.json, figures and trajectories. Needs no sourced ROS.')
+        'LaTeX and CSV, results.json, run.json with input and options, figures and trajectories. '
+        'Runs without ROS.')
     group = parser.add_mutually_exclusive_group(required=True)
-    option(group, '--queries NPZ', 'recorded boxes and similarities')
-    option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that ~/record '
-           'stored (npz), which is answered again', Path)
+    option(group, '--queries NPZ', 'recorded boxes and similarities; options of networks and '
+           'recordings have no effect on it and are refused')
+    option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that was '
+           'stored by ~/record (npz), to answer it again', Path)
     add_folders(group)
-    option(parser, '--map YAML', 'several maps are searched as one; true poses are in the first',
-           nargs='+', required=True)
-    option(parser, '--methods M', f'default: {ALL}; see below', default=[ALL], nargs='+')
-    option(parser, '--trials', "the paper's %(default)s by default", positive_int, 5)
-    option(parser, '--seed', 'of the first trial (%(default)s)', within(*SEEDS), 0)
-    option(parser, '--frames', "of a query file; 'all' includes the neighbours of the queries",
+    option(parser, '--map YAML', 'several maps are searched as one; the true poses are in the '
+           'first', nargs='+', required=True)
+    option(parser, '--methods M', f'methods to compare ({ALL}); see below', default=[ALL],
+           nargs='+')
+    option(parser, '--poses NAME=FILE', 'a further row of the table: poses of another program, of '
+           'the camera (z forward) in the map, in TUM format; each query gets the pose that is '
+           'nearest in time, within 10 ms', default=[], nargs='+', action='extend')
+    option(parser, '--trials', "number of trials (%(default)s, the paper's)", positive_int, 5)
+    option(parser, '--seed', 'seed of the first trial (%(default)s)', within(*SEEDS), 0)
+    option(parser, '--frames', "frames of a query file; 'all': neighbours of queries, too",
            default='main', choices=('main', 'all'))
     option(parser, '--crops', f"crops that '{AUTO}' compares with labels (%(default)s)",
            lambda text: text.replace('-', '_'), RelocalizerOptions.crops, choices=CROPS)
     option(parser, '--out DIR', default=Path('evaluation'))
     option(parser, '--workers N',
-           f'local processes ({_cores()} for searches, 1 for detector and CLIP)', positive_int)
+           f'number of local processes ({_cores()} for searches, 1 for networks)', positive_int)
     option(parser, '--resume', 'continue an unfinished run')
     option(parser, '--no-figures', dest='figures', action='store_false')
-    add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does; "
-                   'needs the images of --bag or a folder')
+    add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does, on "
+                   'the images of --bag or a folder')
     _add_paper_options(parser)
     _add_sensor_options(parser)
     _add_recording_options(parser)
@@ -95,44 +104,45 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--iterations', '(%(default)s)', positive_int, 500)
     option(group, '--k', '(%(default)s)', positive_int, 3)
     option(group, '--iou-threshold', '(%(default)s)', within(0.0, 1.0), 0.2)
-    option(group, '--time-budget-ms MS', 'limit of each search (none); with one, results vary',
-           limit, float('inf'))
-    option(group, '--sweep N', 'numbers of iterations to compare (50 100 200 1000)', positive_int,
-           [50, 100, 200, 1000], nargs='*')
+    option(group, '--time-budget-ms MS', 'time limit of each search (none); with a limit, results '
+           'vary', limit, float('inf'))
+    option(group, '--sweep N', 'numbers of iterations to compare in a figure (50 100 200 1000)',
+           positive_int, [50, 100, 200, 1000], nargs='*')
 
 
 def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('simulated sensors beside the camera')
-    option(group, '--gravity', f"'{AUTO}' knows the vertical, from the true poses; the paper's "
-           'methods do not use it')
-    option(group, '--gravity-noise-deg DEG', 'standard deviation of the vertical (0)',
+    group = parser.add_argument_group('simulated sensors in addition to the camera')
+    option(group, '--gravity', f"'{AUTO}' knows the vertical, which is simulated from the true "
+           "poses; the paper's methods do not use it")
+    option(group, '--gravity-noise-deg DEG', 'standard deviation of the error of the vertical (0)',
            within(0.0, 45.0), 0.0)
-    option(group, '--height-range LOW HIGH', 'heights that the camera may have in the map [m]',
+    option(group, '--height-range LOW HIGH', 'range of the height of the camera in the map [m]',
            limit, (-math.inf, math.inf))
     option(group, '--tilt-deviation DEG',
-           f"of the camera off upright, for '{AUTO}' without vertical; 0 where "
-           "the map's z axis is not up (%(default)s)", not_negative, 40.0)
+           f"standard deviation of the camera's tilt, for '{AUTO}' without a "
+           "vertical; 0 if the map's z axis is not up (%(default)s)", not_negative, 40.0)
     option(group, '--fuse', 'localize each query with the other frames of its group, linked by '
            'odometry from the true poses')
-    option(group, '--odometry-noise METRES DEGREES', 'standard deviations of each step of '
-           'odometry, on each axis (0 0)', not_negative, (0.0, 0.0))
+    option(group, '--odometry-noise METRES DEGREES', 'standard deviations of the error of '
+           'odometry from frame to frame, on each axis (0 0)', not_negative, (0.0, 0.0))
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('options of --bag and folders')
-    option(group, '--save-queries NPZ', 'write the recorded boxes and similarities, for --queries')
+    option(group, '--save-queries NPZ', 'write boxes and similarities to a file for --queries')
     add_network_options(group)
     option(group, '--landmark-embeddings', "compare crops with the map's labels (text), with the "
-           'images next to it, or with both (%(default)s)', default='image', choices=COMPARED)
+           'images of its landmarks, or with both (%(default)s)', default='image',
+           choices=COMPARED)
     option(group, '--every N', 'use every N-th image of a folder', positive_int, 1)
-    option(group, '--sync-tolerance SECONDS', 'images of several --cameras within this time are '
-           'of one instant, and localized together, from the first camera (%(default)s)',
+    option(group, '--sync-tolerance SECONDS', 'greatest distance in time of images of several '
+           '--cameras that are localized together, from the first camera (%(default)s)',
            not_negative, 0.05)
 
 
 def evaluate(options: argparse.Namespace) -> int:
     """Evaluate with the options of the command line; return the exit code."""
-    # imported late, so that --help is fast
+    # late imports keep --help fast
     from cliploc_ros.core.map.joined_map import join_maps
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
@@ -142,6 +152,11 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.offline.evaluation.run import compare_methods
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
+    parser = make_parser()
+    given = given_options(options, {name: parser.get_default(name) for name in vars(options)
+                                    if name != 'ros_args'})
+    if options.queries is not None:
+        _refuse_image_options(options)
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
         raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
     check_folder_options(options)
@@ -164,10 +179,11 @@ def evaluate(options: argparse.Namespace) -> int:
         tilt_deviation_deg=options.tilt_deviation,
         vertical_deviation_deg=max(1.0, options.gravity_noise_deg), crops=options.crops)
     methods = parse_methods(options.methods, paper, len(landmark_map))
+    others = trials.read_given_poses(options.poses, methods)
     options.clip = len(landmark_map) > 0 and _needs_clip(options, methods)
     layer = _read_layer(options, landmark_map, methods)
     if not len(landmark_map) and layer is None:
-        raise OptionsError(f'{options.map[0]}: has no landmarks, and no keyframes are used')
+        raise OptionsError(f'{options.map[0]} has no landmarks, and no keyframes are used')
     make_folder(options.out)
     images = {} if options.queries is not None else _read_images(options)
     of_cameras = {camera: _read_queries(options, landmark_map, camera, images.get(camera))
@@ -180,33 +196,103 @@ def evaluate(options: argparse.Namespace) -> int:
         queries = trials.join_cameras(asked, options.sync_tolerance)
     if layer is not None:
         queries = with_features(queries, next(iter(images.values())), layer.kind)
-        notes = {layer.camera_note(one.image.camera) for one in queries if one.image is not None}
+        notes = {layer.camera_note(query.image.camera)
+                 for query in queries if query.image is not None}
         print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
 
-    noise_m, noise_deg = options.odometry_noise
+    draws = _with_sensors(options, queries, recorded)
+    compare_methods(landmark_map, draws[0], methods, options.out, trials=options.trials,
+                    workers=options.workers or _cores(), scheduler=options.scheduler,
+                    layer=layer, noisy=draws if len(draws) > 1 else (),
+                    sweep=options.sweep if options.figures else None,
+                    resume=options.resume, frames=recorded.frames,
+                    given=others, about=_describe(options, given, layer is not None),
+                    remarks=[*_notes_on_maps(options), *_notes_on_detector(queries, landmark_map)])
+    return 0
 
-    def sensed(seed: int) -> 'tuple[PosedQuery, ...]':
-        found = queries
+
+def _refuse_image_options(options: argparse.Namespace) -> None:
+    """Refuse options of images and networks beside a query file; OptionsError names them."""
+    of_images = argparse.ArgumentParser()
+    _add_recording_options(of_images)
+    add_reading_options(of_images)
+    defaults = vars(of_images.parse_args([]))
+    del defaults['scheduler']  # searches use it, too
+    if given := given_options(options, defaults):
+        raise OptionsError(f'{", ".join(given)}: no effect on --queries, whose boxes and '
+                           'similarities are recorded; remove them, or give --bag or a folder')
+
+
+def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
+                  recorded: 'Queries') -> 'list[tuple[PosedQuery, ...]]':
+    """Return the queries with simulated sensors: for each trial if they have noise, else once."""
+    from cliploc_ros.offline.evaluation import trials
+
+    noise_m, noise_deg = options.odometry_noise
+    is_noisy = (options.gravity and options.gravity_noise_deg) or (
+        options.fuse and (noise_m or noise_deg))
+    draws = []
+    for seed in range(options.seed, options.seed + (options.trials if is_noisy else 1)):
+        found = tuple(queries)
         if options.gravity:
             found = trials.with_vertical(found, options.gravity_noise_deg, seed)
         if options.fuse:
             found = trials.with_neighbours(found, [frame.group for frame in recorded], noise_m,
                                            noise_deg, seed)
-        return tuple(one for one in found
-                     if options.frames == 'all' or recorded[one.number].is_main)
-    is_noisy = (options.gravity and options.gravity_noise_deg) or (
-        options.fuse and (noise_m or noise_deg))
-    draws = [sensed(options.seed + trial) for trial in range(options.trials if is_noisy else 1)]
-    compare_methods(landmark_map, draws[0], methods, options.out, trials=options.trials,
-                    workers=options.workers or _cores(), scheduler=options.scheduler,
-                    layer=layer, noisy=draws if is_noisy else (), sweep=options.sweep,
-                    resume=options.resume, figures=options.figures, frames=recorded.frames,
-                    remarks=[*_notes_on_maps(options), *_notes_on_detector(queries, landmark_map)])
-    return 0
+        draws.append(tuple(query for query in found
+                           if options.frames == 'all' or recorded[query.number].is_main))
+    return draws
+
+
+def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: bool
+              ) -> dict[str, Any]:
+    """Return files, networks and options of a run; options with their default are left out."""
+    from cliploc_ros.cli.sources import clip_options, detector_options, source_of
+    from cliploc_ros.core.keyframes.layer import layer_path
+    from cliploc_ros.core.map.landmark_embeddings import embeddings_path
+    from cliploc_ros.models.clip_weights import names_onnx
+
+    files = [options.queries or source_of(options), *options.map,
+             *(word for word in options.methods if word.endswith(('.yaml', '.yml'))),
+             *(word.partition('=')[2] for word in options.poses)]
+    if has_layer:
+        files.append(layer_path(options.map[0]))
+    if options.queries is not None:
+        detector = 'unknown: query files do not name it'
+        similarities = 'unknown: query files do not say whether CLIP or a simulation made them'
+    else:
+        detector, clip = detector_options(options).model, clip_options(options)
+        architecture = '' if names_onnx(clip) else f'{clip.model} '
+        similarities = f'CLIP {architecture}{clip.pretrained}' if options.clip else 'none'
+        files += [options.trajectory, options.model, options.clip_pretrained]
+        if options.clip and options.landmark_embeddings != 'text':
+            files += map(embeddings_path, options.map)
+    words = []
+    for name, value in given.items():
+        values = value if isinstance(value, list) else [value]
+        words += [name, *(str(each) for each in values if not isinstance(each, bool))]
+    return {'sha256': {str(file): _hash(file) for file in files if file and Path(file).exists()},
+            'detector': detector, 'similarities': similarities, 'options': shlex.join(words)}
+
+
+def _hash(path: str | Path) -> str:
+    """Return 12 digits of the SHA-256 of a file, or of the files in a folder.
+
+    For a folder, `find -L FOLDER -type f | LC_ALL=C sort | xargs cat | sha256sum` prints the same.
+    """
+    digest = hashlib.sha256()
+    files = sorted((folder / name for folder, _, names in Path(path).walk(follow_symlinks=True)
+                    for name in names), key=str)
+    for file in files or [Path(path)]:
+        if file.is_file():
+            with file.open('rb') as content:
+                while block := content.read(2**20):
+                    digest.update(block)
+    return digest.hexdigest()[:12]
 
 
 def _notes_on_detector(queries: 'Sequence[PosedQuery]', landmark_map: 'LandmarkMap') -> list[str]:
-    """Return a note where no query can be answered by its objects."""
+    """Return a note if the detections cannot match the map in any query."""
     from cliploc_ros.core.detector_check import DetectorCheck
 
     check = DetectorCheck(landmark_map, True, frames=None)
@@ -216,26 +302,23 @@ def _notes_on_detector(queries: 'Sequence[PosedQuery]', landmark_map: 'LandmarkM
 
 
 def _notes_on_maps(options: argparse.Namespace) -> list[str]:
-    """Return a note on each map that was built from the images it is evaluated on."""
+    """Return a note on each map that was built from the images of this evaluation."""
     from cliploc_ros.cli.sources import source_of
     from cliploc_ros.offline.datasets.map_recording import load_recording
 
     if options.queries is not None:
         return []
     images = source_of(options).resolve()
-    return [f'note: {file} was built from these images ({images}): expect less on others'
+    return [f'note: {file} was built from these images ({images}): results are optimistic'
             for file in options.map
             if (recording := load_recording(file)) is not None
             and recording.source is not None and recording.source.resolve() == images]
 
 
 def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> bool:
-    """Return whether crops are compared with labels; OptionsError: they are, and CLIP may not run.
-
-    A file of queries is for other methods, too.
-    """
+    """Return whether CLIP is needed; OptionsError: it is, but --no-clip excludes it."""
     comparing = [method.name for method in methods if method.options.needs_similarities]
-    if options.clip or options.queries is not None:
+    if options.clip:
         return bool(comparing or options.save_queries)
     if comparing or options.save_queries:
         what = f"method '{comparing[0]}'" if comparing else '--save-queries'
@@ -246,15 +329,15 @@ def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> boo
 
 def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
                 methods: 'Sequence[Method]') -> 'KeyframeLayer | None':
-    """Return the layer of the map where a method, the map and the queries can use it.
+    """Return the keyframes of the map; None: methods, map or queries cannot use them.
 
-    CliplocError: keyframes are asked for, and cannot be used.
+    CliplocError: keyframes are requested, but cannot be used.
     """
     from cliploc_ros.core.keyframes.layer import layer_path
 
     wanted, problem = options.keyframes, ''
     if not any(method.keyframes for method in methods):
-        problem = f"none of the methods uses them: add '{AUTO}'"
+        problem = f"no method uses them: add '{AUTO}'"
     elif len(options.map) > 1:
         problem = 'several maps are searched by objects only'
     elif options.queries is not None:
@@ -269,7 +352,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
 
 
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
-    """Answer a recorded request again; return 0 if the verdict is the same, else 1."""
+    """Answer a recorded request again; return 0 if the verdict is the same, 1 otherwise."""
     from cliploc_ros.cli.sources import clip_options
     from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
     from cliploc_ros.core.localizer import Localizer, repeat
@@ -299,14 +382,12 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
 
 def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', camera: str,
                   frames: 'Frames | None') -> 'Queries':
-    """Return the queries of a file, or those of the images of a camera, recorded once."""
+    """Return the queries of a file, or of the images of a camera. Networks run once."""
     from cliploc_ros.offline.datasets.observations import load_queries, save_queries
     from cliploc_ros.offline.evaluation.recording import recorded_queries
     from cliploc_ros.offline.recording.recorder import EVERY_FRAME
 
     if frames is None:
-        if options.save_queries is not None:
-            raise OptionsError('--save-queries needs --bag or a folder')
         return load_queries(options.queries, landmark_map.landmark_ids)
     from cliploc_ros.cli.sources import recording_options
 
@@ -324,7 +405,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', came
 
 
 def _read_images(options: argparse.Namespace) -> 'dict[str, Frames]':
-    """Return the images of each camera with the true poses; of a folder, every n-th."""
+    """Return the images of each camera with their true poses, every N-th image of a folder."""
     from cliploc_ros.cli.sources import read_cameras_of_map
 
     images = read_cameras_of_map(options, Path(options.map[0]))

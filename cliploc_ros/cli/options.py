@@ -3,6 +3,7 @@
 """Options that name a recording and say how to read it: one table for all programs."""
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -136,9 +137,15 @@ def folder_of(options: argparse.Namespace) -> tuple[Path, str] | None:
                  if getattr(options, name) is not None), None)
 
 
+def given_options(options: argparse.Namespace, defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that differ from their defaults, by option: '--every', '--no-clip'."""
+    values = {name: getattr(options, name) for name in defaults}
+    return {f'--{"no-" if value is False else ""}{name.replace("_", "-")}': value
+            for name, value in values.items() if value != defaults[name]}
+
+
 def check_folder_options(options: argparse.Namespace) -> None:
     """Refuse options of folders if the source is not a folder; OptionsError names them."""
-    given = [f'--{name.replace("_", "-")}' for name in _PLACING
-             if getattr(options, name) not in (None, False)]
+    given = given_options(options, dict.fromkeys(_PLACING))
     if given and folder_of(options) is None:
         raise OptionsError(f'{", ".join(given)}: for folders of images only')

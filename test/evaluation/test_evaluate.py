@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executable evaluate, as its users run it."""
 
+import hashlib
 import json
 import re
 import resource
@@ -19,6 +20,7 @@ import yaml
 
 from cliploc_ros.cli.evaluate import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.offline.datasets.map_recording import MapRecording, save_recording
 from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
@@ -98,7 +100,8 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
         tolerance = table['tolerance']['bf' if method.endswith('_bf') else 'sampled']
         assert rows[method] == pytest.approx(expected, abs=tolerance + 0.005), method
     assert {path.name for path in tmp_path.iterdir()} == {
-        'results.json', 'summary.csv', 'table.md', 'table.tex', 'trajectories', 'report.html',
+        'results.json', 'run.json', 'summary.csv', 'table.md', 'table.tex', 'trajectories',
+        'report.html',
         *(f'{name}.{kind}' for name in FIGURES for kind in ('png', 'svg'))}
     for name in FIGURES:
         image = cv2.imread(str(tmp_path / f'{name}.png'))
@@ -126,6 +129,41 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
     assert first != second and len(first) == len(second) == 2
     assert_error(evaluate_here(*small(files, '--methods', 'auto', '--fuse', '--out', tmp_path)),
                  '--fuse', 'neighbouring')
+
+
+def test_the_files_say_what_was_compared(files, recording, tmp_path, evaluate_here):
+    poses = tmp_path / 'theirs.txt'
+    truth = recording[0].map_from_camera
+    numbers = ' '.join(map(str, [*truth[:3, 3], *quaternion_from_transform(truth)]))
+    poses.write_text(''.join(f'{second} {numbers}\n' for second in range(100, 109)))
+    given = small(files, '--methods', 'class_bf', '--seed', 7, '--no-figures')
+    done = evaluate_here(*given, '--poses', f'theirs={poses}', '--out', tmp_path / 'out')
+    assert done.returncode == 0, done.stderr
+    about = json.loads((tmp_path / 'out/run.json').read_text())
+    assert about['sha256'] == {
+        str(file): hashlib.sha256(file.read_bytes()).hexdigest()[:12]
+        for file in (files / 'queries.npz', files / 'map.yaml', poses)}
+    assert (about['queries'], about['landmarks'], about['seed']) == (
+        len(recording), len(recording.landmark_ids), 7)
+    assert about['similarities'].startswith('unknown')
+    assert '--methods class_bf --poses theirs=' in about['options']
+    assert '--trials' not in about['options']
+    for name in ('report.html', 'table.md', 'table.tex'):
+        text = (tmp_path / 'out' / name).read_text()
+        assert about['sha256'][str(poses)] in text and 'theirs' in text
+    assert [row['solved'] for row in results_of(tmp_path / 'out')
+            if row['method'] == 'theirs'] == [True] * 9 + [False] * 3
+    assert not (tmp_path / 'out/trajectories/theirs.txt').exists()
+    for word, named in (('class_bf=x.txt', "called 'class_bf'"), ('theirs', 'NAME=FILE'),
+                        ('theirs=missing.txt', 'missing.txt')):
+        assert_error(evaluate_here(*given, '--poses', word, '--out', tmp_path / 'none'), named)
+
+
+def test_options_without_effect_are_refused(files, tmp_path, evaluate_here):
+    given = small(files, '--methods', 'auto', '--out', tmp_path / 'out')
+    assert_error(evaluate_here(*given, '--model', 'yolo.pt', '--no-clip', '--every', 2,
+                               '--save-queries', tmp_path / 'q.npz', '--max-gap', 1),
+                 '--save-queries, --model, --no-clip, --every, --max-gap: no effect on --queries')
 
 
 @pytest.fixture(scope='module')
@@ -167,6 +205,13 @@ def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag, 
     assert done.returncode == 0, done.stderr
     results = results_of(walk / 'from_bag')
     assert results == results_of(walk / 'from_saved')
+    about = json.loads((walk / 'from_tum/run.json').read_text())
+    assert about['detector'] == str(ASSETS / 'yolo.onnx')
+    assert about['similarities'] == f'CLIP {ASSETS / "clip"}'
+    of_folder = hashlib.sha256()
+    for path in sorted((path for path in (walk / 'tum').rglob('*') if path.is_file()), key=str):
+        of_folder.update(path.read_bytes())
+    assert about['sha256'][str(walk / 'tum')] == of_folder.hexdigest()[:12]
     # a bag's quaternions are rounded once more
     for result, other in zip(results, results_of(walk / 'from_tum'), strict=True):
         for name in ('error_m', 'error_deg', 'nees', 'confidence'):

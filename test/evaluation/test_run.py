@@ -16,11 +16,12 @@ import pytest
 from matplotlib.figure import Figure
 from scene import make_room
 
-from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.geometry.transforms import make_transform, quaternion_from_transform
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.offline.datasets.observations import Queries
+from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation.figures import (
     draw_map,
     png_of,
@@ -42,7 +43,7 @@ from cliploc_ros.offline.evaluation.summary import (
     summarize,
     table_rows,
 )
-from cliploc_ros.offline.evaluation.trials import Result, make_queries
+from cliploc_ros.offline.evaluation.trials import Result, given_results, make_queries
 
 PAPER = RelocalizerOptions(iterations=60)
 
@@ -224,14 +225,16 @@ def test_bad_files_are_named(tmp_path, text, named):
     assert named in str(caught.value)
 
 
-def make_summary(errors, method='auto', accepted=None, confidence=None):
+def make_summary(errors, method='auto', accepted=None, confidence=None, **more):
+    """A summary whose errors [deg] are ten times those [m]."""
     errors = np.atleast_2d(np.array(errors, dtype=float))
     shape = errors.shape
     return Summary(
-        method, tuple(range(shape[1])), errors,
+        method, tuple(range(shape[1])), errors, 10.0 * errors,
         np.zeros(shape, bool) if accepted is None else np.atleast_2d(accepted),
         np.zeros(shape) if confidence is None else np.atleast_2d(confidence), np.full(shape, 2.0),
-        np.ones(shape), np.ones(shape, int), np.full(shape, 500), np.full(shape[1], 5))
+        np.ones(shape), np.ones(shape, int), np.full(shape, 500), np.full(shape[1], 5),
+        **more)
 
 
 def make_result(**changes):
@@ -249,6 +252,8 @@ def test_success_and_errors():
     assert one.success(1.0) == 5 / 8
     assert one.success_deviation(1.0) == pytest.approx(0.125)
     assert one.median_error_m == pytest.approx((0.4 + 0.9) / 2)
+    assert one.median_error_deg == pytest.approx(10 * (0.4 + 0.9) / 2)
+    assert one.solved == 7 / 8
     assert one.mean_error_m == pytest.approx((0.1 + 0.4 + 3.0 + 0.1 + 0.9 + 0.2 + 3.0) / 7)
 
 
@@ -297,7 +302,8 @@ def test_the_table_marks_noise_and_cut_searches():
     assert rows[2][2].endswith(' ~')
     assert rows[3][:3] == ('mine', '', '.00±.00 / .00±.00 / .00±.00')
     assert as_markdown(rows).splitlines()[2].startswith('| hybrid | bf | 1.00')
-    assert all(len(line) < 140 for line in as_text(rows).splitlines())
+    assert all(len(line) <= 160 for line in as_text(rows).splitlines())
+    assert rows[0][-1] == 'false accepts', 'all queries are solved'
     assert rows[1][-2:] == ('1.00 (.00 to 1.00)', '0 of 0')
     assert 'fitted on simulated' in notes([good, near])[1]
     assert 'hybrid_bf' in notes([good, near])[2]
@@ -305,15 +311,38 @@ def test_the_table_marks_noise_and_cut_searches():
 
 def test_the_spread_over_trials():
     one = make_summary([[0.1, 0.3, np.inf], [0.2, 0.3, 0.7]], 'clip_ransac')
-    assert one.error_deviations_m == pytest.approx((0.0, 0.1))
+    assert one.error_deviations == pytest.approx((0.0, 0.0, 0.1))
     assert table_rows([one])[1][2:4] == (
-        '.33±.00 / .67±.00 / .83±.17', '0.300±0.000, 0.32±0.10')
+        '.33±.00 / .67±.00 / .83±.17', '0.300±0.000, 3.00±0.00; 0.32±0.10')
+    assert [row[-1] for row in table_rows([one])] == ['solved', '.83']
     row, = csv.DictReader(as_csv([one]).splitlines())
     assert float(row['success_1m_std']) == pytest.approx(1 / 6, abs=1e-5)
     assert float(row['mean_error_m_std']) == pytest.approx(0.1)
     half = make_summary([[0.1, np.inf], [np.inf, np.inf]])
-    assert np.isnan(half.error_deviations_m).all()
+    assert np.isnan(half.error_deviations).all()
     assert '±' not in table_rows([half])[1][3]
+
+
+def test_poses_of_another_program_have_errors_only(questions):
+    """The second query has the nearest of two poses. That of the last query is 20 ms late."""
+    seconds, truth = [100.0, 101.004, 101.002, 111.02], questions[0].map_from_camera
+    pose = quaternion_from_transform(truth).tolist()
+    poses = TimedPoses.from_samples(
+        [round(1e9 * second) for second in seconds],
+        [[*(truth[:3, 3] + [0.1 * row, 0.0, 0.0]), *pose] for row in range(len(seconds))], 'here')
+    results = given_results('theirs', poses, questions)
+    assert [result.solved for result in results] == [True] * 2 + [False] * 10
+    assert [result.error_m for result in results[:2]] == pytest.approx([0.0, 0.2])
+    theirs, = summarize(results)
+    ours = make_summary([[0.1] * 6 + [2.0] * 6] * 5, 'clip_ransac')
+    rows = table_rows([ours, theirs])
+    assert rows[2] == ('theirs', '', '.17 / .17 / .17', 'inf, inf; 0.10', *[''] * 4, '.17')
+    _, row = csv.DictReader(as_csv([ours, theirs]).splitlines())
+    assert (row['solved'], row['accepted'], row['mean_search_ms']) == ('0.166667', '', '')
+    assert 'theirs: poses of another program; 10 of 12 queries have none' in '\n'.join(
+        notes([ours, theirs]))
+    with pytest.raises(DatasetError, match='do not overlap'):
+        given_results('theirs', replace(poses, stamps_ns=poses.stamps_ns + 10**12), questions)
 
 
 def test_the_table_in_latex():

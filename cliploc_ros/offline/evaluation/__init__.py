@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Methods compared on identical input: recorded queries, the paper's table."""
+"""Compare methods on identical input: recorded queries, the paper's table."""

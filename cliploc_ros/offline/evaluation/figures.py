@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's figures and others, as PNG and SVG; maps from above with names."""
+"""Draw the paper's figures and others, as PNG and SVG, and maps from above with names."""
 
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -28,18 +28,18 @@ from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 from cliploc_ros.offline.evaluation.summary import Summary, find_best, wilson_interval
 from cliploc_ros.offline.evaluation.trials import PosedQuery, Result
 
-#: Outlines text, so that it is legible on any background.
+#: Outline of text, which makes it legible on any background.
 EDGED = (withStroke(linewidth=2.0, foreground='white'),)
-# Names of more landmarks would be too small to read; and their size [pt].
+# Greatest number of landmarks that are drawn with their names, and the size of a name [pt].
 _MOST_NAMES, _NAME_PT = 40, 8
 _NAME = 'name'
-# Steps of a name from its place, in half widths and in heights, the nearest first.
+# Offsets of a name from its place, in half widths and in heights of the name, nearest first.
 _STEPS = sorted(product((0.0, 1.1, -1.1, 2.2, -2.2), np.arange(-4, 5) * 1.05),
                 key=lambda step: (abs(step[0]) + abs(step[1]), -step[1]))
 
 
 def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ...]]:
-    """Draw each landmark from above, with its name if there are few.
+    """Draw each landmark from above, with its name if the map has few landmarks.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ..
         draw_outline(axes, center, shape, facecolor=colors[class_id], edgecolor='#333333',
                      linewidth=0.5, alpha=0.55, zorder=3)
     if len(landmark_map) <= _MOST_NAMES:
-        # the highest first: they hide the others
+        # the highest first, since they hide the others
         for row in np.argsort(-landmark_map.centers[:, 2], kind='stable'):
             write_name(axes, landmark_map.centers[row, :2], landmark_map.landmark_ids[row],
                        _NAME_PT)
@@ -68,23 +68,23 @@ def draw_map(axes: Axes, landmark_map: LandmarkMap) -> dict[str, tuple[float, ..
 
 def draw_outline(axes: Axes, center: NDArray[np.float64], shape: NDArray[np.float64],
                  **style: object) -> None:
-    """Draw an ellipsoid, of center (3,) and shape (6,), from above."""
+    """Draw an ellipsoid of center (3,) and shape (6,) from above."""
     outline = np.array([center[0], center[1], shape[0], shape[1], shape[3]])
     axes.add_patch(Polygon(outline_points(outline), closed=True, **style))
 
 
 def write_name(axes: Axes, xy: ArrayLike, text: str, size: float = 8,
                color: str = '#222222') -> None:
-    """Write a name at a place (2,); see spread_names."""
+    """Write a name at a position (2,), which spread_names may change."""
     x, y = np.asarray(xy)
     axes.text(x, y, text, fontsize=size, color=color, ha='center', va='center', zorder=9,
               path_effects=EDGED, parse_math=False, clip_on=True, gid=_NAME).set_in_layout(False)
 
 
 def spread_names(figure: Figure) -> None:
-    """Move names that would cover each other, and hide those that have no room.
+    """Move names that cover each other, and hide names that find no room.
 
-    A line joins a name that was moved with its place. The names that were written first stay.
+    A line joins a moved name to its place. Names that were written earlier take precedence.
     """
     figure.draw_without_rendering()
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -111,15 +111,15 @@ def spread_names(figure: Figure) -> None:
 
 
 def png_of(figure: Figure, dpi: int) -> bytes:
-    """Return a figure as PNG, its names spread."""
+    """Return a figure as PNG, after spread_names."""
     spread_names(figure)
     buffer = io.BytesIO()
     figure.savefig(buffer, format='png', dpi=dpi)
     return buffer.getvalue()
 
 
-# The colours of Okabe and Ito, which the colour-blind can distinguish: one for each matching, the
-# others for other methods. Line style and marker show the algorithm.
+# Okabe and Ito's colours, which colour-blind readers can distinguish. The colour shows the
+# matching; line style and marker show the algorithm. Other methods have other colours.
 _COLORS = {'class': '#D55E00', 'clip': '#009E73', 'hybrid': '#0072B2'}
 _OTHER_COLORS = ('#CC79A7', '#E69F00', '#56B4E9', '#000000', '#F0E442')
 _STYLES = {'bf': ('-', 'o'), 'ransac': ((0, (1, 1.2)), '^'), 'prosac': ((0, (5, 1.5)), 's'),
@@ -129,9 +129,9 @@ _MAX_ERROR_M = 2.0
 _SUCCESS_M = 1.0
 _BOX_BINS = ((0, 2), (3, 4), (5, 6), (7, 9), (10, 14), (15, 10_000))
 _MARGIN_M = 0.5
-# Bins of reliability, finer where poses are accepted
+# Bins of confidence, finer where poses are accepted
 _BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
-_FREEDOM = 6  # of a pose
+_FREEDOM = 6  # degrees of freedom of a pose
 _JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 _MARKERS = 'osD^vP'
 _STAGE_COLORS = {'detector': '#BBBBBB', 'CLIP': '#888888', 'keyframes': '#56B4E9'}
@@ -148,18 +148,19 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
     folder : Path
         Folder of the figures.
     summaries : sequence of Summary
-        Summaries of the results.
+        Summaries of the results. Poses of other programs appear in the figures of success only.
     sweep : mapping of str to mapping of int to Summary
         Summaries of each sampling method, by its number of iterations.
     observing_ms : mapping of str to float
-        Mean times of the stages before the search, where recorded.
+        Mean times of the stages before the search, where they were recorded [ms].
 
     Returns
     -------
     list of Path
         The PNG files; each has an SVG beside it.
     """
-    best = find_best(summaries)
+    searched = [summary for summary in summaries if not summary.is_given]
+    best = find_best(searched)
     found = np.isfinite(best.errors_m)
     reliable = {best.method: (best.confidence[found], best.errors_m[found] < _SUCCESS_M)}
     success = f'success (within {_SUCCESS_M:g} m)'
@@ -171,16 +172,17 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
         'precision_over_recall': _drawn(
             'recall: right poses that are accepted',
             f'precision: accepted poses within {_SUCCESS_M:g} m', _precision_over_recall,
-            summaries),
+            searched),
         'reliability': _drawn('confidence', f'share of poses within {_SUCCESS_M:g} m',
                               draw_reliability, reliable, 'installed calibration'),
         'consistency': _drawn('squared error in its own covariance (NEES)',
-                              'share of accepted poses below', _consistency, summaries),
-        'time_by_stage': _drawn('mean time [ms]', '', _time_by_stage, summaries, observing_ms),
+                              'share of accepted poses below', _consistency, searched),
+        'time_by_stage': _drawn('mean time [ms]', '', _time_by_stage, searched, observing_ms),
         'top_view': _top_view(landmark_map, queries,
-                              [one for one in results if one.method == best.method], best.method),
+                              [result for result in results if result.method == best.method],
+                              best.method),
     }
-    if sampled := [summary for summary in summaries if not summary.method.endswith('_bf')]:
+    if sampled := [summary for summary in searched if not summary.method.endswith('_bf')]:
         figures['best_iteration'] = _drawn('iteration that found the best pose', '',
                                            _best_iteration, sampled)
     if sweep:
@@ -190,7 +192,7 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
 
 
 def _drawn(xlabel: str, ylabel: str, draw: Callable[..., None], *values: Any) -> Figure:
-    """Return a figure in which a function draws values, with a legend of what has a label."""
+    """Return a figure in which a function draws values, with a legend if anything has a label."""
     figure, axes = new_axes(xlabel, ylabel)
     draw(axes, *values)
     if axes.get_legend_handles_labels()[0]:
@@ -202,7 +204,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG and as SVG beside it; return the path."""
     spread_names(figure)
     write_file(path, lambda partial: figure.savefig(partial, dpi=150))
-    # without its date and with fixed ids, an SVG of the same results is the same file
+    # no date and fixed ids: equal results give equal SVG files
     with matplotlib.rc_context({'svg.hashsalt': path.stem}):
         write_file(path.with_suffix('.svg'),
                    lambda partial: figure.savefig(partial, metadata={'Date': None}))
@@ -225,7 +227,9 @@ def _style(method: str) -> tuple[str, object, str | None]:
     if method in PAPER_METHODS:
         matching, algorithm = method.split('_')
         return _COLORS[matching], *_STYLES[algorithm]
-    return _OTHER_COLORS[sum(method.encode()) % len(_OTHER_COLORS)], '-', 'P'
+    number = sum(method.encode())
+    return (_OTHER_COLORS[number % len(_OTHER_COLORS)],
+            *tuple(_STYLES.values())[number // len(_OTHER_COLORS) % len(_STYLES)])
 
 
 def add_legend(figure: Figure) -> None:
@@ -246,7 +250,7 @@ def _success_over_threshold(axes: Axes, summaries: Sequence[Summary]) -> None:
 def _success_over_iterations(axes: Axes, sweep: Mapping[str, Mapping[int, Summary]]) -> None:
     for method, by_count in sweep.items():
         color, line, marker = _style(method)
-        rates = [one.success(_SUCCESS_M) for one in by_count.values()]
+        rates = [summary.success(_SUCCESS_M) for summary in by_count.values()]
         axes.plot([*by_count], rates, color=color, linestyle=line, marker=marker, markersize=4,
                   linewidth=1.2, label=method)
     counts = sorted({count for by_count in sweep.values() for count in by_count})
@@ -262,15 +266,15 @@ def _best_iteration(axes: Axes, summaries: Sequence[Summary]) -> None:
                          patch_artist=True, medianprops={'color': 'black'})
     for patch, summary in zip(boxes['boxes'], summaries, strict=True):
         patch.set(facecolor=_style(summary.method)[0], alpha=0.6)
-    axes.set_yticks(range(1, len(summaries) + 1), [one.method for one in summaries])
+    axes.set_yticks(range(1, len(summaries) + 1), [summary.method for summary in summaries])
     axes.invert_yaxis()
-    axes.set_title('median, quartiles, and 1.5 of their distance', fontsize=9)
+    axes.set_title('median, quartiles, whiskers of 1.5 interquartile ranges', fontsize=9)
 
 
 def _success_by_boxes(axes: Axes, summaries: Sequence[Summary]) -> None:
     boxes = summaries[0].boxes
-    bins = [(low, high, (boxes >= low) & (boxes <= high)) for low, high in _BOX_BINS]
-    bins = [one for one in bins if one[2].any()]
+    bins = [(low, high, chosen) for low, high in _BOX_BINS
+            if (chosen := (boxes >= low) & (boxes <= high)).any()]
     for summary in summaries:
         color, line, marker = _style(summary.method)
         rates = [(summary.errors_m[:, chosen] < _SUCCESS_M).mean() for _, _, chosen in bins]
@@ -285,23 +289,23 @@ def _success_by_boxes(axes: Axes, summaries: Sequence[Summary]) -> None:
 
 
 def _precision_over_recall(axes: Axes, summaries: Sequence[Summary]) -> None:
-    for one in summaries:
-        color, line, marker = _style(one.method)
-        recall, precision = precision_recall(one)
+    for summary in summaries:
+        color, line, marker = _style(summary.method)
+        recall, precision = precision_recall(summary)
         if not len(recall):
             continue
         axes.plot(recall, precision, color=color, linestyle=line, linewidth=1.2,
-                  label=one.method)
-        if one.accepted.any():
-            axes.plot(one.recall(), one.precision(), color=color, marker=marker, markersize=6,
-                      markeredgecolor='black', linestyle='none')
+                  label=summary.method)
+        if summary.accepted.any():
+            axes.plot(summary.recall(), summary.precision(), color=color, marker=marker,
+                      markersize=6, markeredgecolor='black', linestyle='none')
     axes.set(xlim=(-0.02, 1.02))
-    axes.set_title('lines: all least confidences; markers: as run', fontsize=9)
+    axes.set_title('lines: all thresholds; markers: the threshold of the run', fontsize=9)
 
 
-def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
+def precision_recall(summary: Summary, limit_m: float = _SUCCESS_M
                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return recall and precision of accepting all poses above each confidence.
+    """Return recall and precision for each threshold of the confidence.
 
     Parameters
     ----------
@@ -311,21 +315,21 @@ def precision_recall(one: Summary, limit_m: float = _SUCCESS_M
     Returns
     -------
     recall, precision : ndarray (m,)
-        From the strictest threshold to the loosest; empty if no pose is right.
+        From the strictest threshold to the loosest; empty if no pose is correct.
     """
-    solved = np.isfinite(one.errors_m)
-    order = np.argsort(-one.confidence[solved], kind='stable')
-    right = (one.errors_m[solved] < limit_m)[order]
+    solved = np.isfinite(summary.errors_m)
+    order = np.argsort(-summary.confidence[solved], kind='stable')
+    right = (summary.errors_m[solved] < limit_m)[order]
     if not right.any():
         return np.empty(0), np.empty(0)
     accepted = np.cumsum(right)
-    # of equal confidence all poses are accepted, or none
-    last = np.append(np.diff(one.confidence[solved][order]) != 0, True)
+    # poses of equal confidence are accepted together
+    last = np.append(np.diff(summary.confidence[solved][order]) != 0, True)
     return (accepted / right.sum())[last], (accepted / np.arange(1, right.size + 1))[last]
 
 
 def _consistency(axes: Axes, summaries: Sequence[Summary]) -> None:
-    """Draw the distribution of the normalized squared errors of accepted poses."""
+    """Draw the distribution of the normalized squared errors (NEES) of accepted poses."""
     levels = np.linspace(0.0, float(chi2.ppf(0.999, _FREEDOM)), 400)
     axes.plot(levels, chi2.cdf(levels, _FREEDOM), color='#888888', linewidth=1.6,
               label='ideal')
@@ -346,8 +350,9 @@ def _time_by_stage(axes: Axes, summaries: Sequence[Summary], observing_ms: Mappi
     start = np.zeros(len(summaries))
     stages: dict[str, Any] = dict(observing_ms)
     if any(summary.has_keyframes for summary in summaries):
-        stages['keyframes'] = np.array([one.keyframes_ms.mean() if one.has_keyframes else 0.0
-                                        for one in summaries])
+        stages['keyframes'] = np.array([
+            summary.keyframes_ms.mean() if summary.has_keyframes else 0.0
+            for summary in summaries])
     for stage, duration in stages.items():
         axes.barh(rows, duration, left=start, color=_STAGE_COLORS[stage], label=stage)
         start += duration
@@ -385,9 +390,10 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results:
               color='#222222', label='truth', zorder=6)
     for label, color, marker, verdict in (('accepted', '#0072B2', 'o', True),
                                           ('refused', '#D55E00', 'X', False)):
-        chosen = [one for one in first if one.error_m is not None and one.accepted == verdict]
-        for number, one in enumerate(chosen):
-            (x, y), pose = truth[one.query][:2, 3], one.map_from_camera
+        chosen = [result for result in first
+                  if result.solved and result.accepted == verdict]
+        for number, result in enumerate(chosen):
+            (x, y), pose = truth[result.query][:2, 3], result.map_from_camera
             assert pose is not None
             axes.plot([x, pose[0][3]], [y, pose[1][3]], color=color, linewidth=0.9, zorder=5,
                       marker=marker, markevery=[1], markersize=4,
@@ -399,9 +405,9 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results:
 def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
                                                             NDArray[np.bool_]]],
                      title: str = '') -> None:
-    """Draw the share of right poses over confidence, with 95 % intervals.
+    """Draw the share of correct poses over the confidence, with 95 % intervals.
 
-    `judged` maps names to confidences (n,) and to whether each pose is right (n,).
+    `judged` maps each name to confidences (n,) and a mask of the correct poses (n,).
     """
     if title:
         axes.set_title(title, fontsize=9)
@@ -421,5 +427,5 @@ def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
 
 
 def within_ellipsoid(squares: NDArray[np.float64], share: float = 0.95) -> float:
-    """Return the share of poses within the ellipsoids that should hold a given share."""
+    """Return the share of poses within the confidence ellipsoids of a given probability."""
     return float((squares < chi2.ppf(share, _FREEDOM)).mean())

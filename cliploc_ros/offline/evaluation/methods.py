@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Methods to compare: the paper's ten, our defaults, and named sets of options."""
+"""Define the methods to compare: the paper's ten, our defaults, and named sets of options."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -10,7 +10,7 @@ from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError, did_you_mean
 
-#: The rows of the paper's Table 1. PROSAC needs similarities, which class matching has not.
+#: The rows of the paper's Table 1. Class matching has no similarities, which PROSAC needs.
 PAPER_METHODS = ('class_bf', 'class_ransac', 'clip_bf', 'clip_ransac', 'clip_prosac',
                  'clip_b-prosac', 'hybrid_bf', 'hybrid_ransac', 'hybrid_prosac',
                  'hybrid_b-prosac')
@@ -22,7 +22,7 @@ _FIELDS = {field.name: field for field in fields(RelocalizerOptions)}
 
 @dataclass(frozen=True)
 class Method:
-    """A name, its options, and whether it uses keyframes where there are some."""
+    """A named set of options, with keyframes or without."""
 
     name: str
     options: RelocalizerOptions
@@ -30,28 +30,27 @@ class Method:
 
     @property
     def draws_nothing(self) -> bool:
-        """Return whether it tries samples in a fixed order, so that all trials are equal."""
+        """Return whether it draws no random samples. Then all its trials are equal."""
         return self.options.algorithm in ('auto', 'bf')
 
 
 def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: int
                   ) -> tuple[Method, ...]:
-    """Return the methods with some names.
+    """Return the methods that the words name.
 
-    OptionsError: the message names the word, or the file, the method and the option.
+    OptionsError: a name, or an option in a file, is unknown or invalid; the message names it.
 
     Parameters
     ----------
     words : iterable of str
         Names of the paper's methods, 'auto', 'all' of these, or YAML files: a mapping of names
-        to options, where 'base' names a method whose options are the defaults, and 'keyframes'
-        says whether keyframes are used; the paper's methods never use them.
+        to options. 'base' names the method with the default values, 'keyframes' switches
+        keyframes on or off. The paper's methods never use keyframes.
     paper : RelocalizerOptions
         Options of the paper's methods other than matching and algorithm. auto takes its seed,
         height range, deviations of vertical and tilt, crops and matching from them.
     landmarks : int
-        Number of landmarks of the map; it limits k. Without any, all methods have to use
-        keyframes.
+        Number of landmarks of the map; it limits k. If it is 0, all methods must use keyframes.
     """
     methods: dict[str, Method] = {}
     for word in words:
@@ -70,7 +69,7 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
                 raise OptionsError(f"two different methods are called '{method.name}'")
             methods[method.name] = method
     if not methods:
-        raise OptionsError(f'no method is named: give some of {", ".join(PAPER_METHODS)}, '
+        raise OptionsError(f'no method is named: give one or more of {", ".join(PAPER_METHODS)}, '
                            f'{ALL}, {AUTO}, or a YAML file')
     for name, method in methods.items():
         if not landmarks and not method.keyframes:
@@ -117,7 +116,7 @@ def _made(where: str, name: str, values: Any, paper: RelocalizerOptions, landmar
 
 
 def _converted(where: str, value: Any, default: Any) -> Any:
-    """Return an option's value from YAML, where it is of the default's type."""
+    """Return an option's value from YAML; OptionsError: its type is not that of the default."""
     if isinstance(default, tuple):
         if not isinstance(value, list) or len(value) != len(default):
             raise OptionsError(f'{where}: {value!r} is not a list of {len(default)}')

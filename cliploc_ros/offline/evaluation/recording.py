@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Queries from recorded observations: every method gets the same input."""
+"""Make queries of recorded observations: every method gets the same input."""
 
 import logging
 import os
@@ -33,13 +33,13 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
                      map_files: Sequence[str], compare: str) -> Queries:
     """Return the images with ground truth as queries; detector and CLIP run once.
 
-    CliplocError: from loading the networks and from recording. A folder that cannot be written
-    gives a warning only.
+    CliplocError: the networks cannot be loaded, or the recording fails. If the folder cannot be
+    written to, the observations are not kept, with a warning.
 
     Parameters
     ----------
     options : RecordingOptions
-        Without CLIP, all similarities are 0: for methods that match by class.
+        Without CLIP, all similarities are 0, which suits methods that match by class only.
     map_files, compare
         See load_encoder_for_map.
     """
@@ -48,7 +48,7 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
     file = observation_file(frames, options)
     if file.exists() or os.access(file.parent, os.W_OK):
         return make_queries_of(record_once(frames, options), landmark_map, labels)
-    logger.warning('the next run must record again: %s cannot be written', file.parent)
+    logger.warning('the next run has to record again: %s cannot be written to', file.parent)
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_') as folder:
         recorded = record_once(frames, options, Path(folder) / file.name)
     return make_queries_of(recorded, landmark_map, labels)
@@ -56,14 +56,14 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
 
 def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
                     labels: LabelEmbeddings | None) -> Queries:
-    """Return recorded frames as queries, each a group of its own; true landmarks are unknown."""
+    """Return recorded frames as queries, each in its own group; true landmarks are unknown."""
     detections = recorded.detections
     camera, names = detections.cameras[0], detections.class_names
     frames = []
     for frame, stamp_ns in enumerate(recorded.stamps_ns):
         rows = slice(*map(int, detections.frame_offsets[frame:frame + 2]))
         boxes = detections.bboxes_xyxy[rows]
-        if detections.camera_of(frame) != camera:  # queries have one camera
+        if detections.camera_of(frame) != camera:  # all queries have the same camera
             boxes = camera.bboxes_in_pixels(detections.camera_of(frame).normalize_bboxes(boxes))
         similarities = np.zeros((len(boxes), len(landmark_map)))
         if labels is not None:
@@ -86,9 +86,9 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
 
 def with_features(queries: Sequence[PosedQuery], frames: Frames, kind: FeatureKind = SIFT
                   ) -> tuple[PosedQuery, ...]:
-    """Return queries with the features of their images; those without an image stay.
+    """Return queries with the features of their images; a query without an image is unchanged.
 
-    The queries were recorded from these frames.
+    `frames` are the recording of the queries.
     """
     waiting: dict[int, deque[int]] = defaultdict(deque)
     for row, query in enumerate(queries):
@@ -98,10 +98,10 @@ def with_features(queries: Sequence[PosedQuery], frames: Frames, kind: FeatureKi
                              and bool(waiting.get(stamp_ns)))
     for raw in tqdm(wanted, 'features', len(queries), unit='image', disable=None):
         if not waiting[raw.stamp_ns]:
-            continue  # of images of one stamp, more than were recorded
+            continue  # more images of this stamp than queries
         row = waiting[raw.stamp_ns].popleft()
         image_rgb, camera = raw.color()
-        # a pass decodes it again: the images of a long recording would fill the memory
+        # kept compressed, since the images of a long recording would fill the memory
         _, content = cv2.imencode('.png', image_rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])
         features = ImageFeatures(partial(_decoded, content), camera, kind)
         features.of_pass(is_thorough=False)
@@ -110,5 +110,5 @@ def with_features(queries: Sequence[PosedQuery], frames: Frames, kind: FeatureKi
 
 
 def _decoded(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image of a lossless PNG, whose channels are in any order."""
+    """Return the image that was compressed, its channels in the same order."""
     return np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR), dtype=np.uint8)

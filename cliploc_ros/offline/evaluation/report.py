@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of compared methods: the best method, the table and all figures."""
+"""Write the page that compares methods: the best method, the table and all figures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,35 +14,41 @@ _TOP_VIEW = 'top_view'
 # Columns of the first screen: method, success, accepted, false accepts.
 _BRIEF = (0, 1, 2, 5, 7)
 CAPTIONS = {
-    _TOP_VIEW: 'The map from above. A line joins each estimate of the best method to its truth.',
+    _TOP_VIEW: 'The map from above. A line joins each estimate of this method to its truth.',
     'success_over_threshold': 'Share of poses within a distance of the truth, accepted or not.',
     'success_by_boxes': 'Success by the number of detections in the image.',
-    'precision_over_recall': 'What another least confidence would accept.',
-    'reliability': 'Whether the confidence is true, with 95 % intervals.',
-    'consistency': 'Whether the covariance is true.',
+    'precision_over_recall': 'Precision and recall at other thresholds of the confidence.',
+    'reliability': 'Calibration of the confidence, with 95 % intervals.',
+    'consistency': 'Calibration of the covariance.',
     'time_by_stage': 'Mean time of an answer, by stage.',
-    'best_iteration': 'When the best pose was found.',
-    'success_over_iterations': 'Success over the length of the search.'}
+    'best_iteration': 'Iteration that found the best pose.',
+    'success_over_iterations': 'Success over the number of iterations.'}
 
 
 def write_report(folder: Path, summaries: Sequence[Summary], rows: Sequence[Sequence[str]],
-                 remarks: Sequence[str], pictures: Sequence[Path]) -> None:
-    """Write the page, with the table's rows, its header first, and embedded PNG files."""
+                 remarks: Sequence[str], pictures: Sequence[Path],
+                 about: Sequence[tuple[str, str]]) -> None:
+    """Write the page. It embeds the pictures, which are PNG files.
+
+    `rows` are those of the table, its header first; `about` names and values of input and options.
+    """
     best = find_best(summaries)
     wrong, count = best.false_accepts(), best.errors_m.size
     said = html.verdict(f'{best.method} is the best of {len(summaries)} methods on '
                         f'{len(best.queries)} images' if len(summaries) > 1 else
                         f'{best.method} on {len(best.queries)} images', not wrong)
-    numbers = html.tiles([
-        (f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True),
-        (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
-        (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)])
+    numbers = [(f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True)]
+    if not best.is_given:
+        numbers += [
+            (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
+            (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)]
     drawn = {picture.stem: html.figure(picture.read_bytes(), CAPTIONS[picture.stem], picture.stem)
              for picture in pictures}
     head, *brief = [[row[column] for column in _BRIEF] for row in rows]
     top_view = drawn.pop(_TOP_VIEW, '')
     write_text(folder / PAGE, html.page(
         'Evaluation',
-        html.first_screen([said, numbers, html.table(head, brief)], [top_view]),
+        html.first_screen([said, html.tiles(numbers), html.table(head, brief)], [top_view]),
         html.fold('The whole table', html.table(rows[0], rows[1:]), *map(html.note, remarks)),
+        html.fold('Input and options', html.table(('', ''), about)),
         html.fold('Figures', html.side_by_side(drawn.values()), is_open=True)))

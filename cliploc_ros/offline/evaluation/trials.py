@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Methods run on queries: the pose that each search found, and its error; simulated sensors."""
+"""Run methods on queries: the pose of each search and its error; simulated sensors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -22,7 +22,12 @@ from cliploc_ros.core.geometry.depth import (
     depth_of,
     half_chord,
 )
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    pose_error,
+    transform_from_pose,
+)
 from cliploc_ros.core.keyframes.localization import (
     ImageFeatures,
     ImageRecognizer,
@@ -35,20 +40,27 @@ from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.offline.datasets.observations import Queries
-from cliploc_ros.offline.evaluation.methods import Method
+from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
+from cliploc_ros.offline.datasets.tum import read_tum_trajectory
+from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS, Method
 from cliploc_ros.units import NS_PER_S
+
+#: Result.source of a pose that another program found.
+GIVEN = 'given'
+#: Greatest difference in time between a query and its given pose [ms]: evo's default.
+GIVEN_TOLERANCE_MS = 10
 
 
 @dataclass(frozen=True)
 class PosedQuery:
-    """An observation to localize, and the true pose."""
+    """An observation to localize, and its true pose."""
 
     number: int  #: Number of the frame in its query file, from 0
     observation: Observation
     map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
-    #: Other frames, which odometry links to it, or those of other cameras at its instant
+    #: Other frames that odometry links to it, or the frames of other cameras at its instant
     neighbours: tuple[Observation, ...] = ()
-    image: ImageFeatures | None = None  #: Its local features, for keyframes
+    image: ImageFeatures | None = None  #: Local features of its image, for keyframes
 
 
 @dataclass(frozen=True)
@@ -56,7 +68,7 @@ class Result:
     """The result of one search."""
 
     method: str
-    trial: int  #: From 0; added to the seed of the run
+    trial: int  #: Number of the trial, from 0, which is added to the seed of the run
     query: int  #: Number of the frame in its query file
     timestamp: float  #: Timestamp of the image [s]
     boxes: int  #: Number of detections
@@ -67,26 +79,27 @@ class Result:
     #: Error of the best pose; None if none was found
     error_m: float | None
     error_deg: float | None
-    score: float  #: Sum of the IoUs of its inliers
-    confidence: float  #: Probability that it is within 1 m, according to the relocalizer
-    nees: float | None  #: Squared error in its own covariance, see normalized_square
-    inliers: int
-    hypotheses: int  #: Number of hypotheses tried
-    best_iteration: int  #: Iteration that found the best pose, from 1
-    coverage: float  #: Share of its samples that the search tried
-    reason: str  #: Reason of the refusal; empty when accepted
-    search_ms: float  #: Search of objects. Only times differ from run to run.
-    crops_share: float = 1.0  #: Share of the crops of its frames that were compared with labels
-    #: With several maps, the map of the pose, which is in the coordinates of the first map: on
-    #: another map, it is far away. Empty for a single map.
+    score: float = 0.0  #: Sum of the IoUs of its inliers
+    confidence: float = 0.0  #: Probability that it is within 1 m, according to the relocalizer
+    nees: float | None = None  #: Squared error in its own covariance, see normalized_square
+    inliers: int = 0
+    hypotheses: int = 0  #: Number of hypotheses tried
+    best_iteration: int = 0  #: Iteration that found the best pose, from 1
+    coverage: float = 1.0  #: Share of all samples that the search tried
+    reason: str = ''  #: Reason of the refusal; empty when accepted
+    search_ms: float = 0.0  #: Time of the search of objects. Only times differ from run to run.
+    crops_share: float = 1.0  #: Share of the query's crops that were compared with labels
+    #: Name of the map that the pose belongs to, where there are several. The pose is in the
+    #: coordinates of the first map, far away if it belongs to another map. Empty for a single map.
     map: str = ''
     refusal_kind: str = ''  #: See cliploc_ros.core.acceptance.verdict; empty when accepted
-    #: What the pose comes from: 'objects', 'keyframes' or 'both'; empty if none was found
+    #: Source of the pose: 'objects', 'keyframes' or 'both'; empty if none was found. GIVEN for all
+    #: results of another program
     source: str = ''
-    #: Points of keyframes that agree on their pose, whatever the pose comes from
+    #: Points of keyframes that agree on the pose of the keyframes, whatever the source
     keyframe_inliers: int = 0
     keyframes_ms: float = 0.0  #: Time of features, matching and the pose from them [ms]
-    keyframe_search: str = 'none'  #: How far it went: 'none', 'fast' or 'thorough'
+    keyframe_search: str = 'none'  #: The last pass over keyframes: 'none', 'fast' or 'thorough'
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, for JSON."""
@@ -97,18 +110,18 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
                  ) -> tuple[PosedQuery, ...]:
     """Return the queries of a file, with similarities in the map's order.
 
-    With `every_frame` the neighbouring frames are queries, too. DatasetError: the queries were
-    recorded against another map.
+    With `every_frame`, neighbouring frames are queries, too. DatasetError: the queries were
+    recorded with another map.
     """
     column = {landmark_id: number for number, landmark_id in enumerate(queries.landmark_ids)}
-    missing = [one for one in landmark_map.landmark_ids if one not in column]
+    missing = [name for name in landmark_map.landmark_ids if name not in column]
     if missing:
         more = f' and {len(missing) - 1} more' if missing[1:] else ''
         raise DatasetError(f"the queries lack the map's landmark '{missing[0]}'{more}: they were "
                            'recorded with another map')
     columns = [column[landmark_id] for landmark_id in landmark_map.landmark_ids]
     fx, fy, cx, cy = queries.intrinsics_fx_fy_cx_cy
-    # the file does not hold the size of the image, and localizing does not use it
+    # the file lacks the size of the image, which localization does not need
     camera = Camera(max(1, round(2 * cx)), max(1, round(2 * cy)), fx, fy, cx, cy)
     return tuple(
         PosedQuery(number, Observation(
@@ -120,27 +133,28 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
 
 def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float
                  ) -> tuple[PosedQuery, ...]:
-    """Return the queries of the first camera, each with the other cameras at its instant.
+    """Return the queries of the first camera, each with the other cameras' frames of its instant.
 
-    The mounts of the cameras follow from the true poses. DatasetError: no other image is so near
-    in time to one of the first camera.
+    The mounts of the cameras follow from the true poses. DatasetError: no image of another camera
+    is within the tolerance of an image of the first camera.
     """
     (first, main), *others = queries.items()
-    stamps = {name: np.array([one.observation.stamp_ns for one in its]) for name, its in others}
+    stamps = {name: np.array([query.observation.stamp_ns for query in its])
+              for name, its in others}
     found = []
     for query in main:
         stamp_ns, beside = query.observation.stamp_ns, []
         for name, its in others:
             near = np.abs(stamps[name] - stamp_ns)
             if len(near) and near.min() <= tolerance_s * NS_PER_S:
-                one = its[int(near.argmin())]
-                beside.append(replace(one.observation, camera_name=name, stamp_ns=stamp_ns,
-                                      odom_from_camera=one.map_from_camera))
+                nearest = its[int(near.argmin())]
+                beside.append(replace(nearest.observation, camera_name=name, stamp_ns=stamp_ns,
+                                      odom_from_camera=nearest.map_from_camera))
         found.append(replace(query, neighbours=tuple(beside), observation=replace(
             query.observation, camera_name=first, odom_from_camera=query.map_from_camera)))
-    if not any(one.neighbours for one in found):
+    if not any(query.neighbours for query in found):
         raise DatasetError(f'no image of {", ".join(name for name, _ in others)} is within '
-                           f'{tolerance_s:g} s of one of {first}')
+                           f'{tolerance_s:g} s of an image of {first}')
     return tuple(found)
 
 
@@ -148,7 +162,8 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
               keyframes: KeyframeLocalizer | None = None) -> list[Result]:
     """Run one trial of a method, numbered from 0, on some queries.
 
-    `keyframes` are of the map's layer, for methods that use keyframes and queries with features.
+    `keyframes` localizes in the keyframes of the map, if the method uses them and the query has
+    features.
     """
     seed = method.options.random_seed + trial
     relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
@@ -170,11 +185,61 @@ def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Se
     return results
 
 
+def read_given_poses(words: Iterable[str], methods: Iterable[Method]) -> dict[str, TimedPoses]:
+    """Read the poses of other programs, which are given as NAME=FILE; return them by name.
+
+    OptionsError: a word has another form, or a method has the same name. DatasetError: a file is
+    not a trajectory in TUM format.
+    """
+    taken = {*PAPER_METHODS, AUTO, ALL, *(method.name for method in methods)}
+    found: dict[str, TimedPoses] = {}
+    for word in words:
+        name, _, file = word.partition('=')
+        if not name or not file or '@' in name or '/' in name:
+            raise OptionsError(f"`poses` {word}: expected NAME=FILE, and no '@' or '/' in NAME")
+        if name in taken or name in found:
+            raise OptionsError(f"`poses` {word}: another method is called '{name}'")
+        found[name] = read_tum_trajectory(file)
+    return found
+
+
+def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -> list[Result]:
+    """Return a result for each query from the poses of another program.
+
+    The poses are those of the camera in the map. Each query gets the pose that is nearest in time,
+    within GIVEN_TOLERANCE_MS.
+    DatasetError: the time span of the poses does not overlap that of the queries.
+    """
+    stamps_ns = [query.observation.stamp_ns for query in queries]
+    tolerance_ns = GIVEN_TOLERANCE_MS * 1_000_000
+    check_clock(poses, min(stamps_ns) - tolerance_ns, max(stamps_ns) + tolerance_ns,
+                f'poses of {name}')
+    results = []
+    for query, stamp_ns in zip(queries, stamps_ns, strict=True):
+        gaps_ns = np.abs(poses.stamps_ns - stamp_ns)
+        row = int(gaps_ns.argmin())
+        pose = (transform_from_pose(poses.positions_xyz[row], poses.quats_xyzw[row])
+                if gaps_ns[row] <= tolerance_ns else None)
+        results.append(Result(
+            name, 0, query.number, stamp_ns / NS_PER_S, len(query.observation.detections),
+            solved=pose is not None, accepted=False, source=GIVEN, **_error(pose, query)))
+    return results
+
+
+def _error(pose: NDArray[np.float64] | None, query: PosedQuery) -> dict[str, Any]:
+    """Return the pose and the errors of a result by their fields; None without a pose."""
+    if pose is None:
+        return dict.fromkeys(('map_from_camera', 'error_m', 'error_deg'))
+    error_m, error_deg = pose_error(pose, query.map_from_camera)
+    return {'map_from_camera': pose.tolist(), 'error_m': float(error_m),
+            'error_deg': float(error_deg)}
+
+
 def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observation],
                         recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
-    """Localize as the node does: with each frame after those before it, crops on demand.
+    """Localize as the node does: frame after frame, with crops compared on demand.
 
-    Return the result and the share of crops that were compared.
+    Return the result and the share of crops that were compared with labels.
     """
     frames: list[SearchedFrame] = []
     count = len(relocalizer.landmark_map)
@@ -187,8 +252,8 @@ def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observa
             localizer.recorded_crops(observation, relocalizer.options),
             recognizer=recognizer if observation is observations[-1] else None)
         frames.append(frame)
-    crops = sum(len(one.observation.detections) for one in frames)
-    compared = sum(int((one.observation.similarity_rows >= 0).sum()) for one in frames)
+    crops = sum(len(frame.observation.detections) for frame in frames)
+    compared = sum(int((frame.observation.similarity_rows >= 0).sum()) for frame in frames)
     return found, compared / max(crops, 1)
 
 
@@ -196,16 +261,12 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery
            found: Relocalization, crops_share: float, recognizer: ImageRecognizer | None
            ) -> Result:
     pose = found.map_from_camera
-    error_m, error_deg = (None, None) if pose is None else pose_error(pose, query.map_from_camera)
     return Result(
         method=method, trial=trial, query=query.number,
         timestamp=float(query.observation.stamp_ns) / NS_PER_S,
         boxes=len(query.observation.detections),
-        solved=found.solved, accepted=found.accepted,
-        map_from_camera=None if pose is None else pose.tolist(),
-        error_m=None if error_m is None else float(error_m),
-        error_deg=None if error_deg is None else float(error_deg), score=float(found.score),
-        confidence=float(found.confidence),
+        solved=found.solved, accepted=found.accepted, **_error(pose, query),
+        score=float(found.score), confidence=float(found.confidence),
         nees=None if pose is None or found.covariance is None
         else normalized_square(pose, found.covariance, query.map_from_camera),
         inliers=len(found.matches), hypotheses=int(found.tried),
@@ -219,22 +280,22 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery
         keyframe_search=found.keyframe_search)
 
 
-# In a kitchen, a tenth of the boxes have no depth. The share of boxes with the depth of something
-# else, and the range of that depth [m], are guesses.
+# Share of boxes without depth, measured in a kitchen; share of boxes with the depth of another
+# object, and the range of that depth [m]. The latter two are not measured.
 _NO_DEPTH, _SOMETHING_ELSE, _ANY_DEPTH_M = 0.1, 0.05, (0.5, 5.0)
 
 
 def with_vertical(queries: Sequence[PosedQuery], noise_deg: float = 0.0, seed: int = 0
                   ) -> tuple[PosedQuery, ...]:
-    """Return queries with a known vertical, as from an accelerometer.
+    """Return queries with a known vertical, as an accelerometer measures it.
 
     Parameters
     ----------
     noise_deg : float
-        Standard deviation of the error of each vertical [deg], a rotation about a random level
-        axis.
+        Standard deviation of the error of each vertical [deg]: a rotation about a random
+        horizontal axis.
     seed : int
-        Equal seeds give equal noise in any order of the queries.
+        Equal seeds give equal noise, whatever the order of the queries.
     """
     found = []
     for query in queries:
@@ -242,17 +303,17 @@ def with_vertical(queries: Sequence[PosedQuery], noise_deg: float = 0.0, seed: i
         up = turned(query.map_from_camera[2, :3], np.radians(noise_deg) * rng.normal(), rng)
         found.append(replace(
             query, observation=replace(query.observation, up_in_camera=up), neighbours=tuple(
-                _same_vertical(one, query.observation, up) for one in query.neighbours)))
+                _same_vertical(seen, query.observation, up) for seen in query.neighbours)))
     return tuple(found)
 
 
-def _same_vertical(one: Observation, other: Observation, up_in_other: NDArray[np.float64]
+def _same_vertical(seen: Observation, other: Observation, up_in_other: NDArray[np.float64]
                    ) -> Observation:
-    """Return the observation of another camera of the robot, with the same vertical."""
-    if one.odom_from_camera is None or other.odom_from_camera is None:
-        return one
-    turn = one.odom_from_camera[:3, :3].T @ other.odom_from_camera[:3, :3]
-    return replace(one, up_in_camera=turn @ up_in_other)
+    """Return an observation with the vertical that another camera of the robot knows."""
+    if seen.odom_from_camera is None or other.odom_from_camera is None:
+        return seen
+    turn = seen.odom_from_camera[:3, :3].T @ other.odom_from_camera[:3, :3]
+    return replace(seen, up_in_camera=turn @ up_in_other)
 
 
 def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_m: float = 0.0,
@@ -264,10 +325,9 @@ def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_
     queries : sequence of PosedQuery
         All frames.
     groups : sequence of int
-        The group of each.
+        The group of each frame.
     noise_m, noise_deg : float
-        Standard deviations of the error of each step from one frame to the next in time, on each
-        axis.
+        Standard deviations of the error of odometry from each frame to the next, on each axis.
     seed : int
         Equal seeds give equal noise.
 
@@ -278,8 +338,9 @@ def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_
     """
     found: dict[int, PosedQuery] = {}
     for group in dict.fromkeys(groups):
-        frames = sorted((one for one, its in zip(queries, groups, strict=True) if its == group),
-                        key=lambda one: one.observation.stamp_ns)
+        frames = sorted(
+            (query for query, its in zip(queries, groups, strict=True) if its == group),
+            key=lambda query: query.observation.stamp_ns)
         rng = np.random.default_rng([seed, abs(group), 1])
         joined = [replace(frame.observation, odom_from_camera=pose) for frame, pose in zip(
             frames, _odometry(frames, noise_m, noise_deg, rng), strict=True)]
@@ -287,7 +348,7 @@ def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_
             near = sorted(range(len(frames)), key=lambda other: abs(other - row))[1:MAX_FRAMES]
             found[query.number] = replace(query, observation=joined[row], neighbours=tuple(
                 joined[other] for other in sorted(near)))
-    if not any(one.neighbours for one in found.values()):
+    if not any(query.neighbours for query in found.values()):
         raise OptionsError('--fuse: no query of this input has neighbouring frames in its group')
     return tuple(found[query.number] for query in queries)
 
@@ -295,15 +356,15 @@ def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_
 def simulate_depths(centers: NDArray[np.float64], shapes: NDArray[np.float64],
                     map_from_camera: NDArray[np.float64], rng: np.random.Generator,
                     scale: float = 1.0) -> NDArray[np.float64]:
-    """Return the depths (m,) [m] that an RGB-D camera would measure in m boxes; NaN for none.
+    """Return the depths (m,) [m] that an RGB-D camera would measure in m boxes; NaN: no depth.
 
     Parameters
     ----------
     centers, shapes : ndarray (m, 3), (m, 6)
-        Ellipsoid of the object in each box, in the map; NaN for other things.
+        Ellipsoid of the object in each box, in the map; NaN: an object that is not in the map.
     map_from_camera : ndarray (4, 4)
     scale : float
-        Measured over true depth.
+        Ratio of measured and true depth.
     """
     camera_from_map = invert_transform(map_from_camera)
     rotation, translation = (np.ascontiguousarray(camera_from_map[:3, :3]),
@@ -321,7 +382,7 @@ def simulate_depths(centers: NDArray[np.float64], shapes: NDArray[np.float64],
 
 def _odometry(frames: Sequence[PosedQuery], noise_m: float, noise_deg: float,
               rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    """Return odom_from_camera (4, 4) of each frame, with a random error of each step."""
+    """Return odom_from_camera (4, 4) of each frame, with a random error in each step."""
     poses = [np.eye(4)]
     for before, after in pairwise(frames):
         step = invert_transform(before.map_from_camera) @ after.map_from_camera

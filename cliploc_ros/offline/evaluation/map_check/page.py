@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a check: figures as JSON, and a page with the main results first.
+"""Write the files of a check: figures as JSON, and a page with the main results first.
 
-Beside an advice are the room's own images: a landmark in its best view, or the nearest view.
+Each piece of advice has an image of the recording: the best view of a landmark, or the nearest
+view.
 """
 
 import json
@@ -33,15 +34,15 @@ GRADE_COLORS = {'faulty': html.MISLED, 'minor': html.REFUSED, 'sound': '#009E73'
 GRADE_NAMES = {'faulty': 'serious fault', 'minor': 'minor fault', 'sound': 'sound'}
 _MOST_LANDMARKS = 300
 _MOST_MATCHED = 12
-# Numbers and advice on the first screen.
+# Numbers of figures and of pieces of advice on the first screen.
 _NUMBERS, FIRST_ADVICE = 3, 3
-# How the names of figures for large type begin, the most telling first.
+# Beginnings of the names of figures in large type, the most important first.
 _TELLING = ('recorded frames accepted by', 'positions with a heading accepted',
             'views that mislead a robot', 'landmarks with a serious fault')
 
 
 def grade(landmark: LandmarkCheck) -> str:
-    """Return 'faulty', 'minor' or 'sound'."""
+    """Return the grade of a landmark: 'faulty', 'minor' or 'sound'."""
     if landmark.severity >= SERIOUS:
         return 'faulty'
     return 'minor' if landmark.faults else 'sound'
@@ -50,10 +51,10 @@ def grade(landmark: LandmarkCheck) -> str:
 def write_report(folder: Path, name: str, report: CheckReport,
                  pictures: Iterable[tuple[str, str, bytes]], views: ViewPainter | None = None
                  ) -> None:
-    """Write the page and the JSON file of a check of a named map, each in one step.
+    """Write the page and the JSON file of the check of a map, each atomically.
 
-    Pictures have a name, a caption and a PNG each; the first one is on the first screen. Views are
-    beside the advice. OptionsError: a file cannot be written; the old one stays.
+    `pictures` have a name, a caption and a PNG. The first picture is on the first screen. `views`
+    draws the images beside the advice. OptionsError: a file cannot be written; the old file stays.
     """
     data = _finite({'map': name, **report.as_dict()})
     write_text(folder / DATA, json.dumps(data, indent=1, allow_nan=False))
@@ -61,11 +62,11 @@ def write_report(folder: Path, name: str, report: CheckReport,
 
 
 def _finite(value: Any) -> Any:
-    """Return a tree with null for numbers that JSON does not have."""
+    """Return a JSON tree with None in place of numbers that are not finite."""
     if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -77,17 +78,18 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
                         if report.verdict == 'keyframes only' else
                         f'The map misses {missed} of {len(report.measures)} thresholds.',
                         report.passed)
-    said += html.items(f'Localized {one}' for one in report.carried)
-    told = [one for name in _TELLING for one in report.measures if one.name.startswith(name)
-            ][:_NUMBERS]
+    said += html.items(f'Localized {text}' for text in report.carried)
+    told = [measure for name in _TELLING for measure in report.measures
+            if measure.name.startswith(name)][:_NUMBERS]
     first, *others = (html.figure(png, caption, picture) for picture, caption, png in pictures)
-    cards = [_card(number, one, views) for number, one in enumerate(report.to_do, start=1)]
+    cards = [_card(number, advice, views) for number, advice in enumerate(report.to_do, start=1)]
     parts = [html.first_screen(
-        [said, html.tiles((one.show(one.value), one.name, not one.is_missed) for one in told),
+        [said, html.tiles((measure.show(measure.value), measure.name, not measure.is_missed)
+                          for measure in told),
          html.bars(_bar(measure) for measure in report.measures),
          '<h2>What to do first</h2>', *cards[:FIRST_ADVICE]], [first])]
-    if rest := cards[FIRST_ADVICE:]:
-        parts.append(html.fold(f'{len(rest)} more to do', *rest))
+    if later := cards[FIRST_ADVICE:]:
+        parts.append(html.fold(f'{len(later)} more to do', *later))
     faulty = sum(grade(landmark) == 'faulty' for landmark in report.landmarks)
     parts += [html.fold('All figures', html.table(('', ''), _figures(report))),
               html.fold('Pictures', *others),
@@ -101,12 +103,12 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
                  f'{fold.boxes.explained:.1%}', f'{fold.boxes.median_iou:.3f}')
                 for number, fold in enumerate(report.recording.folds, start=1)]
         parts += [html.fold('Held-out boxes', html.note(
-            'Blocks of time take turns in being judged; landmarks are fitted to the other '
-            'blocks.'), html.table(('#fold', '#frames', '#landmarks', '#boxes', '#explained',
-                                    '#median IoU'), rows)),
+            'The recording is split into blocks of time. The boxes of each block are compared '
+            'with landmarks that were fitted to the other blocks.'), html.table((
+                '#fold', '#frames', '#landmarks', '#boxes', '#explained', '#median IoU'), rows)),
                   html.fold('Systematic residuals', _corrections(report.recording))]
     return html.page(f'Check of {name}', *parts,
-                     html.fold('What these figures rest on', html.items(report.notes)))
+                     html.fold('How these figures were computed', html.items(report.notes)))
 
 
 def _card(number: int, advice: Advice, views: ViewPainter | None) -> str:
@@ -115,12 +117,13 @@ def _card(number: int, advice: Advice, views: ViewPainter | None) -> str:
     return html.card(text) if view is None else html.card(text, view.jpeg, view.caption)
 
 
-def _bar(one: Measure) -> html.Bar:
-    """Return the bar of a figure; a count's bar has room for its limit and one more."""
-    scale = max(one.limit + 1.0, one.value) if one.unit == 'count' else 1.0
-    word = 'at most' if one.is_most else 'at least'
-    return html.Bar(one.name, f'{one.show(one.value)} ({word} {one.show(one.limit)})',
-                    one.value / scale, one.limit / scale, not one.is_missed)
+def _bar(measure: Measure) -> html.Bar:
+    """Return the bar of a figure. That of a count ends at its limit plus one, or at its value."""
+    scale = max(measure.limit + 1.0, measure.value) if measure.unit == 'count' else 1.0
+    word = 'at most' if measure.is_most else 'at least'
+    return html.Bar(
+        measure.name, f'{measure.show(measure.value)} ({word} {measure.show(measure.limit)})',
+        measure.value / scale, measure.limit / scale, not measure.is_missed)
 
 
 def summary_lines(report: CheckReport) -> list[str]:
@@ -134,22 +137,24 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
             ('with a serious fault', f'{faulty} ({report.faulty:.0%})'),
             ('pairs of duplicates', str(report.duplicates)),
             ('pairs of places that look alike', str(len(report.look_alikes)))]
-    if (one := report.recording) is not None:
+    if (recording := report.recording) is not None:
         rows += [
-            ('recording', f'{one.frames} frames, {one.boxes} boxes, {one.duration_s:.0f} s'),
+            ('recording', f'{recording.frames} frames, {recording.boxes} boxes, '
+             f'{recording.duration_s:.0f} s'),
             ('explained boxes, median IoU; map as given',
-             f'{one.as_given.explained:.1%}, {one.as_given.median_iou:.3f} (too good if the map '
-             'was built from this recording)'),
+             f'{recording.as_given.explained:.1%}, {recording.as_given.median_iou:.3f} '
+             '(optimistic if the map was built from this recording)'),
             ('explained boxes, median IoU; held out',
-             f'{one.held_out.explained:.1%}, {one.held_out.median_iou:.3f}'),
-            (f'recorded frames, cross-validated, {report.evidence}', _verdicts(one.judged) + (
-                '' if len(one.judged) == len(one.trials) else
-                f'; of all {_verdicts(one.trials)}: no other part of the recording shows the '
-                'objects of the rest')),
-            *([('of these by objects alone', str(count_by_objects(one.judged)['accepted']))]
-              if any(trial.by_objects for trial in one.trials) else []),
-            ('the same poses with simulated boxes', _verdicts(one.simulated)),
-            ('noise of box edges', f'{one.edge_scale:.2f} times that assumed by build_map')]
+             f'{recording.held_out.explained:.1%}, {recording.held_out.median_iou:.3f}'),
+            (f'recorded frames, cross-validated, {report.evidence}',
+             _verdicts(recording.judged) + (
+                 '' if len(recording.judged) == len(recording.trials) else
+                 f'; of all frames {_verdicts(recording.trials)}: the objects of the others are '
+                 'in no other part of the recording')),
+            *([('of these by objects alone', str(count_by_objects(recording.judged)['accepted']))]
+              if any(trial.by_objects for trial in recording.trials) else []),
+            ('the same poses with simulated boxes', _verdicts(recording.simulated)),
+            ('noise of box edges', f'{recording.edge_scale:.2f} times that assumed by build_map')]
     if report.queries:
         rows.append(('queries with recorded similarities', _verdicts(report.queries)))
     near = ' near the recording' if report.recording else ''
@@ -179,51 +184,55 @@ def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
     head = ('landmark', 'label', 'faults', '#frames', '#seen [%]', '#baseline [°]',
             '#deviation [cm]', '#offset [cm]', '#IoU', '#thinness', 'overlaps with')
     rows: list[list[str | tuple[str, str]]] = []
-    for one in landmarks[:_MOST_LANDMARKS]:
-        support = '' if one.support is None else (
-            str(one.support) if one.expected is None else f'{one.support} of {one.expected}')
-        label = one.class_id if one.label == one.class_id else f'{one.label} ({one.class_id})'
-        numbers = [(one.seen_ratio, 100.0, 0), (one.baseline_deg, 1.0, 0),
-                   (one.position_sigma_m, 100.0, 1), (one.offset_m, 100.0, 1),
-                   (one.median_iou, 1.0, 2), (one.thinness, 1.0, 2)]
+    for check in landmarks[:_MOST_LANDMARKS]:
+        support = '' if check.support is None else (
+            str(check.support) if check.expected is None
+            else f'{check.support} of {check.expected}')
+        label = (check.class_id if check.label == check.class_id
+                 else f'{check.label} ({check.class_id})')
+        numbers = [(check.seen_ratio, 100.0, 0), (check.baseline_deg, 1.0, 0),
+                   (check.position_sigma_m, 100.0, 1), (check.offset_m, 100.0, 1),
+                   (check.median_iou, 1.0, 2), (check.thinness, 1.0, 2)]
         texts = [support, *('' if value is None else f'{value * factor:.{digits}f}'
                             for value, factor, digits in numbers)]
-        faults = '; '.join(one.faults) if one.faults else GRADE_NAMES['sound']
+        faults = '; '.join(check.faults) if check.faults else GRADE_NAMES['sound']
         rows.append([
-            (one.landmark_id, grade(one)), (label, 'text'), (faults, 'text'), *texts,
-            ', '.join(f'{name} ({distance:.2f})' for name, distance in one.overlaps)])
+            (check.landmark_id, grade(check)), (label, 'text'), (faults, 'text'), *texts,
+            ', '.join(f'{name} ({distance:.2f})' for name, distance in check.overlaps)])
     rest = len(landmarks) - _MOST_LANDMARKS
     more = html.note(f'and {rest} more in the JSON file') if rest > 0 else ''
     return html.table(head, rows) + more + html.note(
-        'frames: with the landmark, of those that should show it. seen: their share. baseline: '
-        'greatest angle between two views. deviation: of the centre on its worst axis. offset: '
-        'from the centre to where its boxes put it. IoU: median of its boxes. thinness: least by '
-        'greatest semi-axis. In brackets: the normalized distance of an overlap.')
+        'frames: frames that show the landmark, of the frames that should show it. seen: their '
+        'share. baseline: greatest angle between two views. deviation: standard deviation of the '
+        'centre on its worst axis. offset: distance of the centre from that of a fit to its '
+        'boxes. IoU: median over its boxes. thinness: least semi-axis divided by the greatest. In '
+        'brackets: normalized distance of overlapping landmarks.')
 
 
 def _look_alikes(report: CheckReport) -> str:
     rows = []
-    for number, one in enumerate(report.look_alikes, start=1):
-        pairs = ', '.join(f'{first} = {second}' for first, second in one.matched[:_MOST_MATCHED])
-        if len(one.matched) > _MOST_MATCHED:
-            pairs += f' and {len(one.matched) - _MOST_MATCHED} more'
-        rows.append((str(number), f'{one.first[0]:.1f}, {one.first[1]:.1f}',
-                     f'{one.second[0]:.1f}, {one.second[1]:.1f}', f'{one.turn_deg:.0f}',
-                     f'{len(one.matched)} of {one.landmarks}', str(one.same_labels), pairs))
+    for number, pair in enumerate(report.look_alikes, start=1):
+        pairs = ', '.join(f'{first} = {second}' for first, second in pair.matched[:_MOST_MATCHED])
+        if len(pair.matched) > _MOST_MATCHED:
+            pairs += f' and {len(pair.matched) - _MOST_MATCHED} more'
+        rows.append((str(number), f'{pair.first[0]:.1f}, {pair.first[1]:.1f}',
+                     f'{pair.second[0]:.1f}, {pair.second[1]:.1f}', f'{pair.turn_deg:.0f}',
+                     f'{len(pair.matched)} of {pair.landmarks}', str(pair.same_labels), pairs))
     return html.table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#landmarks alike',
                        '#with equal labels', 'which'), rows)
 
 
 def _corrections(recording: RecordingCheck) -> str:
     if not recording.corrections:
-        return html.note('Too few boxes to tell.')
+        return html.note('There are too few boxes to estimate corrections.')
     rows = [(correction.cause, correction.name, f'{correction.value:+.2f} {correction.unit}',
              f'{correction.deviation:.2f} {correction.unit}', f'{correction.effect_px:.1f}',
              f'{correction.explained:.1%}', '' if not correction.is_significant else (
-                 'may follow from the cause that explains most' if correction.follows
+                 'may follow from the strongest cause' if correction.follows
                  else 'significant'))
             for correction in recording.corrections]
-    return (html.note('The correction that fits the edges of the boxes best, each cause on its '
-                      'own. A turned mount and a shifted principal point look much the same.')
+    return (html.note('The correction that fits the edges of the boxes best, estimated for each '
+                      'cause alone. A turned mount and a shifted principal point have much the '
+                      'same effect.')
             + html.table(('cause', 'what', '#correction', '#deviation', '#effect [px]',
                           '#cost that the cause explains', ''), rows))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of a check: the map from above with landmarks, grid and recorded frames."""
+"""Draw the pictures of a check: the map from above with landmarks, grid and recorded frames."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -38,40 +38,41 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
                   ) -> Iterator[tuple[str, str, bytes]]:
     """Yield the name, the caption and the PNG of each picture."""
     canvas = _Canvas(landmark_map, report)
-    yield ('grid', 'Expected relocalization from above. A cell is a camera position: its shade '
-           'is the share of headings with three or more detectable landmarks that give a right, '
-           'accepted pose. Ticks point where the camera looked when a wrong pose was accepted. '
-           'Positions inside of a landmark, and beyond all objects, are left out. Numbers '
-           'are those of the advice.', png_of(_grid_figure(canvas), _DPI))
+    yield ('grid', 'Expected relocalization from above. A cell is a camera position. Its shade '
+           'is the share of headings with a correct, accepted pose, of those with three or more '
+           'detectable landmarks. Ticks show the headings at which a wrong pose was accepted. '
+           'Positions inside landmarks and beyond all objects are left out. Numbers refer to the '
+           'advice.', png_of(_grid_figure(canvas), _DPI))
     if report.recording is not None and report.recording.trials:
         yield ('frames', 'Recorded frames, each relocalized in a map that was fitted without '
-               'frames of that time. The dot is the camera, the wedge where it looks. Times '
-               'are those of the longest runs of refused frames.',
+               'frames of that time. The dot is the camera, the wedge its heading. Times '
+               'mark the longest runs of refused frames.',
                png_of(_frames_figure(canvas, report.recording.trials), _DPI))
-        yield ('time', 'The same frames over time: how many landmarks of the map the detector '
-               'found, and the verdict.', png_of(_time_figure(report.recording.trials), _DPI))
-    yield ('landmarks', 'The landmarks from above. Names are those of landmarks with a fault; '
-           'where these are many, with a serious one.', png_of(_landmarks_figure(canvas), _DPI))
+        yield ('time', 'The same frames over time: the number of mapped landmarks that were '
+               'detected, and the verdict.', png_of(_time_figure(report.recording.trials), _DPI))
+    yield ('landmarks', 'The landmarks from above. Landmarks with a fault are named, or only '
+           'those with a serious fault if there are many.',
+           png_of(_landmarks_figure(canvas), _DPI))
     if report.look_alikes:
         yield ('look_alikes', 'Places that look alike, joined in pairs.',
                png_of(_look_alikes_figure(canvas), _DPI))
 
 
 class _Canvas:
-    """Makes figures of the map from above, all with the same bounds."""
+    """Makes figures of the map from above, which have the same bounds."""
 
     def __init__(self, landmark_map: LandmarkMap, report: CheckReport):
         self.map, self.report = landmark_map, report
         grid, half = report.grid.positions[:, :2], report.grid.spacing_m / 2
         self.path = None if report.recording is None else report.recording.path_xyz[:, :2]
-        #: (P,): the positions to draw. Beyond the objects and the path there may be walls.
+        #: (P,): the grid positions to draw. Beyond the objects and the path there may be walls.
         self.shown = np.ones(len(grid), dtype=np.bool_)
         points = [landmark_map.centers[:, :2]]
         if self.path is not None:
             points.append(self.path)
             hull = cv2.convexHull(np.concatenate(points).astype(np.float32))
             self.shown = report.grid.is_near | np.array([
-                cv2.pointPolygonTest(hull, one, False) > 0 for one in grid.tolist()])
+                cv2.pointPolygonTest(hull, position, False) > 0 for position in grid.tolist()])
         every = np.concatenate([*points, grid[self.shown] - half, grid[self.shown] + half])
         self._low = every.min(axis=0) - _MARGIN_M
         self._high = every.max(axis=0) + _MARGIN_M
@@ -80,14 +81,14 @@ class _Canvas:
 
     def figure(self, title: str, face: str | Sequence[str], alpha: float = 0.35
                ) -> tuple[Figure, Axes]:
-        """Return a figure with the landmarks in equal scales, and room for a legend below."""
+        """Return a figure with the landmarks, equal scales, and room for a legend below."""
         width, height = (self._high - self._low) * _LARGEST_IN / self.size
         figure = Figure(figsize=(max(6.5, width + 1.6), max(4.0, height + 1.6)),
                         layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1))
         axes = figure.add_subplot()
         axes.set(xlim=(self._low[0], self._high[0]), ylim=(self._low[1], self._high[1]),
                  aspect='equal')
-        # a frame_id is any text, also one that mathtext refuses
+        # a frame_id may be text that mathtext refuses
         axes.set_xlabel(f'x in {self.map.frame_id} [m]', parse_math=False)
         axes.set_ylabel(f'y in {self.map.frame_id} [m]', parse_math=False)
         axes.set_title(title, fontsize=12)
@@ -133,9 +134,9 @@ def _grid_figure(canvas: _Canvas) -> Figure:
                            label='path of the recording'),
                     Patch(facecolor='white', edgecolor='#555555', label='near the recording')]
     wrong = [trial for trial in grid.trials if trial.verdict == 'misled']
-    for one in wrong:
-        x, y = one.position[:2]
-        ahead = one.forward[:2] / max(float(np.linalg.norm(one.forward[:2])), 1e-9)
+    for trial in wrong:
+        x, y = trial.position[:2]
+        ahead = trial.forward[:2] / max(float(np.linalg.norm(trial.forward[:2])), 1e-9)
         dx, dy = 0.45 * side * ahead
         axes.plot([x, x + dx], [y, y + dy], color=html.MISLED, linewidth=2.5, zorder=7,
                   path_effects=EDGED)
@@ -160,18 +161,19 @@ def _grid_figure(canvas: _Canvas) -> Figure:
 def _frames_figure(canvas: _Canvas, trials: Sequence[Trial]) -> Figure:
     figure, axes = canvas.figure('Recorded frames, cross-validated', '#BBBBBB')
     size = 0.035 * canvas.size
-    for one in trials:
-        ahead, tip, color = one.forward[:2], one.position[:2], page.VERDICT_COLORS[one.verdict]
-        side, is_refused = np.array([-ahead[1], ahead[0]]) * 0.5, one.verdict == 'refused'
+    for trial in trials:
+        ahead, tip = trial.forward[:2], trial.position[:2]
+        color, is_refused = page.VERDICT_COLORS[trial.verdict], trial.verdict == 'refused'
+        side = np.array([-ahead[1], ahead[0]]) * 0.5
         axes.add_patch(Polygon(
             [tip, tip + size * (ahead + side), tip + size * (ahead - side)], closed=True,
             facecolor=to_rgba(color, 0.0 if is_refused else 0.3), edgecolor=color,
             linewidth=1.0, zorder=5))
         axes.plot(tip[0], tip[1], marker='s' if is_refused else 'o', color=color, markersize=4,
                   zorder=6)
-        if one.verdict == 'misled' and one.estimate is not None:
-            axes.plot([tip[0], one.estimate[0]], [tip[1], one.estimate[1]], color=html.MISLED,
-                      linewidth=1.5, zorder=7)
+        if trial.verdict == 'misled' and trial.estimate is not None:
+            axes.plot([tip[0], trial.estimate[0]], [tip[1], trial.estimate[1]],
+                      color=html.MISLED, linewidth=1.5, zorder=7)
     first = trials[0].stamp_s or 0.0
     for run in [run for run in refused_spans(trials) if len(run) > 1][:8]:
         middle = run[len(run) // 2]
@@ -201,7 +203,7 @@ def _time_figure(trials: Sequence[Trial]) -> Figure:
             'facecolor': 'white' if verdict == 'refused' else color,
             'hatch': '////' if verdict == 'refused' else None}
         axes.bar(stamps[chosen], counts[chosen], width=width, **style)
-        # a patch of its own, since bars that are missing give the legend no colour
+        # a separate patch, since missing bars give the legend no colour
         handles.append(Patch(label=f'{verdict} ({chosen.sum()})', **style))
         none = chosen & (counts == 0)
         axes.plot(stamps[none], np.zeros(none.sum()), 'x', color=color, clip_on=False, zorder=5)
@@ -218,9 +220,9 @@ def _landmarks_figure(canvas: _Canvas) -> Figure:
     figure, axes = canvas.figure('Landmarks', colors, alpha=0.6)
     named = [check for check in checks if check.faults]
     if len(named) > _MOST_NAMES:
-        named = [one for one in named if page.grade(one) == 'faulty'][:_MOST_NAMES]
-    for one in named:
-        write_name(axes, one.center[:2], one.landmark_id)
+        named = [check for check in named if page.grade(check) == 'faulty'][:_MOST_NAMES]
+    for check in named:
+        write_name(axes, check.center[:2], check.landmark_id)
     if canvas.path is not None:
         axes.plot(*canvas.path.T, color=html.FAINT, linewidth=0.8, zorder=2)
     counts = Counter(grades.values())
@@ -232,14 +234,14 @@ def _landmarks_figure(canvas: _Canvas) -> Figure:
 
 def _look_alikes_figure(canvas: _Canvas) -> Figure:
     figure, axes = canvas.figure('Places that look alike', '#BBBBBB')
-    for number, one in enumerate(canvas.report.look_alikes[:_MOST_LOOK_ALIKES], start=1):
-        for letter, place in (('a', one.first), ('b', one.second)):
+    for number, pair in enumerate(canvas.report.look_alikes[:_MOST_LOOK_ALIKES], start=1):
+        for letter, place in (('a', pair.first), ('b', pair.second)):
             axes.add_patch(Circle(place[:2], RADIUS_M, fill=False, edgecolor=page.LOOK_ALIKE,
                                   linewidth=1.8, zorder=5))
             axes.text(place[0], place[1] + 0.8 * RADIUS_M, f'{number}{letter}', fontsize=11,
                       fontweight='bold', color=INK, ha='center', va='center', zorder=9,
                       path_effects=EDGED, clip_on=True)
-        axes.plot([one.first[0], one.second[0]], [one.first[1], one.second[1]],
+        axes.plot([pair.first[0], pair.second[0]], [pair.first[1], pair.second[1]],
                   color=page.LOOK_ALIKE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4)
     _add_legend(figure, [
         Line2D([], [], color=page.LOOK_ALIKE, marker='o', markersize=12, markerfacecolor='none',

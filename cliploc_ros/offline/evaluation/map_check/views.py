@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The room's own images beside an advice: a landmark in its best view, or the nearest view."""
+"""Draw images of the recording beside advice: the best view of a landmark, or the nearest view."""
 
 from collections.abc import Callable, Iterator
 from functools import cached_property
@@ -21,12 +21,13 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.sightings import find_sightings, outlines_in_view
 from cliploc_ros.offline.mapping.views import make_views
 
-#: Returns the image (h, w, 3), red first, of a time [s] and a camera, as a pinhole shows it.
+#: Returns the undistorted image (h, w, 3), RGB, at a time [s], of a named camera; None: there is
+#: none. The camera is the pinhole camera of the image.
 ReadImage = Callable[[float, str, Camera], NDArray[np.uint8] | None]
-# A picture of a landmark is this many times as large as it.
+# Height of a picture of a landmark, in sizes of the landmark.
 _AROUND = 3.0
-# An angle that makes a view as different as a metre does [deg]; what is the same view, and a view
-# that is too different [m].
+# Angle that makes a view as different as 1 m does [deg]; greatest difference of equal views, and
+# of views that are similar enough [m].
 _DEGREES_PER_M, _SAME, _MOST_DIFFERENT = 30.0, 0.1, 3.0
 _WIDTH_PX, _JPEG_QUALITY = 480, 75
 _BOX_RGB, _OUTLINE_RGB = (255, 255, 255), (230, 159, 0)
@@ -46,7 +47,7 @@ class ViewPainter:
         self._map, self._detections, self._read = landmark_map, detections, read
 
     def of(self, advice: Advice) -> Picture | None:
-        """Return the view that shows best what an advice is about; None if there is none."""
+        """Return the view that shows best what the advice is about; None: no view shows it."""
         if advice.landmarks:
             rows = [self._map.landmark_ids.index(landmark) for landmark in advice.landmarks]
             words = 'outlined: ' + ' and '.join(advice.landmarks)
@@ -71,7 +72,7 @@ class ViewPainter:
             landmarks_of_map(self._map, self._detections.class_names)), len(self._map))
 
     def _near(self, view: Trial) -> Iterator[tuple[int, str]]:
-        """Yield the frames near to a view, the nearest first, and how far they are off."""
+        """Yield the frames near a view, the nearest first, and captions with their distance."""
         poses = self._detections.map_from_camera
         far_m = np.linalg.norm(poses[:, :3, 3] - view.position, axis=1)
         off_deg = np.degrees(np.arccos(np.clip(poses[:, :3, 2] @ view.forward, -1.0, 1.0)))
@@ -86,7 +87,7 @@ class ViewPainter:
             *self._detections.frame_offsets[frame:frame + 2])]
 
     def _draw(self, frame: int, rows: list[int]) -> bytes | None:
-        """Return a JPEG with the boxes of a frame, and with outlines; None without its image."""
+        """Return a JPEG of a frame with its boxes and outlines of landmarks; None: no image."""
         camera = self._detections.camera_of(frame)
         image = self._read(float(self._detections.stamps_s[frame]),
                            self._detections.name_of(frame), camera)
@@ -96,7 +97,7 @@ class ViewPainter:
                                     self._map.shapes[rows])
         corner, size = np.zeros(2), np.array([camera.width, camera.height], dtype=np.float64)
         if rows:
-            # a part of the image, in which a small landmark is to be seen
+            # crop the image, so that a small landmark is visible
             left, top, right, bottom = ellipse_bboxes(outlines[:1])[0]
             part = float(np.clip(_AROUND * max(right - left, bottom - top) / size[1], 0.3, 1.0))
             corner = np.clip(np.array([left + right, top + bottom]) / 2 - part * size / 2, 0.0,
