@@ -36,7 +36,7 @@ def test_every_page_is_there_and_in_the_menu(site):
 
 def test_the_reference_has_the_docstrings(site):
     text = (site / 'library.html').read_text()
-    assert 'Find where the camera was when it saw the last of some frames.' in text
+    assert 'Find the pose of the camera at the last of one or more frames.' in text
     assert 'id="cliploc_ros.core.relocalizer.Relocalizer.relocalize"' in text
 
 

@@ -127,7 +127,7 @@ def test_a_label_of_another_class_is_a_fault(label, class_id, other):
     ids = ('cup', class_id, 'book', *TABLE.class_ids[3:])
     named = replace(TABLE, class_ids=ids, labels=('a cup', label, 'a book', *TABLE.labels[3:]))
     faults = {one.landmark_id: one.faults for one in check_landmarks(named, None, [])}
-    assert [f"'{label}', a {other} by" in fault for fault in faults.pop(TABLE.landmark_ids[1])
+    assert [f"is labelled '{label}', which names a {other}," in fault for fault in faults.pop(TABLE.landmark_ids[1])
             ] == [True] * (other is not None)
     assert not any(faults.values())
 
