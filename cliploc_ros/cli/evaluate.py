@@ -276,19 +276,14 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
 
 
 def _hash(path: str | Path) -> str:
-    """Return 12 digits of the SHA-256 of a file, or of the files in a folder.
-
-    For a folder, `find -L FOLDER -type f | LC_ALL=C sort | xargs cat | sha256sum` prints the same.
-    """
-    digest = hashlib.sha256()
-    files = sorted((folder / name for folder, _, names in Path(path).walk(follow_symlinks=True)
-                    for name in names), key=str)
-    for file in files or [Path(path)]:
-        if file.is_file():
-            with file.open('rb') as content:
-                while block := content.read(2**20):
-                    digest.update(block)
-    return digest.hexdigest()[:12]
+    """Return 12 digits of the SHA-256 of a file; of a folder, of the names and sizes in it."""
+    path = Path(path)
+    if path.is_file():
+        with path.open('rb') as content:
+            return hashlib.file_digest(content, 'sha256').hexdigest()[:12]
+    listing = ''.join(sorted(f'{file.relative_to(path)} {file.stat().st_size}\n'
+                             for file in path.rglob('*') if file.is_file()))
+    return hashlib.sha256(listing.encode()).hexdigest()[:12]
 
 
 def _notes_on_detector(queries: 'Sequence[PosedQuery]', landmark_map: 'LandmarkMap') -> list[str]:
