@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo: a robot wakes up in a synthetic room, and the whole system runs.
 
-``python -m demo`` runs it, from the root of the repository; it is not installed. ``demo.world``
-built the room and trained the networks in ``assets``.
+Run it with ``python -m demo`` from the root of the repository; it is not installed. The programs
+in ``demo.world`` built the room and trained the networks in ``assets``.
 """
 
 from pathlib import Path

@@ -78,7 +78,7 @@ def record(folder: Path, room: Room, renderer: Renderer, poses: npt.NDArray[np.f
 
 
 def _with_progress(poses: npt.NDArray[np.float64], what: str) -> Iterable[Any]:
-    """Return poses with a progress bar, unless this is one of several processes."""
+    """Return poses with a progress bar, except in a worker process."""
     is_worker = multiprocessing.parent_process() is not None
     return tqdm(poses, what, unit='image', disable=is_worker or None)
 
@@ -130,7 +130,7 @@ def write_true_map(path: Path, room: Room) -> None:
 
 def write_fitted_map(path: Path, room: Room, renderer: Renderer,
                      poses: npt.NDArray[np.float64], *, seed: int) -> None:
-    """Write a map as a mapping run makes it: ellipsoids fitted to the boxes of many views.
+    """Write a map with ellipsoids fitted to the boxes of many views, as in a mapping run.
 
     The fit uses views that show an object whole and hardly covered, with boxes perturbed by a
     pixel like a detector's. An object with fewer than three such views keeps its exact ellipsoid.
@@ -163,7 +163,7 @@ def _fit(entry: dict[str, Any], views: Sequence[tuple[npt.NDArray[np.float64], .
         conics = np.concatenate([project_ellipsoids(pose, x[None, :3], shape) for pose in poses])
         # An ellipsoid that reaches the camera has no outline: a large finite residual.
         outlines = np.nan_to_num(ellipse_bboxes(ellipses_in_pixels(conics, CAMERA)), nan=1e4)
-        # Views from one side leave the depth undetermined: then the prior decides.
+        # Views from one side leave the depth undetermined; the prior then determines it.
         return np.concatenate([(outlines - bboxes).ravel(), (x - start) / _USUAL_SPREAD])
 
     found = least_squares(residuals, start, loss='soft_l1', f_scale=3.0).x

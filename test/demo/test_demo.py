@@ -88,7 +88,7 @@ def test_four_cameras_need_not_turn(tmp_path):
     print(output)
     accepted, places, *alone = run_of_page('--cameras 4')
     assert f'{places:.0f} wake-ups: {accepted:.0f} accepted, 0 refused, none wrong' in output
-    assert any(f'4 cameras; with the first of them alone, {number:.0f} of {places:.0f} would be '
+    assert any(f'4 cameras; with the first camera alone, {number:.0f} of {places:.0f} would be '
                'accepted' in output for number in alone)
     page = (tmp_path / 'index.html').read_text()
     assert page.count(', 4 cameras') == places
