@@ -208,7 +208,7 @@ def _say_plan(names: Sequence[str], sources: Sources, out: Path) -> None:
     print('Differences from the paper:', *(f'\n  {line}' for line in sources.remarks), flush=True)
     if free < room:
         raise OptionsError(f'the disk of {out} has {free / 1e3:.1f} GB left, {room / 1e3:.1f} GB '
-                           'are needed: free some space, or set --out to another disk')
+                           'are needed: make room, or set --out to another disk')
 
 
 def _is_agreed() -> bool:
@@ -303,7 +303,7 @@ def unpacked(recording: Recording, folder: Path, out: Path) -> Path:
                                'different file, and was removed; run again to download it'
                                ) from error
         except OSError as error:
-            raise DatasetError(f'{staging} cannot be written: {error.strerror}; free some space, '
+            raise DatasetError(f'{staging} cannot be written: {error.strerror}; make room, '
                                f'then {_AGAIN}') from error
         staging.rename(frames)
     for sequence in (frames, *sorted(path for path in frames.rglob('*') if path.is_dir())):

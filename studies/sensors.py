@@ -3,8 +3,8 @@
 """Measure errors of real wheel odometry, IMUs and accelerometers: ``python -m studies.sensors``.
 
 Wheels are compared with the gyroscope, the orientation of an IMU with its acceleration over
-seconds, and an accelerometer with motion capture. The verticals are
-those of the relocalizer's ``gravity: imu``.
+seconds, and an accelerometer with motion capture. The verticals are those of the relocalizer's
+``gravity: imu``.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``build_map --bag --cameras``: the demo's rig, four cameras at six places, in one recording."""
+"""Test ``build_map --bag --cameras`` with the demo's rig: four cameras at six places."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def bag(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def built(bag):
-    """Return the files of maps: from all cameras, whose poses are in tf, and from one."""
+    """Return the files of two maps: from all cameras, with poses in tf, and from one camera."""
     paths = {}
     for names in (ALL, ('back',)):
         paths[names] = path = bag.with_name(f'{len(names)}.yaml')
@@ -42,7 +42,7 @@ def built(bag):
 
 
 def errors_of(path):
-    """Return how far each landmark is from the nearest true object of its class [m]."""
+    """Return the distance of each landmark to the nearest true object of its class [m]."""
     found, objects = LandmarkMap.from_file(path), read_objects(RIG / 'front')
     return np.array([min(np.linalg.norm(one.center - center) for one in objects
                          if one.class_id == name)

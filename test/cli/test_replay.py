@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executables tum_to_bag and replay: real recordings, processes and listening nodes."""
+"""Test the executables tum_to_bag and replay with real recordings, processes and nodes."""
 
 import os
 import signal
@@ -51,7 +51,7 @@ def recorded(path):
 
 
 def offset_ms(data):
-    """Return how long after the recording's start a received pose is [ms]."""
+    """Return the stamp of a received pose relative to the recording's start [ms]."""
     return (bag_messages.stamp_ns(deserialize_message(data, PoseStamped)) - START_NS) / MS
 
 
@@ -96,7 +96,7 @@ def test_qos_is_as_recorded(tmp_path, listener, start):
         (endpoint,) = endpoints(name)
         assert endpoint.qos_profile.reliability == reliability, name
         assert endpoint.qos_profile.durability == durability, name
-    # The first message is sent; a late subscriber still receives the latched ones.
+    # The first message has been sent; a late subscriber still receives the latched messages.
     late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     listener.listen('/map', PoseStamped, late)
     listener.listen('/latched', PoseStamped, late)
@@ -150,7 +150,7 @@ def test_start_offset_sends_what_is_latched_first(tmp_path, listener):
 
 
 def stop(process, number):
-    """Signal a process; expect it to end cleanly within 2 s."""
+    """Signal a process; expect it to exit cleanly within 2 s."""
     begin = time.monotonic()
     process.send_signal(number)
     output, errors = process.communicate(timeout=10)
@@ -216,7 +216,7 @@ print('received', flush=True)
 
 @pytest.fixture
 def subscriber():
-    """Start a reliable subscriber of /pose in a process of its own."""
+    """Start a reliable subscriber of /pose in a separate process."""
     process = subprocess.Popen([sys.executable, '-c', SUBSCRIBER], stdout=subprocess.PIPE,
                                text=True)
     assert process.stdout.readline() == 'ready\n'

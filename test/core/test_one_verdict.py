@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One verdict from objects and keyframes: which pose leads, and what either cannot override."""
+"""One verdict from objects and keyframes: which pose leads, and what neither can override."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def moved(x, pose=MAP_FROM_CAMERA):
 
 
 def place(x=0.0, inliers=200, confirmed=0.9, reach=1.0, **fields):
-    """Points all over the middle of the image, a share of its width and height."""
+    """Return points over the middle of the image, within a share of its width and height."""
     rng, size = np.random.default_rng(0), np.array([CAMERA.width, CAMERA.height])
     pixels = size * (0.5 + reach * rng.uniform(-0.55, 0.55, (inliers, 2)))
     return RecognizedPlace(moved(x), FINE, 0.5 * FINE, inliers, confirmed, 0.9, (40, 44),
@@ -80,7 +80,7 @@ def test_many_points_accept_what_objects_could_not():
 
 
 def test_points_of_a_thorough_search_count_less():
-    """It finds several times as many, and so do things that look alike."""
+    """The thorough pass finds several times as many points, and so do places that look alike."""
     fast, thorough = (ask(Says(place(3.0, inliers=50, confirmed=0.5, is_thorough=one)), objects=0)
                       for one in (False, True))
     assert fast.accepted and not thorough.accepted
@@ -173,7 +173,7 @@ def test_a_picture_refuses_the_objects_in_it_too():
 
 
 def two_rooms(lacking=0):
-    """The room and a copy of it 20 m away, without some of its objects."""
+    """Return the room and a copy of it 20 m away, without some of its objects."""
     return doubled_room(np.array([20.0, 0.0, 0.0])).select(range(2 * len(ROOM) - lacking))
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Several cameras of one robot, which look at one instant in different directions."""
+"""Several cameras of one robot, which look in different directions at the same instant."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def test_together_they_see_enough(rng):
 
 
 def test_cameras_of_one_instant_have_no_odometry_between_them(rng):
-    """Whatever their names say, equal names are frames of one camera that moved."""
+    """Frames with equal names are from one camera that moved."""
     relocalizer = Relocalizer(MAP, replace(OPTIONS, mount_deviation=(0.0, 0.0)))
     frames = look(rng, objects=5)
     rigid, moving = (relocalizer.relocalize([replace(frame, camera_name=name) for frame, name in
@@ -103,7 +103,7 @@ def test_a_camera_that_contradicts_the_others_is_named(rng, turned_deg, objects,
     (5, 4, 1, 2, [])])
 def test_a_mount_is_judged_by_what_the_other_cameras_match(rng, instants, objects, matched, others,
                                                            wrong):
-    """Too few instants, too few objects, half of them matched; where others miss half, too."""
+    """Too few instants or objects, half of the objects matched, or other cameras miss half too."""
     check = CameraCheck()
     for _ in range(instants):
         check.add_instant(look(rng), [objects] * 4, [others, matched, others, others])
@@ -120,7 +120,7 @@ def test_a_covered_camera_has_no_wrong_mount(rng):
 
 
 def test_a_map_that_is_out_of_date_is_not_blamed_on_a_mount(rng):
-    """All objects have swapped places. No pose is accepted, so no mount is judged by one."""
+    """All objects have swapped places. No pose is accepted, so no mount is judged."""
     exchanged = replace(MAP, centers=MAP.centers[np.random.default_rng(0).permutation(len(MAP))])
     localizer = Localizer(Relocalizer(exchanged, OPTIONS))
     for _ in range(10):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings: written and read back, of several files, compressed, damaged."""
+"""Recordings: write and read back; split, compressed and damaged files."""
 
 import numpy as np
 import pytest
@@ -26,13 +26,13 @@ from cliploc_ros.offline.datasets.bags import (
 from cliploc_ros.ros.conversions import pose_from_msg
 
 STRING = 'std_msgs/msg/String'
-# From ROS's own generator, not computed here.
+# Hashes from ROS's generator, not computed here.
 STRING_HASH = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
 QOS = {'/chatter': RELIABLE_QOS, '/robot_description': LATCHED_QOS, '/status': RELIABLE_QOS}
 
 
 def make_messages(count):
-    """Three topics in turn, the third with the stamp of the second."""
+    """Yield messages of three topics in turn, the third with the stamp of the second."""
     text = typestore().types[STRING]
     return [BagMessage([*QOS][number % 3], 10**18 + (number - (number % 3 == 2)) * 100_000_001,
                        bytes(typestore().serialize_cdr(text(f'message {number}'), STRING)))
@@ -203,7 +203,7 @@ def test_failure_leaves_nothing(tmp_path, plugin):
     with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', plugin) as bag:
         bag.add_topic('/pose', bag_messages.POSE)
         bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
-        assert not (tmp_path / 'bag').exists()  # built beside its final path
+        assert not (tmp_path / 'bag').exists()  # written beside its final path
         assert len(list(tmp_path.iterdir())) == 1
         _ = 1 / 0
     assert list(tmp_path.iterdir()) == []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of other systems: what is read, what is left out, and what is refused."""
+"""Maps of other systems: what is read, left out and refused."""
 
 import json
 from dataclasses import replace
@@ -109,7 +109,7 @@ def test_oaslam_saved_map(true_map, tmp_path):
 
 
 def test_msgloc(true_map, tmp_path):
-    """Quaternions are w, x, y, z, signs of radii mean nothing, and shares are not likelihoods."""
+    """Quaternions are w, x, y, z; signs of radii mean nothing; shares are not likelihoods."""
     imported = import_all(read_msgloc(write(tmp_path / 'm.json', msgloc_text(true_map)), COCO))
     check_equal(imported, true_map)
     assert imported.landmark_map.details[1].class_weights == (('book', 0.75), ('vase', 0.25))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo as a user runs it, to its end or to Ctrl-C."""
+"""Run the demo as a user does, to its end or to Ctrl-C."""
 
 import os
 import re
@@ -81,7 +81,7 @@ def test_a_disk_that_fills_up_is_named_in_one_line(tmp_path):
                     done.stderr.splitlines()[-1]), done.stderr
 
 
-@pytest.mark.clock  # the request takes the cameras whose images come in time
+@pytest.mark.clock  # a request uses the cameras whose images arrive in time
 def test_four_cameras_need_not_turn(tmp_path):
     code, output, errors = run('--out', tmp_path, '--cameras', 4)
     assert code == 0, errors
@@ -98,7 +98,7 @@ def test_four_cameras_need_not_turn(tmp_path):
     assert height > 0.7 * width, 'two rows of two images'
 
 
-@pytest.mark.clock  # a busy machine leaves looks out
+@pytest.mark.clock  # a busy machine skips looks
 def test_a_kidnapped_robot_is_noticed_stops_and_gets_its_pose_back(tmp_path):
     code, output, errors = run('--out', tmp_path, '--kidnapped', '--method',
                                'class_auto')
@@ -139,7 +139,7 @@ def test_the_page_shows_all_and_says_what_it_does_not(finished):
 
 @pytest.fixture(scope='module')
 def mapped(tmp_path_factory):
-    """Run the demo with a map of its own; return the folder of its pictures and its output."""
+    """Run the demo with a map that it builds; return the folder of its pictures and its output."""
     out = tmp_path_factory.mktemp('demo') / 'mapped'
     code, output, errors = run('--out', out, '--map', '--wake-ups', 1)
     assert code == 0, errors

@@ -20,7 +20,7 @@ NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip
 
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
-    """The demo's walk, and maps: its floor, the same again, and the same objects elsewhere."""
+    """Return the demo's walk, and maps: its floor, an equal floor, and the objects elsewhere."""
     folder = tmp_path_factory.mktemp('floors')
     shutil.copytree(ASSETS / 'sequence', folder / 'sequence')
     true = LandmarkMap.from_file(ASSETS / 'map.yaml')

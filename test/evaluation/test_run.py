@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of methods: on any number of processes, broken off and resumed; their names and figures."""
+"""Runs of methods: with several processes, interrupted and resumed; their names and numbers."""
 
 import csv
 import multiprocessing
@@ -91,7 +91,7 @@ def test_trials_differ_and_repeat(results, room, questions, methods):
 
 def test_workers_do_not_matter_and_get_the_queries_once(results, room, questions, methods):
     class Counted(list):
-        """Queries that count how often they are sent."""
+        """Queries that count how often they are pickled."""
 
         def __reduce__(self):
             sent.append(1)
@@ -155,7 +155,7 @@ def test_an_unfinished_run_goes_on_if_it_is_the_same(results, tmp_path):
 
 
 def test_crops_on_demand_are_a_part_of_all(room, questions):
-    """The last one sees twelve objects: its classes suffice. The first one sees two."""
+    """The last query sees twelve objects, so classes suffice; the first query sees two."""
     options = replace(PAPER, iterations=2000)
     found = {crops: run_methods(room, parse_methods(['auto'], replace(options, crops=crops),
                                                     len(room)), questions, trials=1)
@@ -267,7 +267,7 @@ def test_precision_and_recall():
 
 
 def test_the_interval_of_the_precision_counts_queries():
-    """Trials of one query are not independent, so more trials do not narrow it."""
+    """Trials of one query are not independent, so more trials do not narrow the interval."""
     once = make_summary([0.1] * 10, accepted=[True] * 10)
     often = make_summary([[0.1] * 10] * 5, accepted=[[True] * 10] * 5)
     assert once.precision_interval() == (pytest.approx(0.722, abs=1e-3), 1.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the check of a map finds, on a simulated walk whose landmarks are known."""
+"""Findings of the check of a map, on a simulated walk with known landmarks."""
 
 import json
 import re
@@ -65,7 +65,7 @@ def report(detections):
 
 @pytest.fixture(scope='module')
 def rooms_report():
-    """Of two identical rooms, 10 m apart."""
+    """Return a map of two identical rooms, 10 m apart."""
     other = replace(TABLE, centers=TABLE.centers + np.array([10.0, 0.0, 0.0]))
     return check_map(join_maps(TABLE, other), options=QUICK)
 
@@ -133,7 +133,7 @@ def test_a_label_of_another_class_is_a_fault(label, class_id, other):
 
 
 def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detections):
-    """The image cuts them on three sides: they fit a landmark anywhere along their rays."""
+    """The image cuts three sides of the boxes, so they fit anywhere along their rays."""
     _, witness = witness_of(TABLE, detections)
     own = np.nonzero(witness.shown == 4)[0]
     boxes = detections.bboxes_xyxy.copy()
@@ -152,7 +152,7 @@ def test_a_shifted_landmark_is_told_its_offset(detections):
     assert worst.landmark_id == 'thing_4'
     assert worst.offset_m == pytest.approx(0.12, abs=0.01)
     assert any('is 12 cm away' in fault for fault in worst.faults)
-    # how uncertain a map is, it says itself
+    # a map states how uncertain it is
     sure = replace(shifted, details=(LandmarkDetails(position_sigma=0.07),) * len(TABLE))
     assert {one.position_sigma_m for one in check_landmarks(sure, witness, [])} == {0.07}
 
@@ -232,7 +232,7 @@ def mount(x=0.0, roll=0.0):
      'stamps of the images', -200.0, 5.0),
 ], ids=['focal length', 'principal point', 'mount', 'roll', 'stamps'])
 def test_systematic_errors_are_measured(spoil, name, value, tolerance):
-    # back on another circle: on one circle, a late clock looks like a turned table
+    # back on another circle: on a single circle, a late clock looks like a turned table
     poses = [walk_around(frames=60), walk_around(frames=60, radius=1.6)[::-1]]
     spoilt = spoil(see(TABLE, np.concatenate(poses), noise_px=1.0))
     views, witness = witness_of(TABLE, spoilt)
@@ -240,10 +240,10 @@ def test_systematic_errors_are_measured(spoil, name, value, tolerance):
                                                        witness.shown)}
     assert found[name].is_significant
     assert found[name].value == pytest.approx(value, abs=tolerance)
-    # one sensor is blamed, whatever else fits better with its error
+    # one sensor is blamed, whatever else its error would fit better
     assert len({one.cause for one in found.values()
                 if one.is_significant and not one.follows}) == 1
-    # a turned mount and a shifted principal point look much the same
+    # a turned mount looks almost like a shifted principal point
     assert found[name].explained > 0.8 * max(one.explained for one in found.values())
 
 
@@ -258,13 +258,13 @@ def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
     of_bare = [trial for trial in trials if trial.stamp_s in bare_stamps]
     assert of_bare
     assert {one.verdict for one in of_bare} == {'refused'}
-    # the other parts tell nothing of the map there
+    # the other parts have no information on the map there
     assert all(trial.is_judged == (trial.stamp_s not in bare_stamps) for trial in trials)
     assert any(trial.verdict == 'accepted' for trial in trials)
 
 
 def test_a_walk_that_passes_each_object_once_is_judged_by_what_it_can_tell():
-    # each object is detected in one block of 4 s only, so that no other block knows it
+    # each object is detected in one block of 4 s only, so no other block knows it
     detections = see(TABLE, walk_around(frames=120))
     _, witness = witness_of(TABLE, detections)
     once = detections.select_boxes(witness.shown % 6 == detections.frames // 20)
@@ -272,7 +272,7 @@ def test_a_walk_that_passes_each_object_once_is_judged_by_what_it_can_tell():
     assert not report.recording.can_judge_boxes
     assert not any(text.startswith('held-out') for text in report.failures)
     assert any('cannot judge boxes' in note for note in report.notes)
-    # a landmark at a wrong place explains none of its boxes, and is seen as such
+    # a landmark at a wrong place explains none of its boxes, and is reported
     moved = replace(TABLE, centers=TABLE.centers + np.array([0.4, 0.0, 0.0]))
     wrong = check_map(moved, detections, options=QUICK)
     assert wrong.recording.can_judge_boxes and not wrong.passed
@@ -368,7 +368,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     named = replace(doubled, frame_id=hostile, labels=(hostile, *doubled.labels[1:]),
                     landmark_ids=(hostile, *doubled.landmark_ids[1:]))
     report = check_map(named, detections, options=QUICK)
-    shown = [0.0, 9.8]  # the images that are at hand
+    shown = [0.0, 9.8]  # the images that are available
 
     def read(stamp_s, camera, pinhole):
         return np.full((480, 640, 3), 128, np.uint8) if min(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Networks by OWNER/NAME from a model hub on this machine: once, whole, and without a network."""
+"""Networks by OWNER/NAME from a local model hub: downloaded once, completely, and used offline."""
 
 import hashlib
 import http.server
@@ -33,7 +33,7 @@ else:
 
 
 class Hub(http.server.BaseHTTPRequestHandler):
-    """The part of a model hub that a download needs."""
+    """The parts of a model hub that a download needs."""
 
     files: dict[str, bytes]
     #: What is sent in place of a file

@@ -18,7 +18,7 @@ from cliploc_ros.ros.conversions import detections_to_msg
 
 BASE_FROM_CAMERA = [float(number) for mount in MOUNTS for number in (
     *mount[:3, 3], *Rotation.from_matrix(mount[:3, :3]).as_quat())]
-# The clock of a camera that has none [s].
+# Clock offset of an unsynchronized camera [s].
 NEVER = 1000.0
 
 
@@ -36,7 +36,7 @@ def cases(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def four_cameras(start_shared, tester, surroundings_map, cases):
-    """Start a relocalizer; return it, and what asks while some cameras publish."""
+    """Start a relocalizer; return it, and a function that requests while some cameras publish."""
     publishers = {name: {kind: tester.create_publisher(kind, f'{name}/{topic}', RELIABLE)
                          for kind, topic in ((CameraInfo, 'camera_info'), (Image, 'image'),
                                              (Detection2DArray, 'detections'))} for name in NAMES}
@@ -128,13 +128,13 @@ def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, wor
 
 @pytest.mark.full
 def test_one_detector_serves_all_cameras_in_turn(start, tester):
-    """With one network: images of one instant, more of them than it can look at."""
+    """With one network, images of the same instant, more than it can process."""
     process = start('nodes.detector', parameters={
         'model': PROJECT / 'demo/assets/yolo.onnx', 'cameras': list(NAMES)})
     process.wait_for_output('ready after')
     publishers = {name: tester.create_publisher(Image, f'{name}/image', RELIABLE)
                   for name in NAMES}
-    heard = {name: [] for name in NAMES[:3]}  # nobody listens to the last one
+    heard = {name: [] for name in NAMES[:3]}  # the last topic has no subscriber
     subscriptions = [tester.create_subscription(Detection2DArray, f'{name}/detections',
                                                 heard[name].append, 10) for name in heard]
     sent = 0

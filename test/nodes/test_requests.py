@@ -34,7 +34,7 @@ def test_a_request_is_answered_with_a_pose(relocalizer, tester):
 
 
 def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
-    """The client of the documents; ~/answer tells the same to those who come later."""
+    """The documented client; ~/answer gives the same answer to late subscribers."""
     page = (PROJECT / 'doc/interface.md').read_text()
     client = subprocess.Popen(
         [sys.executable, '-c', re.search('```python\n(import rclpy.*?)```', page, re.DOTALL)[1]],
@@ -101,5 +101,5 @@ def test_requests_that_wait_together_reset_the_localizer_once(relocalizer, teste
     tester.feed_until(lambda: all(future.done() for future in futures), make_frame())
     assert all(future.result().success for future in futures)
     tester.wait(lambda: tester.initial_poses, 'an initial pose')
-    # those that came after the frame was taken ask for a newer one, together
+    # requests after the frame was taken share a newer frame
     assert len(tester.initial_poses) <= 3

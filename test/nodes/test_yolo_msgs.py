@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Detections of yolo_ros: yolo_msgs where it is installed, a clear message where it is not."""
+"""Detections of yolo_ros: yolo_msgs if it is installed, otherwise a clear message."""
 
 import os
 from types import SimpleNamespace as Fields

@@ -65,14 +65,14 @@ def test_boxes_beyond_all_measure_do_no_harm(room, found):
 
 
 def layer_of(room, **images):
-    """One keyframe with the camera's size, and ten points along its middle row."""
+    """Return one keyframe with the camera's size, and ten points along its middle row."""
     pixels = np.column_stack([np.linspace(50, 590, 10), np.full(10, 240.0)])
     return replace(make_layer(room, keyframes=1, points=10),
                    pixels=(16 * pixels).astype(np.uint16), **images)
 
 
 def recognized(found):
-    """Answer by five of the points, which the image shows 100 px further up."""
+    """Answer from five of the points, which are 100 px further up in the image."""
     pixels = np.column_stack([np.linspace(50, 290, 5), np.full(5, 140.0)])
     seen = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 5, 0.8, 0.8, keyframes=(0,),
                            pixels=pixels, rows=np.arange(5))

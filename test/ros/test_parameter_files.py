@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files of several robots: a node's own ones, as ROS itself gives them to it."""
+"""Parameter files of several robots: a node gets the same parameters as from ROS."""
 
 import pytest
 import yaml

@@ -33,7 +33,7 @@ S = 1_000_000_000
 
 
 class Simulation:
-    """A node in simulated time, and what publishes /clock."""
+    """A node in simulated time, and a publisher of /clock."""
 
     def __init__(self, make_node, spin_until):
         self.node = make_node(parameter_overrides=[Parameter('use_sim_time', value=True)])
@@ -45,7 +45,7 @@ class Simulation:
         self._spin_until([self.node, self.world], condition, what, work)
 
     def set_time(self, *moments):
-        """Publish each time [s] until the node's clock shows it."""
+        """Publish each time [s] until the node's clock has it."""
         for seconds in moments:
             message = Clock(clock=stamp(seconds))
             self.spin_until(lambda m=message: self.node.get_clock().now().to_msg() == m.clock,
@@ -59,7 +59,7 @@ def simulation(make_node, spin_until):
 
 @pytest.fixture
 def jumps(simulation):
-    """Watch the simulation's clock; its attribute forgot counts."""
+    """Watch the simulated clock; the attribute forgot counts."""
     forgot = []
     jumps = TimeJumps(simulation.node, lambda: forgot.append(simulation.node.get_clock().now()))
     jumps.forgot = forgot
@@ -136,7 +136,7 @@ PARAMETERS = RelocalizerParameters(base_frame='base_link', tf_timeout_s=0.0, gra
 
 
 class Inputs:
-    """Everything that the relocalizer listens to, and a robot that publishes it."""
+    """All topics that the relocalizer subscribes to, and a robot that publishes them."""
 
     def __init__(self, simulation):
         node = simulation.node
@@ -175,7 +175,7 @@ class Inputs:
             self._publishers[message_type].publish(message)
 
     def pair(self, simulation, stamp_s, *message_types):
-        """Publish parts of a frame until they wait for the others."""
+        """Publish parts of a frame until they wait for the other parts."""
         heard = self.frames._pairing.last_stamp_ns
         names = {Image: 'image', CameraInfo: 'camera_info', Detection2DArray: 'detections'}
         for one in message_types:
@@ -183,7 +183,7 @@ class Inputs:
                                   names[one], lambda t=one: self.publish(stamp_s, t))
 
     def run(self, stamp_s):
-        """Return which run of odometry covers a time."""
+        """Return the run of odometry that covers a time."""
         return self.odometry.pose_at(stamp(stamp_s)).run
 
     def up(self, stamp_s):
@@ -205,9 +205,9 @@ def test_what_was_heard_before_a_jump_is_forgotten(simulation, restart_s):
     simulation.spin_until(lambda: inputs.is_known(100.0), 'odometry and vertical',
                           lambda: inputs.publish(100.0, Odometry, Imu))
     run = inputs.run(100.0)
-    # The boxes of an image that was lost: the same stamp comes again.
+    # The boxes of a lost image: the same stamp comes again.
     inputs.pair(simulation, restart_s, Detection2DArray, CameraInfo)
-    inputs.pair(simulation, 98.0, Detection2DArray, CameraInfo)  # no copies are on their way now
+    inputs.pair(simulation, 98.0, Detection2DArray, CameraInfo)  # no copies are in transit now
     simulation.set_time(restart_s)
     assert not inputs.is_known(100.0)
     inputs.pair(simulation, restart_s, Image)
@@ -238,7 +238,7 @@ def test_streams_have_stamps_of_their_own_until_one_jumps():
     assert order_of(100.0, order=order, stream='odom') == [False]
     assert order_of(5.0, 6.0, order=order, stream='arm') == [False, False]
     assert order_of(50.0, order=order, stream='odom') == [True]
-    # All are forgotten by one: the other is not taken for another jump.
+    # One jump resets all of them: it is not counted twice.
     assert order_of(1.0, order=order, stream='arm') == [False]
     order.clear()
     assert order_of(1.0, order=order, stream='odom') == [False]
@@ -253,7 +253,7 @@ def test_a_stamp_that_is_no_time(given, problem):
 
 
 def named(*messages, stamps=None):
-    """Take in stamps and contents, .1 s apart; return which are named, and the stamps."""
+    """Feed stamps and contents, .1 s apart; return the reported ones, and the stamps."""
     stamps = stamps or MessageStamps()
     return [stamps.add(stamp(one), content, 500.0 + 0.1 * number)
             for number, (one, content) in enumerate(messages)], stamps

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Real odometry, IMUs and accelerometers beside the deviations that are assumed of them."""
+"""Real odometry, IMUs and accelerometers compared with the assumed deviations."""
 
 import re
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps, detections and sensors go wrong as said, and the study counts every request."""
+"""Errors of maps, detections and sensors are applied as described; every request counts."""
 
 from dataclasses import replace
 

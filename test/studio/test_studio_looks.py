@@ -18,7 +18,7 @@ from cliploc_ros.errors import MapError
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 
-IDS = ('plant_1', 'gone_1', 'cup_1', 'book_1')  # not in the map's order, and one too many
+IDS = ('plant_1', 'gone_1', 'cup_1', 'book_1')  # not in the map's order, with one extra
 SIZE = 16
 
 
@@ -39,7 +39,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def rows(path):
-    """Mean and medoids by landmark, as they were at first."""
+    """Return the original mean and medoids by landmark."""
     return rows_of(path)
 
 
@@ -60,7 +60,7 @@ def change_all(document):
 
 
 def check_all(path, rows):
-    """A merged landmark has the mean by support, each half the whole's rows, a new one none."""
+    """A merged landmark has the weighted mean, each half the original rows, a new one none."""
     found = rows_of(path)
     assert sorted(found) == ['book_1', 'cup_1', 'plant_1', 'plant_2']
     mean = rows['cup_1'][0].astype(float) + 3.0 * rows['book_1'][0].astype(float)

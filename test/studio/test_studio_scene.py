@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The studio's scene: surfaces, walls, labels, colours, and where a person looks from."""
+"""The studio's scene: surfaces, walls, labels, colours, and the viewpoint of a person."""
 
 import io
 from contextlib import redirect_stdout
@@ -45,7 +45,7 @@ def studio(tmp_path):
 
 
 def test_depth_becomes_a_cloud_below_the_ceiling():
-    """A wall 2 m ahead, red at its left, of a camera 1 m above the floor at x = 3."""
+    """Return a wall 2 m ahead, red on the left, of a camera 1 m above the floor at x = 3."""
     image = np.zeros((48, 64, 3), dtype=np.uint8)
     image[:, :32, 0] = 200
     depth = DepthImage(np.full((48, 64), 2.0, dtype=np.float32))
@@ -100,7 +100,7 @@ def test_walls_lie_where_the_grid_has_them(server, yaw):
 
 
 def test_other_answers_take_the_place_of_the_first_ones(server, studio, recwarn):
-    """Viser warns of a node that went with its parent."""
+    """Viser warns of a node that was removed with its parent."""
     layers = Layers(server.scene)
     for view in (0, 5):
         layers.show('Answers', studio.recording.relocalize(
