@@ -413,8 +413,8 @@ class Judge:
     def run(self) -> None:
         """Try all faults, distributed over the workers."""
         started = [_start(partial(self._outcomes, part)) for part in self._parts]
-        for one in started:
-            self.outcomes += _finish(*one)
+        for process in started:
+            self.outcomes += _finish(*process)
 
     def _outcomes(self, mutants: Sequence[Mutant]) -> list[Outcome]:
         return [self._outcome(mutant) for mutant in mutants]
@@ -461,8 +461,8 @@ class Judge:
     def _plant(self, mutant: Mutant) -> None:
         """Replace the code of a function by the code with a fault."""
         assert mutant.function is not None
-        faulty = next(one for one in _codes_of(planted(mutant)[0])
-                      if (one.co_name, one.co_firstlineno) == mutant.function)
+        faulty = next(code for code in _codes_of(planted(mutant)[0])
+                      if (code.co_name, code.co_firstlineno) == mutant.function)
         for function in self._functions[str(PROJECT / mutant.file), *mutant.function]:
             function.__code__ = faulty
 
@@ -553,11 +553,12 @@ def _judge_functions(mutants: Sequence[Mutant], tests: Tests, workers: int) -> l
 def report(outcomes: Sequence[Outcome]) -> str:
     """Return a table by folder, and the faults that no test detected."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
-    for one in outcomes:
-        folder = str(Path(one.mutant.file).parent.relative_to(PACKAGE))
+    for outcome in outcomes:
+        folder = str(Path(outcome.mutant.file).parent.relative_to(PACKAGE))
         for row in {folder, f'{folder.split("/")[0]}, all', 'all',
-                    'kernels' if one.mutant.is_compiled else 'Python'}:
-            counts[row]['killed' if one.killer else 'survived' if one.tests else 'not run'] += 1
+                    'kernels' if outcome.mutant.is_compiled else 'Python'}:
+            counts[row]['killed' if outcome.killer else
+                        'survived' if outcome.tests else 'not run'] += 1
     text = f'{"folder":28}{"killed":>8}{"survived":>10}{"not run":>9}{"share":>7}\n'
     for row, its in sorted(counts.items()):
         text += (f'{row:28}{its["killed"]:8}{its["survived"]:10}{its["not run"]:9}'

@@ -50,8 +50,8 @@ def test_extras_are_what_the_tests_run_with(extras):
     """Each extra has the versions of script/requirements*.txt, with an upper bound."""
     required = ''.join(read(f'script/requirements{part}.txt')
                        for part in ('', '-models', '-test', '-all'))
-    assert {one for extra in extras.values() for one in extra} <= set(required.splitlines())
-    assert all('<' in one or '==' in one for one in extras['all'])
+    assert {name for extra in extras.values() for name in extra} <= set(required.splitlines())
+    assert all('<' in pin or '==' in pin for pin in extras['all'])
 
 
 @pytest.mark.parametrize(('lock', 'files'), [
@@ -78,5 +78,6 @@ def test_container_and_setup_install_the_locks():
     assert 'pip install --no-cache-dir --require-hashes' in read('docker/Dockerfile')
     assert '"$root/script/lock/$kind.txt" --require-hashes' in read('script/common.bash')
     workflow = yaml.safe_load(read('.github/workflows/release.yml'))
-    steps = ' '.join(one.get('run', '') for one in workflow['jobs']['bill-of-materials']['steps'])
+    steps = ' '.join(step.get('run', '')
+                     for step in workflow['jobs']['bill-of-materials']['steps'])
     assert 'cyclonedx-py" requirements' in steps and 'script/lock' in steps

@@ -44,8 +44,8 @@ def built(bag):
 def errors_of(path):
     """Return the distance of each landmark to the nearest true object of its class [m]."""
     found, objects = LandmarkMap.from_file(path), read_objects(RIG / 'front')
-    return np.array([min(np.linalg.norm(one.center - center) for one in objects
-                         if one.class_id == name)
+    return np.array([min(np.linalg.norm(item.center - center) for item in objects
+                         if item.class_id == name)
                      for center, name in zip(found.centers, found.class_ids, strict=True)])
 
 
@@ -61,7 +61,7 @@ def test_the_observations_keep_cameras_and_poses(built):
     recorded = load_observations(built[ALL].with_suffix('.npz'))
     assert recorded.camera_names == ALL
     assert np.bincount(recorded.frame_cameras).tolist() == [6] * 4
-    assert [(one.width, one.fx) for one in recorded.cameras] == [
+    assert [(camera.width, camera.fx) for camera in recorded.cameras] == [
         (640, 500.0), (320, 250.0), (640, 500.0), (640, 500.0)]
     for frame in range(24):
         truth = read_tum(RIG / recorded.name_of(frame)).pose_at(

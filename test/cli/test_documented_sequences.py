@@ -106,8 +106,8 @@ def documented(pages):
     """Return the commands that make, check or open the map of a drive, without duplicates."""
     found = []
     for page in pages:
-        for one in commands_of(page):
-            module, arguments = program_of(one)
+        for command in commands_of(page):
+            module, arguments = program_of(command)
             name = module.rpartition('.')[2]
             if (name in ('build_map', 'check_map', 'studio') and not OTHER & {*arguments}
                     and ('drive' in arguments or (name != 'build_map'
@@ -117,7 +117,7 @@ def documented(pages):
 
 
 FIRST, *ON_PAGE = documented(PAGES[:1])
-ELSEWHERE = [one for one in documented(PAGES) if one not in (FIRST, *ON_PAGE)]
+ELSEWHERE = [command for command in documented(PAGES) if command not in (FIRST, *ON_PAGE)]
 
 
 @BOTH
@@ -157,8 +157,8 @@ def test_the_nodes_answer_as_the_page_says(built, monkeypatch):
     monkeypatch.chdir(folder)
     processes = []
     try:
-        for one in commands_of(PAGES[0]):
-            module, arguments = program_of(one)
+        for command in commands_of(PAGES[0]):
+            module, arguments = program_of(command)
             name = module.rpartition('.')[2]
             words = [sys.executable, '-m', module, *arguments]
             if name in ('detector', 'relocalizer'):

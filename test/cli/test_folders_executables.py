@@ -61,7 +61,7 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     assert '12 of 12 images' in capsys.readouterr().out
     accepted = [trial for trial in json.loads((tmp_path / 'out/results.json').read_text())
                 if trial['accepted']]
-    assert len(accepted) > 4 and max(one['error_m'] for one in accepted) < 0.5
+    assert len(accepted) > 4 and max(result['error_m'] for result in accepted) < 0.5
 
     studio = open_studio(make_parser().parse_args([str(built), '--images', str(walk)]))
     try:

@@ -40,5 +40,5 @@ def test_options_that_are_numbers_refuse_nan_and_infinity(program):
     ('evaluate', '--max-gap'), ('evaluate', '--seed'), ('import_map', '--scale'),
     ('tum_to_bag', '--every')])
 def test_what_is_counted_or_measured_is_not_negative(program, name):
-    action = next(one for one in options_of(program) if name in one.option_strings)
+    action = next(action for action in options_of(program) if name in action.option_strings)
     assert takes(action, '2') and not takes(action, '-1')

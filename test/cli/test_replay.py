@@ -68,7 +68,8 @@ def test_real_frames_arrive_byte_identical(shared_data, tmp_path, listener, stor
         listener.listen(topic, CLASSES[topic])
     done = run('replay', bag, '--rate', 16, '--wait-for-subscribers')
     assert done.returncode == 0, done.stderr
-    wait_until(lambda: all(len(listener.received[one]) == len(expected[one]) for one in expected))
+    wait_until(lambda: all(len(listener.received[topic]) == len(expected[topic])
+                           for topic in expected))
     for topic, messages in expected.items():
         for received, sent in zip(listener.received[topic], messages, strict=True):
             # RTPS pads a payload to a multiple of four bytes
@@ -173,7 +174,7 @@ def test_signal_ends_a_long_pause(tmp_path, start, listener, number):
 def assert_refused(done, *messages):
     assert done.returncode == 1
     *before, line = done.stderr.splitlines()
-    assert all('[rcl]' in one for one in before)  # rcl logs the error too
+    assert all('[rcl]' in line for line in before)  # rcl logs the error too
     assert line.startswith('error: ')
     for message in messages:
         assert message in line

@@ -52,7 +52,7 @@ def query(rng, noise_px=1.0, pose=None):
 
 
 def localized(localizer, queries):
-    return [localizer.answer(Query((one.observation,), run=None)) for one in queries]
+    return [localizer.answer(Query((query.observation,), run=None)) for query in queries]
 
 
 def matches(boxes, map_from_camera):
@@ -119,10 +119,10 @@ WRONG = {
 def test_a_wrong_camera_is_refused_with_the_cause(what, rng):
     localizer = Localizer(RELOCALIZER)
     found = localized(localizer, WRONG[what]([query(rng) for _ in range(LOOKS)]))
-    wrong = [one.refusal_kind is RefusalKind.WRONG_CAMERA for one in found]
-    refused = [not one.accepted for one in found]
+    wrong = [result.refusal_kind is RefusalKind.WRONG_CAMERA for result in found]
+    refused = [not result.accepted for result in found]
     assert all(refused[LOOKS // 2:])
-    assert sum(wrong[LOOKS // 2:]) > 0 or not any(one.accepted for one in found)
+    assert sum(wrong[LOOKS // 2:]) > 0 or not any(result.accepted for result in found)
 
 
 def test_looks_from_one_view_count_once(rng):
@@ -144,7 +144,7 @@ def test_a_mended_camera_is_accepted_again(mended, rng):
     assert localizer.cameras.faults
     found = localized(localizer, [query(rng) for _ in range(LOOKS)])
     assert localizer.cameras.faults == []
-    accepted = [one.accepted for one in found]
+    accepted = [result.accepted for result in found]
     assert all(accepted if mended == 'camera_info' else accepted[LOOKS // 2:])
 
 

@@ -147,7 +147,7 @@ def test_cameras_that_no_image_has(changes, verdict):
 def test_recorded_cameras_are_sound(shared_data):
     cameras = [*PRESETS.values(), *map(read_camera, shared_data.glob('**/camera.json'))]
     assert len(cameras) >= 7
-    assert [camera_faults(one) for one in cameras] == [()] * len(cameras)
+    assert [camera_faults(camera) for camera in cameras] == [()] * len(cameras)
 
 
 def test_the_field_of_view_is_that_of_the_lens():

@@ -365,20 +365,20 @@ def places_of(*rows):
                                     np.arange(sum(counts)), np.zeros(sum(counts), np.float32))
     look_at = localization._Look(features, bearings, LENS)
     found = localization._places(localization._place(matched, look_at), matched, look_at)
-    return found, sorted(np.round([one.map_from_camera[0, 3] - pose[0, 3] for one in found]))
+    return found, sorted(np.round([place.map_from_camera[0, 3] - pose[0, 3] for place in found]))
 
 
 def test_of_equal_rooms_each_is_a_place_of_its_own():
     found, at_m = places_of(MANY, MANY, MANY)
     assert at_m == [0.0, 10.0, 20.0]
-    assert [one.agreed for one in found] == [40, 40, 40]
+    assert [place.agreed for place in found] == [40, 40, 40]
     most = localization.MOST_PLACES
     assert len(places_of(*[MANY] * (most + 2))[0]) == most
 
 
 def test_few_features_are_a_place_where_there_is_no_other():
     """Points of two keyframes count once."""
-    assert [one.agreed for one in places_of(WEAK)[0]] == [LEAST_INLIERS - 2]
+    assert [place.agreed for place in places_of(WEAK)[0]] == [LEAST_INLIERS - 2]
     assert places_of(MANY, WEAK)[1] == [0.0]
     assert places_of(MANY, MANY[:LEAST_INLIERS + 2])[1] == [0.0, 10.0]
 

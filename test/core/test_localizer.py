@@ -50,7 +50,7 @@ class Window:
         new = frame(seconds, degrees, metres, detections)
         earlier, anchor = instants_to_fuse(self.frames, new, limit, length_s)
         self.frames = [*earlier, KeptInstant((RELOCALIZER.search(new),), anchor)]
-        return [one.stamp_ns / 1e9 for one in self.frames]
+        return [frame.stamp_ns / 1e9 for frame in self.frames]
 
 
 @pytest.fixture
@@ -337,7 +337,7 @@ def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
     shares = [[0, 4, 8], [3, 7], [2, 11, 9], [1, 5]]
     frames = [see(room, pose, rows) for pose, rows in zip(walk, shares, strict=True)]
     relocalizer = Relocalizer(room, OPTIONS)
-    assert not any(relocalizer.relocalize([one]).accepted for one in frames)
+    assert not any(relocalizer.relocalize([frame]).accepted for frame in frames)
     found = relocalizer.relocalize(frames)
     assert found.accepted, found.reason
     assert pose_error(found.map_from_camera, walk[-1]) < (0.01, 0.2)
@@ -345,7 +345,8 @@ def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
     assert [match.detection for match in found.matches] == [0, 1]
     assert [match.landmark for match in found.matches] == shares[-1]
     # with a known vertical, two objects suffice to check their camera
-    upright = relocalizer.relocalize([knowing_up(*one) for one in zip(frames, walk, strict=True)])
+    upright = relocalizer.relocalize([knowing_up(frame, pose)
+                                      for frame, pose in zip(frames, walk, strict=True)])
     assert (len(found.cameras), len(upright.cameras)) == (2, 4)
 
 

@@ -149,17 +149,17 @@ def test_two_identical_rooms_are_refused_until_labels_differ():
     relocalizer = Relocalizer(doubled_room(shift_along(10.0)),
                               RelocalizerOptions(min_confidence=0.99))
     found = [relocalizer.relocalize([seen(differing)]) for differing in (0, 1, 2, 6)]
-    assert [one.accepted for one in found] == [False, False, False, True]
+    assert [result.accepted for result in found] == [False, False, False, True]
     first = found[0]
     assert first.evidence.distinct == pytest.approx(0.5, abs=0.01)
     places = sorted([first.evidence.place[0], first.evidence.twin[0]])
     assert places == pytest.approx([0.3, 10.3], abs=0.05)
     for x_m in places:
         assert f'({x_m:.1f}, ' in first.reason
-    distinct = [one.evidence.distinct for one in found]
+    distinct = [result.evidence.distinct for result in found]
     assert distinct == sorted(distinct)
-    for one in found[1:]:
-        assert pose_error(one.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+    for result in found[1:]:
+        assert pose_error(result.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
 
 
 @pytest.mark.parametrize('offset_m', [0.0, 0.01])

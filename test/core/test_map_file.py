@@ -338,7 +338,7 @@ def floor(name, seed=0):
 
 
 def join(*maps):
-    return join_maps(maps, [f'{one.frame_id}.yaml' for one in maps])
+    return join_maps(maps, [f'{landmark_map.frame_id}.yaml' for landmark_map in maps])
 
 
 def localize(landmark_map, seen, options=OPTIONS, similarities=None):

@@ -80,7 +80,7 @@ def test_each_stage_has_more_crops_and_the_last_one_all():
 def test_crops_end_when_there_is_no_room():
     rooms = iter([3, 0])
     stages = searches(Crops(lambda rows: SURE[rows], room=lambda: next(rooms)))
-    assert [len(one.compared) for one in stages] == [0, 3]
+    assert [len(stage.compared) for stage in stages] == [0, 3]
     none = Observation(CAMERA, SEEN.select(np.array([], dtype=np.int64)))
     (stage,) = searches(Crops(lambda rows: SURE[rows]), none)
     assert len(stage.compared) == 0

@@ -81,8 +81,8 @@ def test_many_points_accept_what_objects_could_not():
 
 def test_points_of_a_thorough_search_count_less():
     """The thorough pass finds several times as many points, and so do places that look alike."""
-    fast, thorough = (ask(Says(place(3.0, inliers=50, confirmed=0.5, is_thorough=one)), objects=0)
-                      for one in (False, True))
+    fast, thorough = (ask(Says(place(3.0, inliers=50, confirmed=0.5, is_thorough=is_thorough)),
+                          objects=0) for is_thorough in (False, True))
     assert fast.accepted and not thorough.accepted
     assert ask(Says(place(3.0, is_thorough=True)), objects=0).accepted, 'enough of them do'
 
@@ -93,7 +93,7 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     assert strong.source == weak.source == 'both'
     assert error_m(strong, 0.05) < 1e-12
     assert error_m(weak) < 0.02, 'a few points hardly move the pose of objects'
-    assert [len(one.cameras) for one in (strong, weak)] == [0, 1], \
+    assert [len(seen.cameras) for seen in (strong, weak)] == [0, 1], \
         'only a pose that rests on boxes checks their camera'
     points = ask(Says(place(0.05, inliers=9)), objects=0)
     assert weak.evidence.by_points <= points.evidence.by_points, 'objects say no more for points'
@@ -133,9 +133,10 @@ def test_a_place_that_moves_otherwise_than_odometry_says_is_no_room():
     second = replace(first, stamp_ns=10, odom_from_camera=moved(0.3, np.eye(4)))
     looks = Looks().with_look(Look(first, MAP_FROM_CAMERA, 0.99, place()), accepted=True)
     relocalizer = Relocalizer(ROOM, OPTIONS)
-    found = [relocalizer.locate([relocalizer.search(one)], looks=looks, recognizer=Says(place()))
-             for one in (second, replace(second, odom_from_camera=np.eye(4)))]
-    assert [one.accepted for one in found] == [False, True]
+    found = [relocalizer.locate([relocalizer.search(observation)], looks=looks,
+                                recognizer=Says(place()))
+             for observation in (second, replace(second, odom_from_camera=np.eye(4)))]
+    assert [result.accepted for result in found] == [False, True]
 
 
 @pytest.mark.parametrize('inliers', [60, 400])

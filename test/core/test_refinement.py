@@ -156,11 +156,11 @@ def test_the_score_is_the_sum_of_the_frames_scores(room, walk, rng):
     for pose in walk:  # the rig moves rigidly
         moved = walk[-1] @ shift @ invert_transform(walk[-1]) @ pose
         alone.append(verify(scene_of(room, pose), *split(moved)))
-    assert min(one.score for one in alone) > 1.0
+    assert min(result.score for result in alone) > 1.0
     found = verify_rig(rig, *split(walk[-1] @ shift))
-    assert found.score == pytest.approx(sum(one.score for one in alone), abs=1e-9)
+    assert found.score == pytest.approx(sum(result.score for result in alone), abs=1e-9)
     np.testing.assert_array_equal(found.landmarks,
-                                  np.concatenate([one.landmarks for one in alone]))
+                                  np.concatenate([result.landmarks for result in alone]))
     np.testing.assert_allclose(found.ious, np.concatenate([one.ious for one in alone]), atol=1e-9)
 
 
@@ -329,7 +329,7 @@ def test_a_map_states_what_its_landmarks_share():
     assert not stated.shared_sigmas[1:].any()
     frame = Observation(CAMERA, Detections(boxes_at(MAP_FROM_CAMERA), ROOM.class_ids,
                                            np.ones(len(ROOM))))
-    plain, shared = (Relocalizer(one, BY_CLASS).relocalize([frame]).covariance for one in (
+    plain, shared = (Relocalizer(each, BY_CLASS).relocalize([frame]).covariance for each in (
         ROOM, replace(ROOM, details=(stated.details[0],) * len(ROOM))))
     # the covariance does not shrink with the number of landmarks
     np.testing.assert_allclose(np.diag(shared - plain), [0.01] * 3 + [np.radians(3.0) ** 2] * 3,

@@ -232,11 +232,11 @@ def test_leaders_are_those_of_scoring_every_sample(scene, rng):
     (Constraint(tuple(-UP_IN_CAMERA), tuple(UP_IN_MAP), max_tilt=radians(10)), False),
 ])
 def test_a_constraint_rules_poses_out(scene, constraint, remains):
-    search = (search_exhaustively, lambda *given: search_progressively(
+    searches = (search_exhaustively, lambda *given: search_progressively(
         scene, compatible_pairs(scene), *given[1:]))
-    for one in search:
+    for search in searches:
         leaders = Leaders.none_yet()
-        *_, progress = one(scene, leaders, constraint)
+        *_, progress = search(scene, leaders, constraint)
         assert progress.coverage == 1.0
         near = False
         for row in leaders.ranked():

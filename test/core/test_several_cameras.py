@@ -57,10 +57,11 @@ def test_the_covariance_holds_the_errors_of_mounts(rng):
             np.radians(deviation[1]) * rng.normal(size=3)).as_matrix(),
             deviation[0] * rng.normal(size=3)) for mount in MOUNTS[:-1]]
         frames = look(rng, objects=5, mounts=[*wrong, MOUNTS[-1]])
-        found = [one.relocalize(frames) for one in (stated, ignored)]
-        if all(pose_error(one.map_from_camera, MOUNTS[-1])[0] < 1.0 for one in found):
-            squares.append([normalized_square(one.map_from_camera, one.covariance, MOUNTS[-1])
-                            for one in found])
+        found = [relocalizer.relocalize(frames) for relocalizer in (stated, ignored)]
+        if all(pose_error(result.map_from_camera, MOUNTS[-1])[0] < 1.0 for result in found):
+            squares.append([
+                normalized_square(result.map_from_camera, result.covariance, MOUNTS[-1])
+                for result in found])
     within = (np.array(squares) < chi2.ppf(0.95, 6)).mean(axis=0)
     print(f'\n{len(squares)} poses, in the 95 % ellipsoids: stated {within[0]:.2f}, ignored '
           f'{within[1]:.2f}')

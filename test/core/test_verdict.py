@@ -206,9 +206,9 @@ def test_the_likeliest_hypothesis_leads_and_without_refinement_the_greatest_scor
     differ = 0
     for frame in list(queries.main_frames())[:20:4]:
         found = likeliest.relocalize([observe(frame)]).hypotheses
-        worth = utilities([one.support for one in found])
+        worth = utilities([pose.support for pose in found])
         assert (np.diff(worth) <= 0.0).all()
-        scores = [one.score for one in found]
+        scores = [pose.score for pose in found]
         differ += scores != sorted(scores, reverse=True)
         scores = [one.score for one in greatest.relocalize([observe(frame)]).hypotheses]
         assert scores == sorted(scores, reverse=True)
@@ -223,7 +223,7 @@ def test_another_place_is_hardly_ever_accepted(matching, office_map, queries, th
     for seed in range(2):
         elsewhere, _ = exchange_landmarks(office_map, asked, 1.0, np.random.default_rng(seed))
         relocalizer = Relocalizer(elsewhere, options)
-        accepted += [relocalizer.relocalize([one.observation]).accepted for one in asked]
+        accepted += [relocalizer.relocalize([query.observation]).accepted for query in asked]
     print(f'\n{matching}: {sum(accepted)} of {len(accepted)} accepted in another place')
     assert np.mean(accepted) <= thresholds['trust']['accepted_elsewhere'][matching]
 
@@ -508,8 +508,8 @@ def test_one_thing_under_two_class_names_counts_once():
     renamed = tuple(f'also {name}' for name in ROOM.class_ids)
     both = LandmarkMap('map', (*ROOM.landmark_ids, *(f'{one}_2' for one in ROOM.landmark_ids)),
                        ROOM.labels * 2, ROOM.class_ids + renamed, *(
-                           np.tile(one, (2, 1)) for one in (ROOM.centers, ROOM.semi_axes,
-                                                            ROOM.quats_xyzw)))
+                           np.tile(column, (2, 1)) for column in (
+                               ROOM.centers, ROOM.semi_axes, ROOM.quats_xyzw)))
     alone = support_of(ROOM, seen)
     twice = support_of(both, together(seen, replace(seen, class_ids=renamed)))
     assert (twice.inliers, twice.score) == pytest.approx((alone.inliers, alone.score), abs=0.2)
@@ -551,10 +551,10 @@ def test_a_turn_about_an_axis_that_all_objects_share_is_a_rival():
     assert len(turned_about_axis(ROOM, camera, np.arange(12))) == 0
     # a camera that is not verified yet also lowers the confidence
     options = RelocalizerOptions(matching='class', min_confidence=0.75)
-    found = [Relocalizer(one, options).relocalize(
-        [Observation(CAMERA, see_room(one, camera), up_in_camera=camera[2, :3])])
-        for one in (on_axis, spread)]
-    assert [one.accepted for one in found] == [False, True]
+    found = [Relocalizer(room, options).relocalize(
+        [Observation(CAMERA, see_room(room, camera), up_in_camera=camera[2, :3])])
+        for room in (on_axis, spread)]
+    assert [pose.accepted for pose in found] == [False, True]
     assert found[0].evidence.distinct < 0.8
     assert found[1].evidence.distinct > 0.95
 

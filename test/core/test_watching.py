@@ -280,7 +280,7 @@ def test_without_odometry_the_watch_learns_more_slowly(room):
     for odom in (True, False):
         watch = Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
         wrong = moved(np.eye(4), 2.0, 0.5)
-        chances.append([one.probability for one in follow(watch, room, drive(12), wrong,
+        chances.append([report.probability for report in follow(watch, room, drive(12), wrong,
                                                           odom=odom)])
     assert chances[0][3] < chances[1][3]
     assert chances[1][-1] < 0.05
@@ -294,7 +294,7 @@ def test_missing_landmarks_are_named(watch, room):
     assert not reports[3].missing  # one look names no landmark
     expected = {row for pose in drive(18)
                 for row in expect(room, CAMERA, pose, np.arange(COUNT)).landmarks}
-    named = {room.landmark_ids.index(one) for one in reports[-1].missing}
+    named = {room.landmark_ids.index(landmark) for landmark in reports[-1].missing}
     assert named
     assert named <= set(gone)
     assert named >= set(gone) & expected - {25} or len(named) >= 2

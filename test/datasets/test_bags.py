@@ -58,15 +58,15 @@ def write_bag(path, storage, parts, compression='NONE'):
         for file in every[-1]['rosbag2_bagfile_information']['relative_file_paths']:
             (part / file).rename(path / file)
     info = every[0]['rosbag2_bagfile_information']
-    for one in (each['rosbag2_bagfile_information'] for each in every[1:]):
-        info['relative_file_paths'] += one['relative_file_paths']
-        info['files'] += one['files']
-        info['message_count'] += one['message_count']
+    for part_info in (each['rosbag2_bagfile_information'] for each in every[1:]):
+        info['relative_file_paths'] += part_info['relative_file_paths']
+        info['files'] += part_info['files']
+        info['message_count'] += part_info['message_count']
         info['duration']['nanoseconds'] = (
-            one['starting_time']['nanoseconds_since_epoch'] + one['duration']['nanoseconds']
-            - info['starting_time']['nanoseconds_since_epoch'])
+            part_info['starting_time']['nanoseconds_since_epoch']
+            + part_info['duration']['nanoseconds'] - info['starting_time']['nanoseconds_since_epoch'])
         for topic, more in zip(info['topics_with_message_count'],
-                               one['topics_with_message_count'], strict=True):
+                               part_info['topics_with_message_count'], strict=True):
             topic['message_count'] += more['message_count']
     (path / 'metadata.yaml').write_text(yaml.safe_dump(every[0]))
     return path
@@ -154,7 +154,8 @@ def test_messages_come_back(tmp_path, plugin):
     assert list(info.k) == [53.5, 0, 32.0, 0, 53.9, 24.7, 0, 0, 1]
     assert list(info.p) == [53.5, 0, 32.0, 0, 0, 53.9, 24.7, 0, 0, 0, 1, 0]
     assert list(info.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1]
-    assert [bag_messages.stamp_ns(one) for one in (array, *array.detections)] == [STAMP_NS] * 3
+    stamps_ns = [bag_messages.stamp_ns(message) for message in (array, *array.detections)]
+    assert stamps_ns == [STAMP_NS] * 3
     again = detections_from_msg(array)
     np.testing.assert_array_equal(again.bboxes_xyxy, detections.bboxes_xyxy)
     np.testing.assert_array_equal(again.scores, detections.scores)
@@ -185,7 +186,7 @@ def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
         'liveliness_lease_duration': infinite, 'avoid_ros_namespace_conventions': False,
     }
     latched = offered | {'depth': 1, 'durability': 'transient_local'}
-    topics = [one['topic_metadata'] for one in info['topics_with_message_count']]
+    topics = [topic['topic_metadata'] for topic in info['topics_with_message_count']]
     assert [topic['offered_qos_profiles'] for topic in topics] == [[offered], [latched]]
     assert [topic['serialization_format'] for topic in topics] == ['cdr', 'cdr']
     assert topics[1]['type_description_hash'].startswith('RIHS01_2142741200')

@@ -175,7 +175,7 @@ def test_a_video_is_read_image_by_image(shots, tmp_path):
         video.write(np.full((480, 640, 3), 40 * number, dtype=np.uint8))
     video.release()
     frames = read_folder(tmp_path)
-    assert [round(float(one.image_rgb.mean()) / 40) for one in frames.read()] == [*range(6)]
+    assert [round(float(frame.image_rgb.mean()) / 40) for frame in frames.read()] == [*range(6)]
     one, = frames.select([2]).read()  # back
     assert round(float(one.image_rgb.mean()) / 40) == 2
 

@@ -202,7 +202,7 @@ def test_a_map_of_msgloc_as_published(shared_data, tmp_path):
     print(f'MSG-Loc sample: {len(found)} landmarks, {len(imported.left_out)} left out, '
           f'{sum(one.class_weights is not None for one in found.details)} of several classes')
     assert len(found) == 116 and len(imported.left_out) == 16
-    assert all('semi-axes are' in one.reason for one in imported.left_out)
+    assert all('semi-axes are' in entry.reason for entry in imported.left_out)
     row = found.landmark_ids.index('wine_glass_0')
     np.testing.assert_allclose(found.centers[row], [2.07811, 0.40396, -0.48006], atol=1e-5)
     np.testing.assert_allclose(found.quats_xyzw[row], [-.48684, .39502, -.52906, .57188],

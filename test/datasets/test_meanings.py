@@ -186,7 +186,7 @@ def test_a_few_bad_messages_are_left_out_and_counted(room, tmp_path):
     assert '3 of 48 messages of /camera_info left out' in notes
     assert '1 of 48 messages of /ground_truth left out' in notes
     assert sum(frame.map_from_camera is not None for frame in frames.read()) == 47
-    bad = {one[0] for one in room[:20]}
+    bad = {message[0] for message in room[:20]}
     refuses('/camera_info: 10 messages', write_bag(tmp_path / 'many', room, info=info))
 
 
@@ -305,8 +305,8 @@ def test_another_order_of_a_quaternion_is_seen_in_the_images(shared_data, tmp_pa
     with pytest.raises(DatasetError, match=r'quaternions w x y z .*name the columns'):
         read_folder(tmp_path)
     (tmp_path / 'groundtruth.txt').write_text(f'# timestamp tx ty tz qw qx qy qz\n{other}')
-    ours, theirs = (next(read_folder(one).read_raw(lambda *_: True)).map_from_camera
-                    for one in (tmp_path, folder))
+    ours, theirs = (next(read_folder(folder_).read_raw(lambda *_: True)).map_from_camera
+                    for folder_ in (tmp_path, folder))
     np.testing.assert_allclose(ours, theirs, atol=1e-9)
 
 

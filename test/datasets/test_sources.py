@@ -115,7 +115,7 @@ def test_poses_are_interpolated_within_a_gap(tmp_path):
     assert positions(bag_frames(bag, BagTopics(), poses_of_topic('/pose'))) == [None] * 4
     assert frames.count == 4
     raw = list(frames.read_raw(lambda place, stamp, pose: pose is not None and place > 0))
-    assert [one.place for one in raw] == [1]
+    assert [frame.place for frame in raw] == [1]
     # another process decodes it
     decoded = pickle.loads(pickle.dumps(raw[0])).decode()
     assert (decoded.image_rgb == 500 % 200).all() and decoded.camera.fx == 50.0

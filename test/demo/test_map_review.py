@@ -53,7 +53,7 @@ def test_each_object_has_at_most_one_landmark_of_its_class(review):
     offsets = {review.objects[one.object_row].object_id: one.offset_m for one in review.found}
     assert offsets['box_1'] == pytest.approx(0.02)
     assert offsets['mug_1'] == pytest.approx(0.05)  # the nearer of the two is found
-    assert [one.size_ratio for one in review.found] == pytest.approx([1.1, 1.1])
+    assert [result.size_ratio for result in review.found] == pytest.approx([1.1, 1.1])
 
 
 def test_false_landmarks_say_what_is_there(review):

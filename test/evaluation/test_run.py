@@ -72,7 +72,8 @@ def test_every_method_trial_and_query_is_there(results, methods, questions):
     assert sum(count_trials(method, 3) for method in methods) == 7
     keys = [(result.method, result.trial, result.query) for result in results]
     assert len(set(keys)) == len(keys)
-    assert [one.method for one in summarize(results)] == [method.name for method in methods]
+    assert ([summary.method for summary in summarize(results)]
+            == [method.name for method in methods])
     solved = [result for result in results if result.solved]
     assert solved
     assert len(solved) < len(results)
@@ -83,8 +84,8 @@ def test_every_method_trial_and_query_is_there(results, methods, questions):
 def test_trials_differ_and_repeat(results, room, questions, methods):
     sampled = [result for result in results if result.method == 'class_ransac']
     count = len(questions)
-    assert ([one.score for one in sampled[:count]]
-            != [one.score for one in sampled[count:2 * count]])
+    assert ([result.score for result in sampled[:count]]
+            != [result.score for result in sampled[count:2 * count]])
     again = run_methods(room, methods, questions, trials=3)
     assert without_times(again) == without_times(results)
 
@@ -160,16 +161,17 @@ def test_crops_on_demand_are_a_part_of_all(room, questions):
     found = {crops: run_methods(room, parse_methods(['auto'], replace(options, crops=crops),
                                                     len(room)), questions, trials=1)
              for crops in ('all', 'on_demand')}
-    assert {one.crops_share for one in found['all']} == {1.0}
-    shares = [one.crops_share for one in found['on_demand']]
+    assert {result.crops_share for result in found['all']} == {1.0}
+    shares = [result.crops_share for result in found['on_demand']]
     assert shares[0] == 1.0 and shares[-1] == 0.0
-    assert [one.accepted for one in found['on_demand']] == [one.accepted for one in found['all']]
-    assert all(share == 1.0 or one.accepted
-               for share, one in zip(shares, found['on_demand'], strict=True))
+    assert ([result.accepted for result in found['on_demand']]
+            == [result.accepted for result in found['all']])
+    assert all(share == 1.0 or result.accepted
+               for share, result in zip(shares, found['on_demand'], strict=True))
     (summary,) = summarize(found['on_demand'])
     assert summary.crops_share == pytest.approx(np.mean(shares))
-    refused = [one for one in found['on_demand'] if not one.accepted]
-    assert refused and all(one.refusal_kind for one in refused)
+    refused = [result for result in found['on_demand'] if not result.accepted]
+    assert refused and all(result.refusal_kind for result in refused)
     assert sum(summary.refusals.values()) == len(refused)
     kinds = ', '.join(f'{count} {kind}' for kind, count in summary.refusals.items())
     assert f'auto refused: {kinds}.' in notes([summary])

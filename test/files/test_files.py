@@ -242,7 +242,7 @@ def test_without_dask(monkeypatch):
 @pytest.mark.parametrize(('mode', 'is_own_group', 'foreign'), [
     (0o755, False, False), (0o775, True, False), (0o775, False, True), (0o777, True, True)])
 def test_what_a_group_of_others_can_write_to_is_foreign(tmp_path, mode, is_own_group, foreign):
-    others = [one for one in os.getgroups() if one not in (0, os.getgid())] or [12345]
+    others = [group for group in os.getgroups() if group not in (0, os.getgid())] or [12345]
     os.chown(tmp_path, -1, os.getgid() if is_own_group else others[0])
     tmp_path.chmod(mode)
     assert is_foreign(tmp_path.stat(), {os.getuid()}) is foreign

@@ -142,9 +142,9 @@ def test_two_writers_at_once_leave_one_whole_set(path):
     """As with build_map in two terminals: the last one wins with all of its files."""
     fork = multiprocessing.get_context('fork')
     for turn in range(20):
-        writers = [fork.Process(target=lambda numbers: [write_set(path, one) for one in numbers],
-                                args=(range(100 * turn + 10 * one, 100 * turn + 10 * one + 10),))
-                   for one in range(2)]
+        writers = [fork.Process(target=lambda numbers: [write_set(path, tag) for tag in numbers],
+                                args=(range(100 * turn + 10 * writer_number, 100 * turn + 10 * writer_number + 10),))
+                   for writer_number in range(2)]
         for writer in writers:
             writer.start()
         for writer in writers:

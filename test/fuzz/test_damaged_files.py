@@ -100,7 +100,7 @@ def plain(value):
         return {name: plain(var) for name, var in vars(value).items() if not name.startswith('_')}
     if isinstance(value, np.ndarray):
         return value.tobytes(), value.shape
-    return [plain(one) for one in value] if isinstance(value, tuple | list) else repr(value)
+    return [plain(item) for item in value] if isinstance(value, tuple | list) else repr(value)
 
 
 @pytest.mark.parametrize('name', FORMATS)
@@ -135,7 +135,7 @@ def bomb(path, shape, compression=zipfile.ZIP_DEFLATED, declared=None):
         'descr': '<f8', 'fortran_order': False, 'shape': declared or shape})
     content = header.getvalue() + bytes(8 * int(np.prod(shape)))
     with zipfile.ZipFile(path) as archive:
-        others = {one: archive.read(one) for one in archive.namelist()}
+        others = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(path, 'w', compression) as archive:
         for one, data in (others | {'boxes_xyxy.npy': content}).items():
             archive.writestr(one, data)

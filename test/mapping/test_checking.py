@@ -84,7 +84,7 @@ def test_a_true_map_has_no_fault_and_its_frames_are_accepted(report):
     assert len(grid.trials) == 4 * len(grid.positions)
     assert (grid.accepted <= grid.headings).all()
     blind = [trial for trial in grid.trials if trial.landmarks == 0]
-    assert {one.verdict for one in blind} == {'refused'}
+    assert {trial.verdict for trial in blind} == {'refused'}
 
 
 def test_equal_seed_and_input_give_an_equal_report(report, detections):
@@ -126,7 +126,7 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
 def test_a_label_of_another_class_is_a_fault(label, class_id, other):
     ids = ('cup', class_id, 'book', *TABLE.class_ids[3:])
     named = replace(TABLE, class_ids=ids, labels=('a cup', label, 'a book', *TABLE.labels[3:]))
-    faults = {one.landmark_id: one.faults for one in check_landmarks(named, None, [])}
+    faults = {check.landmark_id: check.faults for check in check_landmarks(named, None, [])}
     assert [f"'{label}', a {other} by" in fault for fault in faults.pop(TABLE.landmark_ids[1])
             ] == [True] * (other is not None)
     assert not any(faults.values())
@@ -154,7 +154,7 @@ def test_a_shifted_landmark_is_told_its_offset(detections):
     assert any('is 12 cm away' in fault for fault in worst.faults)
     # a map states how uncertain it is
     sure = replace(shifted, details=(LandmarkDetails(position_sigma=0.07),) * len(TABLE))
-    assert {one.position_sigma_m for one in check_landmarks(sure, witness, [])} == {0.07}
+    assert {check.position_sigma_m for check in check_landmarks(sure, witness, [])} == {0.07}
 
 
 @pytest.mark.parametrize('turn_deg', [0.0, 35.0, -120.0])
@@ -187,16 +187,16 @@ def test_identical_rooms_fail_the_check(rooms_report):
 def test_a_symmetric_place_is_one_place(report):
     pair = LookAlike((5.7, 3.5, 0.8), (5.8, 3.5, 0.8), (), 6, 1.0, 0, 180.0)
     advice = give_advice(replace(report, look_alikes=(pair,)))
-    assert any('x 5.7, y 3.5' in one.text and '180 degrees' in one.text for one in advice)
+    assert any('x 5.7, y 3.5' in hint.text and '180 degrees' in hint.text for hint in advice)
 
 
 def test_a_robot_that_is_misled_into_the_double_is_advice_on_the_double(rooms_report):
     grid = rooms_report.grid
-    seen = next(one for one in grid.trials if one.landmarks > 3)
+    seen = next(trial for trial in grid.trials if trial.landmarks > 3)
 
     def misled_to(estimate):
         trial = replace(seen, verdict='misled', estimate=np.array(estimate), error_m=10.0)
-        return [one.text for one in give_advice(replace(
+        return [advice.text for advice in give_advice(replace(
             rooms_report, grid=replace(grid, trials=(*grid.trials, trial))))]
 
     side = np.sign(5.0 - seen.position[0])  # to the other room
@@ -236,15 +236,15 @@ def test_systematic_errors_are_measured(spoil, name, value, tolerance):
     poses = [walk_around(frames=60), walk_around(frames=60, radius=1.6)[::-1]]
     spoilt = spoil(see(TABLE, np.concatenate(poses), noise_px=1.0))
     views, witness = witness_of(TABLE, spoilt)
-    found = {one.name: one for one in find_corrections(spoilt, views, witness.fitted,
+    found = {fix.name: fix for fix in find_corrections(spoilt, views, witness.fitted,
                                                        witness.shown)}
     assert found[name].is_significant
     assert found[name].value == pytest.approx(value, abs=tolerance)
     # one sensor is blamed, whatever else its error would fit better
-    assert len({one.cause for one in found.values()
-                if one.is_significant and not one.follows}) == 1
+    assert len({result.cause for result in found.values()
+                if result.is_significant and not result.follows}) == 1
     # a turned mount looks almost like a shifted principal point
-    assert found[name].explained > 0.8 * max(one.explained for one in found.values())
+    assert found[name].explained > 0.8 * max(result.explained for result in found.values())
 
 
 def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
@@ -257,7 +257,7 @@ def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
     bare_stamps = detections.stamps_s[bare.frames]
     of_bare = [trial for trial in trials if trial.stamp_s in bare_stamps]
     assert of_bare
-    assert {one.verdict for one in of_bare} == {'refused'}
+    assert {trial.verdict for trial in of_bare} == {'refused'}
     # the other parts have no information on the map there
     assert all(trial.is_judged == (trial.stamp_s not in bare_stamps) for trial in trials)
     assert any(trial.verdict == 'accepted' for trial in trials)
@@ -372,7 +372,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
 
     def read(stamp_s, camera, pinhole):
         return np.full((480, 640, 3), 128, np.uint8) if min(
-            abs(stamp_s - one) for one in shown) < 1e-6 else None
+            abs(stamp_s - shown_s) for shown_s in shown) < 1e-6 else None
     write_report(tmp_path, hostile, report, draw_pictures(named, report),
                  ViewPainter(named, detections, read))
     page = (tmp_path / PAGE).read_text()
@@ -434,11 +434,11 @@ def test_places_without_a_keyframe_are_counted_and_named(room_report):
     assert len(nowhere.as_dict()['positions_without']) == len(grid.positions)
     assert nowhere.as_dict()['recorded_frames_in_reach'] == 0.5
     text = 'no keyframe is'
-    assert any(text in one.text for one in give_advice(replace(room_report, keyframes=nowhere)))
-    assert not any(text in one.text for one in give_advice(replace(room_report, keyframes=full)))
+    assert any(text in hint.text for hint in give_advice(replace(room_report, keyframes=nowhere)))
+    assert not any(text in hint.text for hint in give_advice(replace(room_report, keyframes=full)))
     by_keyframes = replace(room_report, keyframes=full,
                            grid=replace(grid, accepted=0 * grid.accepted))
-    assert any('only keyframes' in one.text for one in give_advice(by_keyframes))
+    assert any('only keyframes' in advice.text for advice in give_advice(by_keyframes))
 
 
 def test_the_report_has_keyframes_only_where_there_are_some(tmp_path, run_here):

@@ -73,11 +73,11 @@ def drive(*names, noise_px=2.0, move=lambda stamps_s, poses: poses, seconds=50.0
         camera = RIG[name][0]
         seen.append(see_rows(ROOM, true[-1], noise_px * camera.fx / 500.0, seed=number,
                              camera=camera)[0])
-    joined = {key: np.concatenate([getattr(one, key) for one in seen])
+    joined = {key: np.concatenate([getattr(part, key) for part in seen])
               for key in ('bboxes_xyxy', 'classes', 'scores')}
     given = [move(*pair) @ mount_of(name) for *pair, name in zip(
         stamps, map(robot_at, stamps), names, strict=True)]
-    counts = np.concatenate([np.diff(one.frame_offsets) for one in seen])
+    counts = np.concatenate([np.diff(part.frame_offsets) for part in seen])
     rows = np.repeat(np.arange(len(names)), list(map(len, seen)))
     stamps, true = np.concatenate(stamps), np.concatenate(true)
     order = np.argsort(stamps, kind='stable')
@@ -215,7 +215,7 @@ def test_a_map_is_updated_from_several_cameras():
         np.arange(len(ROOM))[:, None] == 3, [0.0, 0.0, 1.0], 0.0))
     updated = update_map(now, drive(*RIG)[0], MappingOptions(pose_errors=ERRORS))
     assert nearest_errors(updated.landmark_map, ROOM).max() < 0.05
-    assert [one.landmark_id for one in updated.report.moved] == ['thing_3']
+    assert [landmark.landmark_id for landmark in updated.report.moved] == ['thing_3']
 
 
 def test_one_mount_is_corrected_at_a_time():

@@ -117,7 +117,7 @@ def test_a_height_that_level_motion_does_not_show_stays_and_is_named():
     found = built.mount.given_from_corrected[:3, 3]
     assert found[0] == pytest.approx(0.03, abs=0.01)
     assert abs(found[1]) < 0.01
-    (note,) = [one for one in built.report.notes if 'not observable' in one]
+    (note,) = [note for note in built.report.notes if 'not observable' in note]
     assert ': y (down);' in note
 
 
@@ -208,7 +208,7 @@ def scaled(factor):
 
 def joined(built):
     """Return the number of pairs of frames with odometry, or None if it is left out."""
-    note, = [one for one in built.report.notes if one.startswith('odometry')]
+    note, = [note for note in built.report.notes if note.startswith('odometry')]
     found = re.search(r' (\d+) of 119 pairs', note)
     return int(found[1]) if found else None
 

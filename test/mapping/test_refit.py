@@ -197,7 +197,7 @@ SCENES = {
 @pytest.mark.parametrize(('things', 'expected'), SCENES.values(), ids=SCENES)
 def test_what_the_images_show_at_once_is_two(things, expected):
     """Two objects overlap. The whole comes before its part."""
-    detections, pair = watch(*things), make_map(*(one[:3] for one in things))
+    detections, pair = watch(*things), make_map(*(thing[:3] for thing in things))
     (overlap,) = overlaps_of(pair, detections)
     assert overlap.is_duplicate == (len(expected) == 1)
     built = build_map(detections).landmark_map
@@ -208,7 +208,7 @@ def test_what_the_images_show_at_once_is_two(things, expected):
         assert np.sort(built.semi_axes[row]) == pytest.approx(np.sort(thing[2]), abs=0.02)
         assert dict(built.details[row].class_weights or {built.class_ids[row]: 1.0}
                     ) == pytest.approx(weights, abs=0.15)
-    assert not any(one.is_duplicate for one in overlaps_of(built, detections))
+    assert not any(pair.is_duplicate for pair in overlaps_of(built, detections))
 
 
 def overlaps_of(landmark_map, detections=None):
@@ -257,12 +257,12 @@ def test_a_refit_and_an_update_join_doubles():
 def test_a_map_made_by_hand_is_judged_by_its_classes():
     room, doubled = doubled_room()
     assert overlaps_of(room) == []
-    assert [(one.first, one.second, one.is_duplicate) for one in overlaps_of(doubled)] == [
+    assert [(pair.first, pair.second, pair.is_duplicate) for pair in overlaps_of(doubled)] == [
         (1, 6, False)]
     named = replace(doubled, class_ids=(*doubled.class_ids[:6], BOTTLE))
-    assert [one.is_duplicate for one in overlaps_of(named)] == [True]
+    assert [pair.is_duplicate for pair in overlaps_of(named)] == [True]
     assert check_map(named, options=QUICK).duplicates == 1
     # boxes of other objects have no information on it
     elsewhere = see(room.select([0, 2, 3, 4, 5]), POSES)
-    assert [one.is_duplicate for one in overlaps_of(doubled, elsewhere)] == [False]
+    assert [pair.is_duplicate for pair in overlaps_of(doubled, elsewhere)] == [False]
     assert (refit_map(elsewhere, doubled).part_of == np.arange(7)).all()

@@ -73,10 +73,10 @@ def test_each_change_is_reported_and_nothing_else():
     assert one.center == pytest.approx((1.6, 0.1, 0.8), abs=0.03)
     assert one.distance_m == pytest.approx(np.linalg.norm(
         np.array([1.6, 0.1, 0.8]) - things.centers[12]), abs=0.03)
-    assert all('seen in 0' in one.evidence for one in report.missing)
+    assert all('seen in 0' in landmark.evidence for landmark in report.missing)
     for row in (5, 17):
-        assert min(np.linalg.norm(np.array(one.center) - things.centers[row])
-                   for one in report.new) < 0.03
+        assert min(np.linalg.norm(np.array(landmark.center) - things.centers[row])
+                   for landmark in report.new) < 0.03
     found = updated.landmark_map
     assert 'thing_7' not in found.landmark_ids
     assert found.labels[found.landmark_ids.index('thing_12')] == 'thing number 12'
@@ -267,7 +267,7 @@ def test_two_objects_that_exchanged_places(alike):
     assert ids(report.moved) == (set() if alike else {'thing_1', 'thing_7'})
     assert report.missing == report.new == ()
     if not alike:
-        assert all('looks different' in one.evidence for one in report.moved)
+        assert all('looks different' in landmark.evidence for landmark in report.moved)
         np.testing.assert_allclose(updated.landmark_map.centers[first], things.centers[second],
                                    atol=0.03)
     assert updated.embeddings.landmark_ids == updated.landmark_map.landmark_ids
@@ -444,7 +444,7 @@ CLIP = ['--clip-pretrained', ASSETS / 'clip']
 
 def update(folder, *options):
     """Update the map of a folder with the executable's function; return the exit code."""
-    return build_map.main([str(one) for one in (
+    return build_map.main([str(argument) for argument in (
         '--observations', ROOM / 'after.npz', '--update', folder / 'map.yaml', '--no-check',
         '--out', folder / 'map.yaml', '--report', folder / 'report.json', *CLIP, *options)])
 
@@ -466,17 +466,17 @@ def report(updated):
 
 def test_all_nine_changes_are_reported_and_nothing_else(report):
     def names(kind):
-        return {one['landmark_id'] for one in report[kind]}
+        return {entry['landmark_id'] for entry in report[kind]}
 
     assert names('moved') == set(CHANGES['moved'])
     assert names('missing') == set(CHANGES['removed'])
     assert len(report['new']) == len(CHANGES['new']) == 3
-    assert sorted(one['class_id'] for one in report['new']) == sorted(
+    assert sorted(landmark['class_id'] for landmark in report['new']) == sorted(
         name.split('_')[0] for name in CHANGES['new'])
     assert len(report['confirmed']) == 60 - 4 - 2
     assert report['not_observed'] == []
-    assert all('seen in 0' in one['evidence'] for one in report['missing'])
-    assert all(one['rivals'] == [] and one['distance_m'] > 1.0 for one in report['moved'])
+    assert all('seen in 0' in landmark['evidence'] for landmark in report['missing'])
+    assert all(entry['rivals'] == [] and entry['distance_m'] > 1.0 for entry in report['moved'])
 
 
 def test_the_map_holds_what_is_there_now(updated, report):
@@ -498,7 +498,7 @@ def test_the_map_holds_what_is_there_now(updated, report):
     stayed = [name for name in kept if name not in CHANGES['moved']]
     for name in stayed:
         np.testing.assert_array_equal(new.centers[new.landmark_ids.index(name)], places[name])
-    assert {one['landmark_id'] for one in report['new']} == set(new.landmark_ids[len(kept):])
+    assert {entry['landmark_id'] for entry in report['new']} == set(new.landmark_ids[len(kept):])
 
 
 def test_new_landmarks_have_phrases_and_all_have_embeddings(updated, report):
@@ -508,10 +508,10 @@ def test_new_landmarks_have_phrases_and_all_have_embeddings(updated, report):
     old = load_embeddings_of_map(ROOM / 'map.yaml', new.landmark_ids)
     kept = old.is_known
     np.testing.assert_array_equal(embeddings.means[kept], old.means[kept])
-    for one in report['new']:
-        row = new.landmark_ids.index(one['landmark_id'])
-        assert one['label'] == new.labels[row]
-        assert len(new.details[row].labels) == 6 or one['label'] == one['class_id']
+    for landmark in report['new']:
+        row = new.landmark_ids.index(landmark['landmark_id'])
+        assert landmark['label'] == new.labels[row]
+        assert len(new.details[row].labels) == 6 or landmark['label'] == landmark['class_id']
 
 
 @pytest.mark.parametrize(('text', 'options', 'message'), [

@@ -29,9 +29,9 @@ def make_table(count=9) -> LandmarkMap:
 def join_maps(*maps: LandmarkMap) -> LandmarkMap:
     """Join the landmarks of several maps; ids get a mark from the second map on."""
     ids = [name + '_b' * number for number, one in enumerate(maps) for name in one.landmark_ids]
-    labels, classes, details = (sum((getattr(one, name) for one in maps), ())
+    labels, classes, details = (sum((getattr(landmark_map, name) for landmark_map in maps), ())
                                 for name in ('labels', 'class_ids', 'details'))
-    arrays = (np.concatenate([getattr(one, name) for one in maps])
+    arrays = (np.concatenate([getattr(landmark_map, name) for landmark_map in maps])
               for name in ('centers', 'semi_axes', 'quats_xyzw'))
     return LandmarkMap(maps[0].frame_id, tuple(ids), labels, classes, *arrays, details)
 

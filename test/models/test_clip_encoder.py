@@ -194,14 +194,14 @@ def test_images_of_this_encoder_are_compared(clip, map_file, compare):
 def test_images_of_several_maps_are_compared_together_or_not_at_all(clip, tmp_path, caplog):
     """Each map keeps its rows; if one map has no images, all are compared by labels."""
     maps = [replace(ROOM, frame_id='hall'), replace(ROOM, frame_id='attic').select([2, 0, 1])]
-    files = [str(tmp_path / f'{one.frame_id}.yaml') for one in maps]
+    files = [str(tmp_path / f'{landmark_map.frame_id}.yaml') for landmark_map in maps]
     both = join_maps(maps, files)
     for one, file in zip(maps, files, strict=True):
         write_map(file, one)
         save_landmark_embeddings(embeddings_path(file), images_of(
             resolve_clip_weights(clip).key, one.landmark_ids))
     rows = embed_map(clip, both, files, 'image')
-    expected = [images_of('', one.landmark_ids).means for one in maps]
+    expected = [images_of('', landmark_map.landmark_ids).means for landmark_map in maps]
     assert np.array_equal(np.asarray(rows), np.concatenate(expected))
     for part, own in zip(rows.parts, expected, strict=True):
         assert np.array_equal(np.asarray(part), own)

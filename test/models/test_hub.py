@@ -139,7 +139,7 @@ def test_an_interrupted_download_goes_on(hub, tmp_path):
     hub.requests.clear()
     found = Path(resolve(tmp_path)['network'])
     assert found.with_name('model.onnx_data').read_bytes() == hub.files['onnx/model.onnx_data']
-    assert not any('GET' in one and one.endswith('/config.json') for one in hub.requests)
+    assert not any('GET' in line and line.endswith('/config.json') for line in hub.requests)
 
 
 def test_a_repository_without_onnx(hub, tmp_path):

@@ -215,7 +215,7 @@ def test_another_view_is_encoded_anew(observer):
     moved = BOXES + 3.0
     assert len(observer.crops(noisy(2), moved).known) == 0, 'other boxes'
     assert len(observer.crops(255 - noisy(2), BOXES).known) == 0, 'other pixels'
-    other = next(one for one in FRAMES if one is not FRAME)
+    other = next(frame for frame in FRAMES if frame is not FRAME)
     image = cv2.imread(str(other.image))[..., ::-1].copy()
     assert len(observer.crops(image, BOXES).known) == 0, 'another image'
     covered, box = noisy(2), BOXES[np.argmax(np.prod(BOXES[:, 2:] - BOXES[:, :2], axis=1))]

@@ -109,7 +109,7 @@ def test_an_export_with_half_precision(plain, tmp_path, images, load):
     network.graph.node.insert(0, helper.make_node('Cast', ['images'], ['images32'],
                                                   to=TensorProto.FLOAT))
     for node in list(network.graph.node)[1:]:
-        node.input[:] = ['images32' if one == 'images' else one for one in node.input]
+        node.input[:] = ['images32' if name == 'images' else name for name in node.input]
     onnx.save(network, tmp_path / 'half.onnx')
     px, score = compare(load(tmp_path / 'half.onnx'), load(plain), images)
     assert px < 1.0 and score < 0.01

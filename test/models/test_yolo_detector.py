@@ -194,7 +194,7 @@ def by_ultralytics(file, texts, image_rgb):
         model.set_classes(texts)
     found = model.predict(np.ascontiguousarray(image_rgb[..., ::-1]), conf=0.0, iou=0.7, imgsz=320,
                           max_det=300, device='cpu', verbose=False)[0].boxes.data.numpy()
-    return found[:, :4], [texts[int(one)] for one in found[:, 5]]
+    return found[:, :4], [texts[int(result)] for result in found[:, 5]]
 
 
 @pytest.mark.parametrize('model', ['world.pt', 'yoloe.pt'])

@@ -121,7 +121,7 @@ def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surrou
     (NAMES[1:], {}), (NAMES, {'left': NEVER})])
 def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, working, late_s):
     process, ask = four_cameras
-    missing = next(iter(late_s), None) or next(one for one in NAMES if one not in working)
+    missing = next(iter(late_s), None) or next(name for name in NAMES if name not in working)
     ask_until(ask, f'no image of {missing};', working, late_s)
     assert 'Traceback' not in process.output()
 
@@ -153,8 +153,8 @@ def test_one_detector_serves_all_cameras_in_turn(start, tester):
     finally:
         for subscription in subscriptions:
             tester.destroy_subscription(subscription)
-        for one in publishers.values():
-            tester.destroy_publisher(one)
+        for publisher in publishers.values():
+            tester.destroy_publisher(publisher)
     stamps = [{msg.header.stamp.sec for msg in messages} for messages in heard.values()]
     assert {msg.header.frame_id for msg in heard['left']} == {'left'}
     assert len(set.intersection(*stamps)) >= 3, f'of the same instants: {stamps}'

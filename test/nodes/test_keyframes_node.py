@@ -137,7 +137,7 @@ def diagnostics_of(tester):
     heard = []
     subscription = tester.create_subscription(
         DiagnosticArray, '/diagnostics', lambda msg: heard.extend(
-            one for one in msg.status if 'relocalizer' in one.name), 10)
+            status for status in msg.status if 'relocalizer' in status.name), 10)
     tester.wait(lambda: heard, 'diagnostics')
     tester.destroy_subscription(subscription)
     return {value.key: value.value for value in heard[-1].values}

@@ -92,7 +92,7 @@ def test_map_to_odom_is_broadcast_where_it_is_asked_for(own_relocalizer, tester)
     tester.feed_until(answered, frame)
     assert future.result().success, future.result().message
     tester.wait(lambda: len(heard) > 2, 'map -> odom')
-    assert {one.child_frame_id for one in heard} == {'odom'}
+    assert {message.child_frame_id for message in heard} == {'odom'}
     t, q = heard[-1].transform.translation, heard[-1].transform.rotation
     map_from_odom = transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
     tester.wait(lambda: tester.poses, 'the pose')

@@ -49,8 +49,8 @@ def tell(tester):
         if expect:
             process.wait_for_output(expect)
     yield publish
-    for one in made:
-        tester.destroy_publisher(one)
+    for each in made:
+        tester.destroy_publisher(each)
 
 
 def test_the_topic_decides_between_rooms_that_look_alike(own_relocalizer, tester, tell,

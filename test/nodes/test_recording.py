@@ -56,7 +56,7 @@ def core_answers(office, detections):
 
 def test_recorded_detections(shared_data, start, tester, tmp_path):
     office = shared_data / 'tum_fr3_office'
-    assert tum_to_bag([str(one) for one in (
+    assert tum_to_bag([str(argument) for argument in (
         office, tmp_path / 'bag', '--intrinsics', 'fr3', '--detections',
         office / 'detections.json')]) == 0
     start('nodes.relocalizer', parameters={
@@ -75,7 +75,7 @@ def test_recorded_detections(shared_data, start, tester, tmp_path):
     for (stamp, answer, hypotheses), expected in zip(answers, expected_answers, strict=True):
         assert answer.success == expected.accepted
         poses = [transform_of(pose) for pose in hypotheses.poses]
-        np.testing.assert_allclose(poses, [one.map_from_camera for one in expected.hypotheses],
+        np.testing.assert_allclose(poses, [best.map_from_camera for best in expected.hypotheses],
                                    atol=1e-9)
         truth = sequence.pose_at(stamp)
         if truth is not None:

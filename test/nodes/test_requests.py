@@ -53,7 +53,7 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     pose = tester.poses[-1].pose
     assert [float(x), float(y), float(fields['z [m]'])] == [
         pose.pose.position.x, pose.pose.position.y, pose.pose.position.z]
-    assert fields['covariance'].split() == [repr(float(one)) for one in pose.covariance]
+    assert fields['covariance'].split() == [repr(float(value)) for value in pose.covariance]
     assert (fields['source'], fields['frames'], fields['landmarks']) == ('objects', '1', '12')
     assert 1.0 >= float(fields['confidence']) >= float(fields['confidence needed']) > 0.5
     assert 0.0 < float(fields['position deviation [m]']) < 0.2

@@ -90,11 +90,11 @@ def watch(own_relocalizer, tester):
         made.append(Watched(tester, Robot(tester), process))
         return made[-1]
     yield run
-    for one in made:
-        one.close()
-        one.robot.close()
-        print(one.process.output())
-        assert one.process.alive and 'Traceback' not in one.process.output()
+    for watched in made:
+        watched.close()
+        watched.robot.close()
+        print(watched.process.output())
+        assert watched.process.alive and 'Traceback' not in watched.process.output()
     tester.localizer.is_on = True
 
 

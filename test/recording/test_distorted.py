@@ -72,8 +72,8 @@ def recorded(folder):
 def landmarks_off(file):
     """Return the distance of each landmark to the nearest object of its class [m]."""
     objects, built = read_objects(ASSETS / 'mapping'), LandmarkMap.from_file(file)
-    return np.array([min(np.linalg.norm(one.center - center) for one in objects
-                         if one.class_id == class_id)
+    return np.array([min(np.linalg.norm(item.center - center) for item in objects
+                         if item.class_id == class_id)
                      for center, class_id in zip(built.centers, built.class_ids, strict=True)])
 
 

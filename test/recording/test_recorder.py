@@ -199,7 +199,8 @@ def test_refusals(walk, recorded, tmp_path, run_here, options, expected):
     other, cut = tmp_path / 'other.txt', tmp_path / 'cut.npz'
     other.write_text('5000 0 0 0 0 0 0 1\n5001 1 0 0 0 0 0 1\n')
     cut.write_bytes(recorded.read_bytes()[:-200])
-    filled = [one.format(walk=walk, other=other, folder=tmp_path, cut=cut) for one in options]
+    filled = [option.format(walk=walk, other=other, folder=tmp_path, cut=cut)
+              for option in options]
     done = run_here(main, *filled, *NETWORKS, '--no-clip', '--out', tmp_path / 'map.yaml')
     assert done.returncode == 1 and expected in done.stderr, done.stderr
     assert len([line for line in done.stderr.splitlines() if line.startswith('error:')]) == 1

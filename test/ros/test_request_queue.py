@@ -180,7 +180,7 @@ def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
         wait(lambda: node.frames.sources['']._pairing.received['image'] > before, 'the image')
 
     request = clients.submit(node.requests.answer)
-    wait(lambda: all(one.get_subscription_count() for one in camera.publishers), 'the node')
+    wait(lambda: all(each.get_subscription_count() for each in camera.publishers), 'the node')
     for number in range(1, 13):
         take(number)
     boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=1))))

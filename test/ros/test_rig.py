@@ -80,7 +80,7 @@ def ask(rig, cameras, late_s, wait, first_s=10.0, patience_s=30.0):
 
 
 def names(frame):
-    return [frame.camera, *(one.camera for one in frame.beside)]
+    return [frame.camera, *(other.camera for other in frame.beside)]
 
 
 @pytest.mark.parametrize(('late_s', 'together', 'left_out'), [
@@ -97,7 +97,7 @@ def test_frames_of_one_instant_come_together(rig, cameras, wait, late_s, togethe
         frame = ask(rig, cameras, late_s, wait, 200.0)
     assert names(frame) == together
     assert frame.left_out == left_out
-    assert {one.image.header.frame_id for one in (frame, *frame.beside)} == set(together)
+    assert {heard.image.header.frame_id for heard in (frame, *frame.beside)} == set(together)
 
 
 def test_silent_inputs_are_named_by_camera(rig, cameras, wait):
@@ -146,7 +146,7 @@ def in_turn(cameras, heard, order, gap_s=0.0, skew_s=0.0):
             cameras(at_s, {name: 0.0}, (Detection2DArray,))
         time.sleep(0.05)
     time.sleep(0.7)  # all waiting times have passed
-    stamps = [one.image.header.stamp for one in heard]
+    stamps = [frame.image.header.stamp for frame in heard]
     assert len({(stamp.sec, stamp.nanosec) for stamp in stamps}) == len(stamps), 'each once'
     return [one for one, at in zip(heard, stamps, strict=True)
             if at.sec + 1e-9 * at.nanosec >= begun_s - 1e-6]
@@ -155,7 +155,7 @@ def in_turn(cameras, heard, order, gap_s=0.0, skew_s=0.0):
 @pytest.fixture
 def known(rig, cameras, wait, heard):
     """Publish until the cameras and their image stamps are known."""
-    wait(lambda: any(not one.left_out for one in heard), 'the first whole instant',
+    wait(lambda: any(not frame.left_out for frame in heard), 'the first whole instant',
          lambda: cameras(now_s(), ALL) or time.sleep(0.05))
 
 
@@ -166,15 +166,15 @@ def test_instants_are_passed_on_with_all_cameras_once(cameras, heard, gap_s, ske
     """In any order, however late the others arrive."""
     for order in (NAMES, NAMES[::-1]):
         found = in_turn(cameras, heard, order, gap_s, skew_s)
-        assert [names(one) for one in found] == [list(NAMES)] * 6
+        assert [names(frame) for frame in found] == [list(NAMES)] * 6
 
 
 @pytest.mark.usefixtures('known')
 @pytest.mark.parametrize('rig', [math.inf], indirect=True)
 def test_a_silent_camera_holds_no_instant_up(cameras, heard):
     found = in_turn(cameras, heard, ('back', 'left'))
-    assert [names(one) for one in found] == [['left', 'back']] * 6
-    assert {one.left_out for one in found} == {('front',)}
+    assert [names(frame) for frame in found] == [['left', 'back']] * 6
+    assert {frame.left_out for frame in found} == {('front',)}
 
 
 @pytest.mark.usefixtures('known')

@@ -88,7 +88,7 @@ def test_time_that_goes_on_is_no_jump(simulation, jumps):
     (3 * (100.0, 101.0), [100.0, 100.0])])  # a bag that loops
 def test_each_jump_back_is_seen_once(simulation, jumps, moments_s, jumps_s):
     simulation.set_time(*moments_s)
-    assert [one.nanoseconds for one in jumps.forgot] == [round(one * S) for one in jumps_s]
+    assert [time.nanoseconds for time in jumps.forgot] == [round(jump_s * S) for jump_s in jumps_s]
 
 
 def test_messages_from_before_a_jump_are_refused(simulation, jumps):
@@ -178,9 +178,9 @@ class Inputs:
         """Publish parts of a frame until they wait for the other parts."""
         heard = self.frames._pairing.last_stamp_ns
         names = {Image: 'image', CameraInfo: 'camera_info', Detection2DArray: 'detections'}
-        for one in message_types:
-            simulation.spin_until(lambda n=names[one]: heard.get(n) == round(stamp_s * S),
-                                  names[one], lambda t=one: self.publish(stamp_s, t))
+        for kind in message_types:
+            simulation.spin_until(lambda n=names[kind]: heard.get(n) == round(stamp_s * S),
+                                  names[kind], lambda t=kind: self.publish(stamp_s, t))
 
     def run(self, stamp_s):
         """Return the run of odometry that covers a time."""
@@ -221,7 +221,7 @@ def test_what_was_heard_before_a_jump_is_forgotten(simulation, restart_s):
 
 def order_of(*stamps_s, order=None, stream='camera'):
     order = order or StampOrder()
-    return [order.goes_back(stream, round(one * S)) for one in stamps_s]
+    return [order.goes_back(stream, round(stamp_s * S)) for stamp_s in stamps_s]
 
 
 @pytest.mark.parametrize(('stamps_s', 'expected'), [
@@ -264,9 +264,9 @@ def named(*messages, stamps=None):
     ([(1.0, 'a'), (1.1, 'b'), (1.2, 'c')], [True] * 3, True),
     ([(1.1, 'a'), (1.0, 'b'), (1.2, 'c')], [True] * 3, True),  # out of order
     ([(1.0, 'a'), (1.0, 'a'), (1.1, 'b'), (1.1, 'b'), (1.2, 'c')], [True] * 5, True),  # twice
-    ([(1.0, one) for one in 'abcd'], [True, False, False, False], False),  # it stands still
+    ([(1.0, letter) for letter in 'abcd'], [True, False, False, False], False),  # it stands still
     ([(1.0 + row // 2, one) for row, one in enumerate('abcdefgh')], [True] + [False] * 7, False),
-    ([(0.0, one) for one in 'abc'], [False] * 3, False),
+    ([(0.0, letter) for letter in 'abc'], [False] * 3, False),
     ([(0.0, 'a'), (1.0, 'b'), (1.1, 'c'), (1.2, 'd')], [False, False, False, True], True),
     ([(1.0, 'a'), (1.0, 'a'), (1.0, 'b'), (1.0, 'b')], [True, True, False, True], False),
     ([(1.0, 'a'), (1.1, 'b'), (1.2, 'c'), (900.0, 'd')], [True] * 4, False)])  # another clock

@@ -350,14 +350,14 @@ def test_the_form_of_the_shipped_sources():
     """The addresses cannot be opened here."""
     sources = reproduce.Sources.of_file(PROJECT / 'studies/reproduce.yaml')
     assert (*sources.recordings,) == ('fr2', 'fr3', 'kitchen')
-    for one in (*sources.networks, *sources.recordings.values()):
-        address = urlparse(one.url)
+    for download in (*sources.networks, *sources.recordings.values()):
+        address = urlparse(download.url)
         assert address.scheme == 'https' and address.hostname in {
             'cvg.cit.tum.de', 'download.microsoft.com', 'github.com',
             'openaipublic.azureedge.net'}
         assert Path(address.path).suffix in ('.tgz', '.zip', '.pt')
-        assert re.fullmatch('([0-9a-f]{64})?', one.sha256)
-        assert one.licence and one.megabytes > 0
+        assert re.fullmatch('([0-9a-f]{64})?', download.sha256)
+        assert download.licence and download.megabytes > 0
     encoder = sources.networks[1]
     assert encoder.sha256 in encoder.url
     paper = (PROJECT.parent / 'shared/paper/clip-loc.tex')

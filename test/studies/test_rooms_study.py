@@ -38,8 +38,9 @@ def asked(tmp_path_factory):
 def test_images_between_the_mapped_ones_are_found(asked):
     outcomes = json.loads((asked[0] / 'outcomes.json').read_text())
     for way, least in (('objects', 0.4), ('both', 0.75)):  # half of the images are mapped
-        errors = [one['error_m'] for one in outcomes if one['way'] == way and one['known'] == '-'
-                  and one['kind'] == 'in turn' and one['asked'] == 'demo']
+        errors = [outcome['error_m'] for outcome in outcomes
+                  if outcome['way'] == way and outcome['known'] == '-'
+                  and outcome['kind'] == 'in turn' and outcome['asked'] == 'demo']
         assert len(errors) == 6
         assert np.mean(np.array(errors) < 0.25) >= least
     robot = [outcome['error_m'] for outcome in outcomes
@@ -51,4 +52,4 @@ def test_nothing_is_accepted_elsewhere(asked):
     outcomes = json.loads((asked[0] / 'outcomes.json').read_text())
     elsewhere = [outcome for outcome in outcomes if outcome['asked'] == 'elsewhere']
     assert len(elsewhere) == 4 * 2 * 3  # parts, images, ways
-    assert not any(one['accepted'] for one in elsewhere)
+    assert not any(outcome['accepted'] for outcome in elsewhere)

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.full
 
 
 def numbers(row):
-    return [float(one) for one in re.findall(r'-?\d+\.?\d*', row.replace('test1', ''))]
+    return [float(number) for number in re.findall(r'-?\d+\.?\d*', row.replace('test1', ''))]
 
 
 def test_the_deviations_of_odometry_cover_a_real_husky(shared_data):

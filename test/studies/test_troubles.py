@@ -55,7 +55,7 @@ def test_the_table_counts_each_request_once(capsys):
     assert len(rows) == 3, 'one for each mode'
     for row in rows:
         _, _, _, requests, success, found, false, *_ = row.strip('| ').split(' | ')
-        shares = [float(one) for one in success.split()]
+        shares = [float(share) for share in success.split()]
         assert int(requests) == 4
         assert 0 <= int(false) <= int(found) <= 4
         assert shares == sorted(shares) and 4 * shares[-1] == round(4 * shares[-1])

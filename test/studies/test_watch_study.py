@@ -55,7 +55,7 @@ def test_figures_of_a_short_drive():
     """Looks 2 s and .5 m apart: one false alarm, then wrong poses that the third look detects."""
     looks = looked(['localized', 'lost', 'lost', 'localized', 'localized', 'uncertain', 'lost'],
                    [0.1, 0.1, 0.2, 0.1, 3.0, 3.0, 3.0], [0.9, 0.04, 0.3, 0.99, 0.95, 0.4, 0.01])
-    assert [one.stamp_s for one in alarms_of(looks)] == [2.0, 12.0]
+    assert [alarm.stamp_s for alarm in alarms_of(looks)] == [2.0, 12.0]
     found = summarize_watch(looks)
     assert found['alarms'] == 2
     assert found['false_alarms'] == 1
@@ -122,5 +122,5 @@ def test_a_localizer_that_jumps_is_noticed(observations, tmp_path):
     assert found['false_alarms'] == 0
     stretch, = found['wrong_stretches']
     assert stretch['looks'] <= 5
-    assert 'localized' in {one['state'] for one in found['every_look'][2:7]}
+    assert 'localized' in {look['state'] for look in found['every_look'][2:7]}
     assert found['every_look'][-1]['error_m'] == pytest.approx(2.0, abs=0.1)

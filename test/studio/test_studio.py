@@ -44,7 +44,7 @@ def test_outlines_lie_in_the_image(studio):
     recording = studio.recording
     outlines = recording.outlines(studio.document.landmarks, 3)
     assert recording.image(3).shape == (480, 640, 3) and recording.image(-1) is None
-    assert [one.distance_m for one in outlines] == sorted(one.distance_m for one in outlines)
+    assert [each.distance_m for each in outlines] == sorted(each.distance_m for each in outlines)
     assert all((outline.bbox_xyxy[:2] < (640, 480)).all() and (outline.bbox_xyxy[2:] > 0).all()
                for outline in outlines)
 
@@ -53,7 +53,7 @@ def test_sightings_are_sharp_whole_and_from_several_sides(studio):
     """A view that is too blurred is not shown first."""
     document, recording = studio.document, studio.recording
     first = recording.sightings(document.landmarks, 'mug_1')
-    assert all(one.is_whole and not one.is_detected for one in first)
+    assert all(shot.is_whole and not shot.is_detected for shot in first)
     best, images = first[0].view, recording.images
 
     class Blurred:
@@ -112,7 +112,7 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
 def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     document = office.document
     before = office.relocalize_all()
-    accepted = sum(one.verdict == 'accepted' for one in office.answers.values())
+    accepted = sum(answer.verdict == 'accepted' for answer in office.answers.values())
     assert 'simulated' in before and '(was' not in before and accepted > 10
     accepted_view = next(view for view, one in office.answers.items()
                          if one.verdict == 'accepted')
@@ -124,7 +124,7 @@ def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     office.delete()
     after = office.relocalize_all()
     assert f'(was {accepted})' in after
-    assert sum(one.verdict == 'accepted' for one in office.answers.values()) < accepted
+    assert sum(answer.verdict == 'accepted' for answer in office.answers.values()) < accepted
     print(f'as given: {before}; every other landmark deleted: {after}')
 
 

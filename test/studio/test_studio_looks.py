@@ -67,7 +67,7 @@ def check_all(path, rows):
     np.testing.assert_allclose(found['cup_1'][0], mean / np.linalg.norm(mean), atol=2e-3)
     both = np.concatenate([rows['cup_1'][1], rows['book_1'][1]])
     assert len(found['cup_1'][1]) == 5
-    assert all((both == one).all(axis=1).any() for one in found['cup_1'][1])
+    assert all((both == medoid).all(axis=1).any() for medoid in found['cup_1'][1])
     assert is_equal(found['plant_1'], rows['plant_1'])
     assert is_equal(found['plant_2'], rows['plant_1'])
     assert not found['book_1'][0].any() and not len(found['book_1'][1]), 'not the old book'

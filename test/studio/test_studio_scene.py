@@ -106,7 +106,7 @@ def test_other_answers_take_the_place_of_the_first_ones(server, studio, recwarn)
         layers.show('Answers', studio.recording.relocalize(
             studio.document.landmarks, [view], None), draw_answers)
     layers.show('Answers', None, draw_answers)
-    assert not [str(one.message) for one in recwarn]
+    assert not [str(warning.message) for warning in recwarn]
 
 
 def test_up_is_found_where_the_map_is_in_a_cameras_frame():
