@@ -90,7 +90,7 @@ def test_a_change_of_a_module_compiles_its_kernels_and_their_callers(kernels, pa
     replace_in(package / 'cliploc_ros/core/geometry/minimal_solvers.py', '_ROUNDING = 4e-16',
                '_ROUNDING = 5e-16')
     assert run_in(kernels, package=package)[0] == KERNELS
-    assert len(list(kernels.iterdir())) == count, 'the outdated ones remain'
+    assert len(list(kernels.iterdir())) == count, 'outdated kernels remain'
 
 
 @pytest.mark.parametrize('damage', ['cut', 'changed'])
@@ -115,7 +115,7 @@ def test_a_full_disk_costs_only_the_cache(tmp_path):
     limit = 'import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n'
     missing, result, log = run_in(tmp_path, program=limit + PROGRAM)
     assert missing == KERNELS and result == pytest.approx(np.pi)
-    assert log.count('WARNING') == 1, 'not one for each kernel'
+    assert log.count('WARNING') == 1, 'one message for all kernels'
     assert 'cannot keep' in log and 'set cache_dir' in log
     assert not list(tmp_path.iterdir())
 

@@ -62,7 +62,7 @@ def test_a_layer_comes_back_as_it_was(file):
     for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words',
                  'vocabulary'):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name
-    assert not isinstance(after.descriptors, np.memmap), 'a small file may be written over'
+    assert not isinstance(after.descriptors, np.memmap), 'a small file may be overwritten'
 
 
 def test_the_arrays_of_a_large_file_stay_in_it(file, monkeypatch):

@@ -82,7 +82,7 @@ def test_of_too_many_frames_those_furthest_apart_remain(window):
         fused = window.join(number / 10, degrees=6.0 * number)
         assert len(fused) <= 5
     assert fused[0] == 0.0 and fused[-1] == 3.0
-    assert np.diff(fused).max() <= 1.6, 'all of the way'
+    assert np.diff(fused).max() <= 1.6, 'the fused frames cover the whole path'
 
 
 def test_old_frames_are_dropped(window):
@@ -144,7 +144,7 @@ def test_a_frame_without_odometry_is_localized_alone(session):
     for number in range(3):
         fused(session, frame(number, 10.0 * number))
     assert fused(session, replace(frame(3.0), odom_from_camera=None)) == 1
-    assert fused(session, frame(4.0, 40.0)) == 4, 'and does not change the session'
+    assert fused(session, frame(4.0, 40.0)) == 4, 'the session is unchanged'
 
 
 def drive(session, seconds, metres, run=0, objects=12):
@@ -230,7 +230,7 @@ def test_odometry_carries_the_looks(camera, turned_deg, driven_m):
         assert camera.look(number / 10, metres, degrees, degrees, metres) == 1.0
     stuck = [camera.look(1.0 + number / 10, 0.0, 0.0, 4.0 * number, 8.0 + number)
              for number in range(1, 10)]
-    assert max(stuck) < 0.5, 'poses that do not move although the robot does'
+    assert max(stuck) < 0.5, 'constant poses of a moving robot'
 
 
 @pytest.mark.parametrize(('way_m', 'agrees'), [(0.0, False), (10.0, False), (33.0, True)])
@@ -304,7 +304,7 @@ def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     assert alone.source == 'keyframes'
     np.testing.assert_array_equal(session.covariance_for_filter(alone), fine)
     assert localize(4, by_keyframes=False).source == 'objects'
-    assert localize(5, deadline=0.0).source == 'objects', 'no time is left'
+    assert localize(5, deadline=0.0).source == 'objects', 'no time remains'
     assert not session.query.by_keyframes
 
 

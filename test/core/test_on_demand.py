@@ -68,7 +68,7 @@ def test_the_crops_that_say_most_come_first():
 def test_each_stage_has_more_crops_and_the_last_one_all():
     stages = searches(Crops(lambda rows: SURE[rows], np.array([5])))
     assert [len(stage.compared) for stage in stages] == [1, 1 + BATCH, 1 + 2 * BATCH, len(SEEN)]
-    assert stages[0].compared.tolist() == [5], 'what is known costs nothing'
+    assert stages[0].compared.tolist() == [5], 'known similarities cost nothing'
     assert sorted(stages[-1].compared) == list(range(len(SEEN)))
     for stage in stages:
         assert np.array_equal(stage.similarities, SURE[stage.compared])

@@ -84,7 +84,7 @@ def test_points_of_a_thorough_search_count_less():
     fast, thorough = (ask(Says(place(3.0, inliers=50, confirmed=0.5, is_thorough=is_thorough)),
                           objects=0) for is_thorough in (False, True))
     assert fast.accepted and not thorough.accepted
-    assert ask(Says(place(3.0, is_thorough=True)), objects=0).accepted, 'enough of them do'
+    assert ask(Says(place(3.0, is_thorough=True)), objects=0).accepted, 'more points suffice'
 
 
 def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
@@ -92,11 +92,11 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     assert strong.accepted and weak.accepted
     assert strong.source == weak.source == 'both'
     assert error_m(strong, 0.05) < 1e-12
-    assert error_m(weak) < 0.02, 'a few points hardly move the pose of objects'
+    assert error_m(weak) < 0.02, 'a few points hardly change the pose from objects'
     assert [len(seen.cameras) for seen in (strong, weak)] == [0, 1], \
-        'only a pose that rests on boxes checks their camera'
+        'only a pose from boxes checks the camera'
     points = ask(Says(place(0.05, inliers=9)), objects=0)
-    assert weak.evidence.by_points <= points.evidence.by_points, 'objects say no more for points'
+    assert weak.evidence.by_points <= points.evidence.by_points, 'objects add no more evidence'
 
 
 @pytest.mark.parametrize('cause', ['too few objects', 'a search cut short', 'earlier looks'])
@@ -151,7 +151,7 @@ def test_a_place_that_the_layer_covers_but_does_not_recognize_loses_confidence()
     covered, elsewhere = ask(Says(covers=1.0), objects=5), ask(Says(covers=0.0), objects=5)
     assert covered.confidence < elsewhere.confidence
     cut = ask(Says(covers=1.0, is_complete=False), objects=5)
-    assert cut.confidence == elsewhere.confidence, 'a search that was cut says nothing'
+    assert cut.confidence == elsewhere.confidence, 'an interrupted search gives no evidence'
 
 
 @pytest.mark.parametrize(('fields', 'kind'), [
@@ -195,7 +195,7 @@ def test_keyframes_tell_a_twin_that_they_cover_as_well_apart(covers):
     both = ask(Says(place(), place(20.0, inliers=190), covers=covers), room=two_rooms())
     assert not both.accepted and both.evidence.distinct < 0.6, 'both rooms are recognized'
     weak = ask(Says(place(inliers=8, confirmed=0.0), covers=covers), room=two_rooms())
-    assert weak.source == 'both' and weak.evidence.distinct < 0.6, 'chance points tell nothing'
+    assert weak.source == 'both' and weak.evidence.distinct < 0.6, 'chance points give no evidence'
 
 
 def test_fusing_takes_the_better_pose_of_each_direction():

@@ -121,7 +121,7 @@ def test_a_region_of_another_floor_decides_between_equal_floors():
 
 def test_a_confident_wrong_region_accepts_nothing_and_is_named():
     wrong = region(5.0, probability=1.0)
-    assert not ask(region=wrong).accepted, 'neither room is there'
+    assert not ask(region=wrong).accepted, 'neither room is recognized'
     refused = ask(make_room(), 3, region=wrong)
     assert refused.confidence < ask(make_room(), 3).confidence
     assert 'prior' in refused.reason

@@ -76,7 +76,7 @@ def test_instants_are_kept_and_replaced_as_a_whole(rng):
         found = localizer.answer(Query((*others, last), limit=5, length_s=60.0))
         return found, [len(instant.searched) for instant in localizer._instants]
     assert localize(0, np.eye(4))[1] == [4]
-    assert localize(1, np.eye(4))[1] == [4], 'a robot that stands replaces its instant'
+    assert localize(1, np.eye(4))[1] == [4], 'a standing robot replaces its instant'
     assert localize(2, STEP)[1] == [4, 4]
     found, kept = localize(3, STEP @ STEP)
     assert kept == [4, 4]

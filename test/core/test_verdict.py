@@ -80,7 +80,7 @@ def test_a_refusal_names_the_evidence_that_decided(what):
     fields, kind = WEAK[what]
     refused = refusal(replace(SURE, **fields), OPTIONS)
     assert refused.kind == kind
-    assert len(f'refused: {refused.reason}') <= 120, 'what services answer is one line'
+    assert len(f'refused: {refused.reason}') <= 120, 'answers of services have one line'
 
 
 def test_keyframes_that_are_sure_replace_what_objects_lack():

@@ -448,7 +448,7 @@ def test_a_pose_that_is_off_is_aligned_with_what_is_seen(room):
     near, far = (align(look_at(room, see(room, pose), options), moved(pose, 0.0, 0.0, degrees))
                  for degrees in (19.0, 21.0))
     assert near.away_deg == pytest.approx(19.0, abs=0.2)
-    assert far.away_deg < 20.0, 'a localizer is never so far off'
+    assert far.away_deg < 20.0, 'no localizer is that far off'
 
 
 @pytest.mark.parametrize(('similarities', 'matching'), [(False, 'class'), (True, 'hybrid')])

@@ -64,7 +64,8 @@ def write_bag(path, storage, parts, compression='NONE'):
         info['message_count'] += part_info['message_count']
         info['duration']['nanoseconds'] = (
             part_info['starting_time']['nanoseconds_since_epoch']
-            + part_info['duration']['nanoseconds'] - info['starting_time']['nanoseconds_since_epoch'])
+            + part_info['duration']['nanoseconds']
+            - info['starting_time']['nanoseconds_since_epoch'])
         for topic, more in zip(info['topics_with_message_count'],
                                part_info['topics_with_message_count'], strict=True):
             topic['message_count'] += more['message_count']

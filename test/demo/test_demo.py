@@ -108,7 +108,7 @@ def test_a_kidnapped_robot_is_noticed_stops_and_gets_its_pose_back(tmp_path):
     assert [step for *_, step in steps] == [
         'carried', 'noticed', 'it', 'relocalized', 'delivered', 'the']
     seconds = [float(second) for second, *_ in steps]
-    assert seconds == sorted(seconds), 'nothing is done before it stops'
+    assert seconds == sorted(seconds), 'no pose may be delivered before the robot stops'
     carried_m, most_looks, within_m = run_of_page('--kidnapped')
     assert int(steps[1][1]) <= most_looks
     assert float(re.search('delivered: ([0-9.]+) m', output)[1]) < within_m
@@ -191,5 +191,5 @@ def test_no_process_outlives_it(tmp_path, number, expected):
     assert process.returncode == expected
     deadline = time.monotonic() + 10
     while any(Path(f'/proc/{node}').exists() for node in nodes):
-        assert time.monotonic() < deadline, 'a node lives on'
+        assert time.monotonic() < deadline, 'a node is still running'
         time.sleep(0.05)

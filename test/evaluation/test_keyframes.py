@@ -128,7 +128,7 @@ def test_a_thorough_search_that_time_cuts_short_changes_nothing(layer, kitchen, 
     assert len(reads) == 2
     assert found.keyframe_search == 'fast'
     np.testing.assert_array_equal(found.map_from_camera, expected.map_from_camera)
-    assert not recognizer.begin_thorough(), 'no time is left'
+    assert not recognizer.begin_thorough(), 'no time remains'
 
 
 @pytest.mark.parametrize('name', ['dark and noisy', 'blurred', 'unevenly lit', 'half covered'])

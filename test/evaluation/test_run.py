@@ -390,7 +390,7 @@ def test_names_do_not_cover_each_other(inches):
     boxes = [name.get_window_extent() for name in names]
     assert not any(first.overlaps(second) for first, second in combinations(boxes, 2))
     assert all(axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 for box in boxes)
-    assert (len(names) == len(room)) == (inches > 2.0), 'a small map has no room for all'
+    assert (len(names) == len(room)) == (inches > 2.0), 'a small figure has no room for all names'
     highest = room.landmark_ids[int(np.argmax(room.centers[:, 2]))]
     assert highest in [name.get_text() for name in names]
     image = cv2.imdecode(np.frombuffer(png_of(figure, 50), np.uint8), cv2.IMREAD_COLOR)

@@ -79,7 +79,7 @@ def test_a_kill_leaves_one_whole_set(path):
         assert agree == {True}
         seen.add(number)
     print(f'150 kills, {len(seen)} sets')
-    assert len(seen) > 10, 'the kills come during writes'
+    assert len(seen) > 10, 'the kills happen during writes'
 
 
 def test_files_of_another_set_are_refused(path):
@@ -143,8 +143,8 @@ def test_two_writers_at_once_leave_one_whole_set(path):
     fork = multiprocessing.get_context('fork')
     for turn in range(20):
         writers = [fork.Process(target=lambda numbers: [write_set(path, tag) for tag in numbers],
-                                args=(range(100 * turn + 10 * writer_number, 100 * turn + 10 * writer_number + 10),))
-                   for writer_number in range(2)]
+                                args=(range(first, first + 10),))
+                   for first in (100 * turn, 100 * turn + 10)]
         for writer in writers:
             writer.start()
         for writer in writers:
@@ -225,7 +225,7 @@ def test_two_processes_of_one_number_share_a_folder(tmp_path):
     writers = [subprocess.Popen([*own_numbers(), sys.executable, '-c', code,
                                  str(path), str(number)], stdout=subprocess.PIPE, text=True)
                for number in range(2)]
-    assert len({writer.stdout.readline() for writer in writers}) == 1, 'they have one number'
+    assert len({writer.stdout.readline() for writer in writers}) == 1, 'all have the same number'
     reads = 0
     while any(writer.poll() is None for writer in writers):
         if path.exists():

@@ -385,7 +385,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     assert kinds['data:image/png;b'] == 4
     assert kinds['data:image/jpeg;'] >= 5, 'five duplicates are shown'
 
-    assert page.index('What to do first') < page.index('<details>'), 'only the rest is folded'
+    assert page.index('What to do first') < page.index('<details>'), 'only the others are folded'
     assert tags.found['u'] == len(report.measures) == 8, 'each threshold has a bar'
     assert 'http' not in page
     assert json.loads((tmp_path / DATA).read_text())['landmarks'][0]['faults']

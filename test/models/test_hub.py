@@ -112,7 +112,7 @@ def test_a_download_is_made_once_and_of_what_is_needed(hub, tmp_path):
     assert tmp_path / 'cache/weights' in found.parents
     hub.requests.clear()
     assert Path(resolve(tmp_path / 'cache')['network']) == found
-    assert hub.requests == [], 'a robot without a network does not wait for one'
+    assert hub.requests == [], 'a robot without a network does not wait for it'
     copied = tmp_path / 'cache'
     copied.rename(tmp_path / 'carried')
     assert 'carried' in resolve(tmp_path / 'carried', HF_HUB_OFFLINE='1')['network']

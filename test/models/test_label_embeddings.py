@@ -227,7 +227,7 @@ def test_another_view_is_encoded_anew(observer):
 
 def test_without_time_no_crop_fits_and_a_slow_moment_passes(encoder):
     observer = Observer(encoder, np.eye(encoder.embed_dim, dtype=np.float32))
-    assert observer.crops_within(0.001) == 1, 'nothing is known of its speed'
+    assert observer.crops_within(0.001) == 1, 'its speed is unknown'
     observer.measure()
     assert observer.crops_within(0.0) == observer.crops_within(-np.inf) == 0
     assert observer.crops_within(np.inf) > 10

@@ -157,5 +157,5 @@ def test_one_detector_serves_all_cameras_in_turn(start, tester):
             tester.destroy_publisher(publisher)
     stamps = [{msg.header.stamp.sec for msg in messages} for messages in heard.values()]
     assert {msg.header.frame_id for msg in heard['left']} == {'left'}
-    assert len(set.intersection(*stamps)) >= 3, f'of the same instants: {stamps}'
+    assert len(set.intersection(*stamps)) >= 3, f'images of the same instants: {stamps}'
     assert 'Traceback' not in process.output()

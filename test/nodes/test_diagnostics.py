@@ -49,7 +49,7 @@ def test_a_relocalizer_that_hears_everything_nothing_and_half(own_relocalizer, t
     assert {'waiting last [ms]', 'queue age [s]', 'images dropped unpaired',
             'frames skipped while busy', 'memory [MiB]'} <= set(values)
     tester.wait(lambda: float(status.wait(OK, 'active', frame)['image rate [Hz]']) > 1.0,
-                'images to be counted')
+                'a count of images')
     status.wait(WARN, 'no image on /image for', (frame[1], frame[2]))
     status.wait(ERROR, 'no camera_info on /camera_info for', (frame[0], frame[2]))
     tester.destroy_publisher(tester.infos)

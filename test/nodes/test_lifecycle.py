@@ -142,7 +142,7 @@ def test_deactivation_answers_the_request_that_waits(manage, tester, room_map):
     tester.connect()
     manager.do('configure', 'activate')
     future = tester.ask()
-    tester.wait(lambda: tester.listened_to() == 3, 'the relocalizer to listen')
+    tester.wait(lambda: tester.listened_to() == 3, 'the relocalizer to subscribe')
     manager.do('deactivate')
     answer = tester.answer(future)
     assert not answer.success

@@ -72,7 +72,7 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     assert (refused.passed, fields['verdict'], fields['kind']) == (
         b'\x00', 'refused', 'too_few_objects')
     assert 'x [m]' not in fields
-    tester.wait(lambda: heard[-1].status == refused.status, 'the same on the topic')
+    tester.wait(lambda: heard[-1].status == refused.status, 'the same answer on the topic')
     assert int(refused.id) == int(fields['answer']) > 1
     tester.destroy_subscription(subscription)
 
@@ -97,7 +97,7 @@ def test_frames_out_of_order_and_time_going_back(relocalizer, tester):
 
 def test_requests_that_wait_together_reset_the_localizer_once(relocalizer, tester):
     futures = [tester.ask() for _ in range(10)]
-    tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to listen')
+    tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to subscribe')
     tester.feed_until(lambda: all(future.done() for future in futures), make_frame())
     assert all(future.result().success for future in futures)
     tester.wait(lambda: tester.initial_poses, 'an initial pose')

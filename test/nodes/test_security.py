@@ -51,7 +51,7 @@ def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
     tester.ask()  # the node subscribes to odometry during a request
     check(tester, 'relocalizer', '/image/compressed', '/depth/compressedDepth', '/clock')
     process.stop()
-    tester.wait(lambda: 'relocalizer' not in tester.get_node_names(), 'the first one to be gone')
+    tester.wait(lambda: 'relocalizer' not in tester.get_node_names(), 'the end of the first node')
     own_relocalizer(image_transport='compressed', use_sim_time='true',
                     depth_transport='compressed')
     tester.ask()

@@ -102,7 +102,7 @@ def test_stamps_that_name_no_image_pair_nothing(relocalizer, tester, ask, health
     health.clear()
     camera = Camera(lambda message: tester.publish([message]), right)
     assert ask(camera).success
-    tester.wait(lambda: (DiagnosticStatus.OK, 'active') in health, 'no problem any more')
+    tester.wait(lambda: (DiagnosticStatus.OK, 'active') in health, 'the end of the problem')
 
 
 def test_late_detections_with_the_stamp_of_their_image_are_right(relocalizer, tester, ask):

@@ -160,7 +160,7 @@ def test_an_interrupt_stops_the_robot(relocalizer, start, end, tester, serve_spi
     process.send(signal.SIGTERM)
     assert end(process) == INTERRUPTED
     assert spinner.cancelled.done()
-    tester.wait(lambda: tester.listened_to() == 0, 'the poor frames to be gone')
+    tester.wait(lambda: tester.listened_to() == 0, 'the end of the poor frames')
     assert tester.relocalize(make_frame()).success
 
 

@@ -91,6 +91,6 @@ def wheels(robot, make_node):
     wheels = make_node('wheels').create_publisher(Odometry, 'odom', 10)
     robot.odometry.open()
     robot.wait(lambda: wheels.get_subscription_count() and robot.odometry.is_published,
-               'the wheels to be heard')
+               'the discovery of the odometry')
     yield wheels
     robot.odometry.close()

@@ -41,7 +41,7 @@ def pixels_of(canvas, color):
 def test_boxes_and_outlines_are_where_they_were_seen(room, found):
     seen = grey_image(room)
     canvas = draw_debug_image(seen, found, room, '')
-    assert (seen.image_rgb == 128).all(), 'the image itself stays'
+    assert (seen.image_rgb == 128).all(), 'the image itself is unchanged'
     box = seen.observation.detections.bboxes_xyxy[0]
     middle = (box[:2] + box[2:]) / 2
     outline = pixels_of(canvas, ELLIPSE)
@@ -85,9 +85,9 @@ def test_the_best_keyframe_is_beside_the_image(room, found):
     assert draw_debug_image(seen, recognized(found), room, '').shape == alone.shape
     without = draw_debug_image(replace(seen, layer=layer_of(room)), recognized(found), room, '')
     height, width = alone.shape[:2]
-    assert without.shape == alone.shape, 'no empty half where no image is stored'
+    assert without.shape == alone.shape, 'no empty half if no image is stored'
     assert (alone == draw_debug_image(seen, found, room, '')).all()
-    assert np.ptp(without[140, 290].astype(int)) > 200, 'points that agree are drawn all the same'
+    assert np.ptp(without[140, 290].astype(int)) > 200, 'points that agree are drawn anyway'
     jpeg = cv2.imencode('.jpg', np.full((192, 256, 3), (200, 30, 30), np.uint8)[..., ::-1])[1]
     shown = draw_debug_image(replace(seen, layer=layer_of(
         room, images=jpeg.ravel(), image_offsets=np.array([0, jpeg.size]))),

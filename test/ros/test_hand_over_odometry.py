@@ -72,7 +72,7 @@ def test_an_image_newer_than_odometry_waits_for_it(listening, wheels, x_m, has_m
     stand(listening, wheels, {-2.0: 0.0, -1.0: 0.0})
     with ThreadPoolExecutor(1) as pool:
         handing_over = pool.submit(is_withheld, listening)
-        listening.wait(lambda: listening.odometry._heard._waiters, 'it to wait for odometry')
+        listening.wait(lambda: listening.odometry._heard._waiters, 'a wait for odometry')
         stand(listening, wheels, {0.3: x_m})
         assert ('has moved by 1.00 m' in handing_over.result()) == has_moved
 

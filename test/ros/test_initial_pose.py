@@ -81,7 +81,7 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
     robot.meet()
     with ThreadPoolExecutor(1) as pool:
         handing_over = pool.submit(robot.hand_over)
-        robot.wait(lambda: robot.odometry._heard._waiters, 'it to wait for odometry')
+        robot.wait(lambda: robot.odometry._heard._waiters, 'a wait for odometry')
         robot.jump()
         tell(robot, wheels, TEN_HZ)
         with pytest.raises(TimeJumpError):

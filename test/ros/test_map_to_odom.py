@@ -125,7 +125,7 @@ def test_a_jump_or_a_restart_ends_the_broadcast_until_the_next_pose(robot, resta
     for at in (received_at, time.monotonic())[:1 if restart_s <= 100.0 else 2]:
         with pytest.raises(TimeJumpError):
             robot.map_to_odom.update(header, MAP_FROM_BASE, PARAMETERS, at)
-    robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'what is on its way')
+    robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'messages in transit')
     robot.heard.clear()
     end = time.monotonic() + 0.5  # five periods
     robot.spin_until(lambda: time.monotonic() > end, 'silence')
@@ -147,13 +147,13 @@ def test_transforms_from_before_a_jump_are_forgotten(robot, restart_s):
         robot.tell(seconds, x_m)
     robot.transforms.forget()
     assert robot.place(99.5) is None and robot.place(100.0) is None
-    assert robot.place(0.0, 'shelf') == 7.0, 'nobody says it again'
+    assert robot.place(0.0, 'shelf') == 7.0, 'the transform is not repeated'
     # a late message from before
     robot.tell(100.02, 3.0)
     for seconds, x_m in ((restart_s, 11.0), (restart_s + 1.0, 12.0)):
         robot.tell(seconds, x_m)
     assert robot.place(restart_s + 0.5) == pytest.approx(11.5)
-    assert robot.place(restart_s + 2.0) is None, 'not interpolated to one from before'
+    assert robot.place(restart_s + 2.0) is None, 'no interpolation across the jump'
 
 
 @pytest.mark.needs('tf2_ros')

@@ -273,4 +273,4 @@ def test_the_way_is_what_was_driven_not_how_far_it_led():
     rng = np.random.default_rng(0)  # visual odometry jitters by millimetres
     for tick in range(50 * 50, 110 * 50):
         window.add(tick * S // 50, rng.normal(0.0, 0.002, 3), UPRIGHT)
-    assert window.way_at(109 * S) < 0.2, 'each run begins with none'
+    assert window.way_at(109 * S) < 0.2, 'each run starts at a distance of 0'

@@ -219,7 +219,7 @@ def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
     start = time.monotonic()
     requests = [clients.submit(node.requests.answer) for _ in range(4)]
     wait(lambda: all(request.done() for request in requests), 'the answers')
-    assert time.monotonic() - start < 0.9, 'they wait side by side'
+    assert time.monotonic() - start < 0.9, 'they wait concurrently'
     assert all('nobody publishes /image' in request.result().message for request in requests)
 
 

@@ -54,7 +54,7 @@ class Ear:
 
     def wait_for_policies(self, *policies):
         self.wait(lambda: self.policies() == list(policies),
-                  f'{[policy.name for policy in policies]} as the subscriptions')
+                  f'{[policy.name for policy in policies]} as the set of subscriptions')
 
     def wait_for_hearing(self, publisher, name):
         def heard():

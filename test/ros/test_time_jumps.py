@@ -98,10 +98,10 @@ def test_messages_from_before_a_jump_are_refused(simulation, jumps):
     after = time.monotonic()
     with pytest.raises(TimeJumpError, match=r' 5\.000 s'):
         jumps.check(stamp(99.9), before)
-    assert is_refused(jumps, 95.0, before), 'its counterparts may be from before'
+    assert is_refused(jumps, 95.0, before), 'its counterparts may be from before the jump'
     assert is_refused(jumps, 99.9, after), 'it waited in the middleware'
     assert not is_refused(jumps, 95.0, after) and not is_refused(jumps, 94.9, after)
-    assert is_refused(jumps, 99.9, after + 60.0), 'so it did for long'
+    assert is_refused(jumps, 99.9, after + 60.0), 'it waited for a long time'
     simulation.set_time(99.9)
     assert not is_refused(jumps, 99.9, after), 'time went on'
 
@@ -211,7 +211,7 @@ def test_what_was_heard_before_a_jump_is_forgotten(simulation, restart_s):
     simulation.set_time(restart_s)
     assert not inputs.is_known(100.0)
     inputs.pair(simulation, restart_s, Image)
-    assert not inputs.complete, 'an image of now with boxes from before'
+    assert not inputs.complete, 'a new image with boxes from before the jump'
     simulation.spin_until(lambda: inputs.is_known(restart_s), 'odometry and vertical',
                           lambda: inputs.publish(restart_s, Odometry, Imu))
     assert inputs.run(restart_s) != run, 'frames across the jump are not fused'

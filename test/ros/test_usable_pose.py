@@ -50,4 +50,4 @@ def test_the_stamp_is_the_images_but_not_later_than_now(image_s, now_s, publishe
     usable = usable_pose(pose, Time(seconds=now_s))
     assert usable.header.stamp.sec == published_s
     assert usable.header.frame_id == 'map'
-    assert pose.header.stamp.sec == image_s, 'what is published elsewhere is not touched'
+    assert pose.header.stamp.sec == image_s, 'the published message is not changed'

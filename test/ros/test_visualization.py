@@ -47,7 +47,7 @@ def test_each_is_made_for_itself(visualization, make_node, spin_until, topic, me
     found = Relocalizer(ROOM, RelocalizerOptions(matching='class', algorithm='bf')).relocalize(
         [Observation(CAMERA, see_room(ROOM))])
     if topic == 'debug_image':
-        spin_until([node, viewer], lambda: shown.wants_debug_image, 'it to be wanted')
+        spin_until([node, viewer], lambda: shown.wants_debug_image, 'a subscriber')
         shown.show(HEADER, None, None, None)  # the others have no subscriber
         return
     spin_until([node, viewer], lambda: heard, 'what is shown',

@@ -52,7 +52,7 @@ def test_boxes_are_of_another_image_or_convention(queries, change, level, expect
 def test_the_table_counts_each_request_once(capsys):
     assert run(['stress', '--worlds', '1', '--kinds', 'room', '--only', 'two identical']) == 0
     _, _, *rows = capsys.readouterr().out.strip().splitlines()
-    assert len(rows) == 3, 'one for each mode'
+    assert len(rows) == 3, 'one row for each mode'
     for row in rows:
         _, _, _, requests, success, found, false, *_ = row.strip('| ').split(' | ')
         shares = [float(share) for share in success.split()]

@@ -24,7 +24,7 @@ def test_coverage_and_look_alikes(chromium, path):
         person.mode('Test')
         person.click('Coverage and look-alikes')
         person.row('cup_0').click()
-        wait_for(lambda: document.selection == ('cup_0',), 'the page answers meanwhile')
+        wait_for(lambda: document.selection == ('cup_0',), 'the page stays responsive')
         page.get_by_text('pairs of places that look alike: 1').wait_for()
         person.picture('places')
         tiles = server.scene._handle_from_node_name['/coverage/tiles']

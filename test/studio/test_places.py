@@ -49,7 +49,7 @@ def test_an_edit_changes_the_figures_and_the_positions_stay(studio):
     assert any(line.endswith('alike: 0 (was 1)') for line in lines)
     assert any(re.search(r'\d+ of \d+ \(was \d+ of \d+\)', line) for line in lines)
     again = find_places(document.landmarks, None, after, silent)
-    assert again.figures == after.figures, 'equal maps, equal figures'
+    assert again.figures == after.figures, 'equal maps give equal numbers'
 
 
 def test_the_time_is_bounded(studio):
@@ -107,6 +107,6 @@ def test_a_search_is_stopped_and_grows_old(studio):
     document.edit(edits.delete, ['cup_0'])
     assert studio.is_stale
     document.undo()
-    assert not studio.is_stale, 'the map is as it was'
+    assert not studio.is_stale, 'the map is unchanged'
     document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
     assert not studio.is_stale, 'a lock changes nothing'

@@ -53,13 +53,13 @@ def test_clip_offers_phrases_for_what_the_images_show(path):
     truth = studio.document.landmarks['bowl_1'].label
     studio.document.edit(edits.set_fields, ['bowl_1'], label='something')
     studio.document.select(['bowl_1'])
-    assert studio.phrases('bowl_1').phrases[0] != truth, "the class's labels as long as CLIP loads"
+    assert studio.phrases('bowl_1').phrases[0] != truth, 'labels of the class while CLIP loads'
     found, notes = wait_for_phrases(studio)
     print(f'{truth}: {found}')
     assert len(found) == 5 and truth in found
     assert len(notes) == 1 and studio.phrases('bowl_1').note == ''
     studio.document.edit(edits.set_fields, ['bowl_1'], center=[1, 1, 1])
-    assert studio.phrases('bowl_1').phrases == found, 'a drag asks nothing'
+    assert studio.phrases('bowl_1').phrases == found, 'a drag requests no phrases'
     studio.stop()
     studio.document.close()
 
@@ -92,7 +92,7 @@ def test_a_new_landmark_has_the_mean_of_its_boxes(path, tmp_path):
         studio.show_view(view)
         box = studio.recording.detections.detections_of(view).bboxes_xyxy[0]
         studio.new.draw(view, box[:2], box[2:])
-    assert studio.new.class_id == 'bowl', 'of the box that the detector has there'
+    assert studio.new.class_id == 'bowl', 'the class of the detected box there'
     studio.new.create('something', 'bowl')
     found, _ = wait_for_phrases(studio)
     assert len(found) == 5

@@ -96,7 +96,7 @@ def test_walls_lie_where_the_grid_has_them(server, yaw):
     in_grid = Rotation.from_euler('z', -yaw).apply(points - [-1.0, 2.0, 0.0])
     cells = {(int(y), int(x)) for x, y in np.floor(in_grid[:, :2] / 0.1)}
     assert cells == {(4, 33), (20, 7)}
-    assert turn.apply([0.0, 0.0, 1.0])[2] == pytest.approx(-1.0), 'its face is up'
+    assert turn.apply([0.0, 0.0, 1.0])[2] == pytest.approx(-1.0), 'its face points up'
 
 
 def test_other_answers_take_the_place_of_the_first_ones(server, studio, recwarn):
