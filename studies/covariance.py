@@ -35,7 +35,7 @@ from studies.reports import draw, interval, print_section, table
 from studies.wrong_sensors import with_mount_error
 
 MODES = ('one image', 'vertical', 'five images', 'five, vertical')
-_FREEDOMS = (6, 3, 3)  # of the whole error, of position and of orientation
+_FREEDOMS = (6, 3, 3)  # of the pose error, the position error and the orientation error
 
 
 def squares_of(place: Place, seed: int) -> Iterator[tuple[str, tuple[float, ...]]]:

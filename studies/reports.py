@@ -145,26 +145,26 @@ def crossed_table[One: Answer](answers: Iterable[One], row: str, column: str,
 
 
 def success_cell(answers: Sequence[Answer]) -> str:
-    """Return the share within .5 m; how many are accepted, and of these false."""
+    """Return the share of poses within .5 m, and accepted_cell."""
     within = np.mean([answer.error_m < FAR_M for answer in answers])
     return f'{short(float(within))}; {accepted_cell(answers)}'
 
 
 def accepted_cell(answers: Sequence[Answer]) -> str:
-    """Return how many answers are accepted, and of these false."""
+    """Return the numbers of accepted answers and of false accepts."""
     accepted = [answer for answer in answers if answer.accepted]
     return f'{len(accepted)} of {len(answers)}, {sum(not answer.right for answer in accepted)}'
 
 
 def recall_cell(answers: Sequence[Answer]) -> str:
-    """Return accepted_cell, and the share of right answers that is accepted."""
+    """Return accepted_cell, and the recall of the correct answers."""
     accepted = [answer.accepted for answer in answers if answer.right]
     recall = short(float(np.mean(accepted))) if accepted else '-'
     return f'{accepted_cell(answers)}; {recall}'
 
 
 def short(share: float) -> str:
-    """Return a share with two digits and no leading zero."""
+    """Format a share with two digits and no leading zero."""
     return f'{share:.2f}'.removeprefix('0')
 
 

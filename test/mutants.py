@@ -67,9 +67,9 @@ _PATIENCE_S, _MOST_S = 60.0, 20.0
 
 
 class Record(NamedTuple):
-    """What a test ran."""
+    """The processor time of a test, and the lines that it ran."""
 
-    seconds: float  #: Of processor time, of this process
+    seconds: float  #: Processor time of this process [s]
     lines: frozenset[tuple[str, int]]  #: File, relative to the project, and line
 
 
@@ -78,10 +78,10 @@ class Mutant(NamedTuple):
 
     file: str
     line: int
-    number: int  #: Of the faults of this file
+    number: int  #: Number of the fault in its file
     what: str
-    lines: tuple[int, ...]  #: Those of its statement; a test that runs one of them runs it
-    names: tuple[str, ...]  #: Where it runs at import: names that it defines
+    lines: tuple[int, ...]  #: Lines of its statement; a test that runs one of them runs it
+    names: tuple[str, ...]  #: Names that the statement defines, if it runs on import
     function: tuple[str, int] | None  #: Name and first line of the outermost function around it
     is_compiled: bool  #: Whether numba compiles it
 
@@ -90,8 +90,8 @@ class Outcome(NamedTuple):
     """The result of the tests for a fault."""
 
     mutant: Mutant
-    tests: int  #: How many tests could notice it
-    killer: str = ''  #: The test that noticed it, or 'time' where they did not end
+    tests: int  #: Number of tests that could detect it
+    killer: str = ''  #: The test that detected it, or 'time' if a test did not end
 
 
 # ---- faults -------------------------------------------------------------------------------------
@@ -587,18 +587,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog='python test/mutants.py', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = parser.add_subparsers(required=True)
-    part = parts.add_parser('record', help='note which lines tests run')
+    part = parts.add_parser('record', help='record the lines that tests run')
     part.add_argument('tests', nargs=argparse.REMAINDER,
                       help='arguments of pytest, such as test/core')
     part.add_argument('--plain', type=float, default=0.0, metavar='S',
                       help='kernels are not compiled; tests that take longer are left out')
     part.set_defaults(run=record)
     part = parts.add_parser('run', help='plant faults')
-    part.add_argument('folders', nargs='+', help='of the package, such as core ros/inputs')
+    part.add_argument('folders', nargs='+', help='folders of the package, such as core ros/inputs')
     part.add_argument('--seed', type=int, default=0)
     part.add_argument('--count', type=int, default=300)
     part.add_argument('--workers', type=int, default=2)
-    part.add_argument('--only', default='', help='faults in FILE or FILE:LINE alone')
+    part.add_argument('--only', default='', help='only faults in FILE or FILE:LINE')
     part.set_defaults(run=run)
     arguments = parser.parse_args()
     warnings.filterwarnings('ignore', '.*use of fork', DeprecationWarning)

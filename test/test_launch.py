@@ -19,7 +19,7 @@ LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
 POLICY = LAUNCH.parent / 'config/security_policy.xml'
 DOCUMENTS = [LAUNCH.parent / 'README.md', *sorted((LAUNCH.parent / 'doc').glob('*.md'))]
 TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
-# topics in the nodes' private namespaces, and those of ROS at the root
+# names in the private namespaces of both nodes, and ROS's names at the root
 OWN = re.compile('/(detector|relocalizer|wake_up|diagnostics|clock|parameter_events|rosout|'
                  'tf(_static)?)(/.*)?$')
 

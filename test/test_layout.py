@@ -90,7 +90,7 @@ def test_imports_point_downwards():
 
 
 def test_each_folder_stands_in_one_layer():
-    """Only core, ros and offline have layers of their own."""
+    """Only core, ros and offline have separate layers."""
     folders = [prefix.partition('.')[0] for prefixes in LAYERS for prefix in prefixes]
     twice = {name for name in folders if folders.count(name) > 1}
     assert twice == {'core', 'ros', 'offline'}

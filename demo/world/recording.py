@@ -103,7 +103,7 @@ def find_boxes(room: Room, renderer: Renderer, map_from_camera: npt.NDArray[np.f
 def _outline_px(item: WorldObject, map_from_camera: npt.NDArray[np.float64]) -> int:
     """Count the pixels that an object would cover alone in an unbounded image.
 
-    The result is 0 for an object that reaches the camera or is too near to be seen whole.
+    The result is 0 for an object that reaches the camera or is too near to be completely visible.
     """
     camera_from_object = invert_transform(map_from_camera) @ item.map_from_object
     hulls = []
@@ -132,8 +132,9 @@ def write_fitted_map(path: Path, room: Room, renderer: Renderer,
                      poses: npt.NDArray[np.float64], *, seed: int) -> None:
     """Write a map with ellipsoids fitted to the boxes of many views, as in a mapping run.
 
-    The fit uses views that show an object whole and hardly covered, with boxes perturbed by a
-    pixel like a detector's. An object with fewer than three such views keeps its exact ellipsoid.
+    The fit uses views that show an object completely and almost unoccluded. Boxes are perturbed by
+    a pixel, like those of a detector. An object with fewer than three such views keeps its exact
+    ellipsoid.
     """
     rng = np.random.default_rng(seed)
     views: dict[str, list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]] = {}

@@ -8,9 +8,9 @@ covered ones, and to other rooms. The second gives the odds that a place is genu
 picture of it, from the signs in all records, given the verdict without them.
 
 Robots see places far more often than pictures of them, so untroubled images have a greater weight.
-This weight was chosen so large that no more pictures, moved halves and wrong cameras are accepted
-than before the thorough pass. Of the pictures on up to 30 % of the image, fewer than 1 % are
-accepted in rooms outside the fit.
+This weight was chosen as large as possible without accepting more pictures, moved halves and wrong
+cameras than before the thorough pass was introduced. Of the pictures on up to 30 % of the image,
+fewer than 1 % are accepted in rooms outside the fit.
 """
 
 import pickle

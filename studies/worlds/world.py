@@ -148,7 +148,7 @@ class Drive:
 
     world: World
     size: tuple[float, float]  #: Size of the place, from (0, 0) [m]
-    #: (L,): landmarks whose object was taken away or moved since the place was mapped
+    #: (L,): landmarks whose object was removed or moved since the place was mapped
     changed: NDArray[np.bool_]
     #: (L,): landmarks that are not where an object of their class is, or have another class
     wrong: NDArray[np.bool_]

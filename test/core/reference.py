@@ -51,8 +51,8 @@ def scene_of(room, map_from_camera=MAP_FROM_CAMERA, rows=slice(None), noise_px=0
 def sample_pose(scene: Scene, sample: NDArray[np.int64]) -> tuple[Pose | None, float]:
     """Return the hypothesis of a minimal sample, and the sum of the IoUs of its three pairs.
 
-    The hypothesis is the P3P solution with the greatest sum, of those for which all three
-    ellipsoids lie wholly in front of the camera; None if there is none.
+    The hypothesis is the P3P solution with the greatest sum among those for which all three
+    ellipsoids lie completely in front of the camera; None if there is none.
     """
     detections, landmarks = scene.pairs[sample].T
     best, best_total = None, -1.0

@@ -74,7 +74,7 @@ def test_errors_of_a_camera_are_found_with_the_pose(errors, rng):
     for _ in range(12):
         pose = place(rng)
         right, rotation, translation = matches(boxes_of(ROOM, pose), pose)
-        # the boxes whose correction gives these boxes
+        # the uncorrected boxes of these corrected ones
         pairs = right.copy()
         for axis, scale in enumerate(np.exp(errors[0] + errors[1] * np.array([0.5, -0.5]))):
             pairs[:, axis] = scale * (right[:, axis] + 2.0 * errors[4 + axis]

@@ -36,10 +36,10 @@ class Hub(http.server.BaseHTTPRequestHandler):
     """The parts of a model hub that a download needs."""
 
     files: dict[str, bytes]
-    #: What is sent in place of a file
+    #: Content that is sent in place of a file
     sent: dict[str, bytes]
     requests: list[str]
-    #: A file that is sent in part, and how much of it
+    #: A file that is sent in part, and the size of this part
     broken: tuple[str, int] | None
 
     def do_HEAD(self):

@@ -133,7 +133,7 @@ def test_only_an_active_relocalizer_localizes(manage, tester, room_map):
     tester.answer(tester.ask_reinitialize())
     assert not tester.answer(tester.ask()).success
     share = processor_share(process, tester)
-    print(f'\ninactive beside a camera: {100 * share:.1f} % of a core')
+    print(f'\ninactive with a camera running: {100 * share:.1f} % of a core')
     assert share < 0.05
 
 

@@ -29,7 +29,7 @@ RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class TakingLocalizer:
-    """Publishes each initial pose at once as its pose, while it is on."""
+    """Publishes each initial pose at once as its estimate, while it is switched on."""
 
     def __init__(self, node, namespace=''):
         self.is_on, self.frame = True, None

@@ -44,11 +44,11 @@ class Robot:
         self._tester, self._tick, self.image_every = tester, 0, 2
         self._odom = tester.create_publisher(Odometry, 'odom', RELIABLE)
         self.speed_m_s, self._x, self._sign = 0.3, 0.0, 1.0
-        #: (4, 4): where its run of odometry began; another one after it was carried away.
+        #: (4, 4): start of its run of odometry; another pose after a kidnap.
         self.start = MAP_FROM_CAMERA @ aside(-1.5)
         #: The localizer's estimate of it.
         self.map_from_odom = self.start
-        #: Of what it shows: a number, or NaN.
+        #: Error of its published poses: a number, or NaN.
         self.error_m = 0.0
         self.frame_id, self.has_odom, self.has_localizer, self.sees = 'map', True, True, True
         self.clock, self.on_tick = time.time, lambda now_s, map_from_odom, odom_from_base: None
