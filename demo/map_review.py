@@ -114,7 +114,7 @@ def review_map(landmark_map: LandmarkMap, objects: Sequence[TrueObject],
         if offset_m >= NEAR_M:
             false[landmark] = f'nothing is there; {nearest.object_id} is {offset_m:.2f} m away'
         elif nearest.class_id == landmark_map.class_ids[landmark]:
-            false[landmark] = f'{nearest.object_id} a second time'
+            false[landmark] = f'a duplicate of {nearest.object_id}'
         else:
             false[landmark] = f'{nearest.object_id} is there: {nearest.label}'
     missed = {}

@@ -185,7 +185,7 @@ def _missing(names: Sequence[str], sources: Sources, out: Path) -> list[Download
 
 
 def _say_plan(names: Sequence[str], sources: Sources, out: Path) -> None:
-    """Print the plan; OptionsError: the disk has not enough free space for it."""
+    """Print the plan; OptionsError: the disk does not have enough space."""
     missing = _missing(names, sources, out)
     print('\n'.join(f'{name}: {sources.recordings[name].name}' for name in names))
     if missing:

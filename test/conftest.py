@@ -83,7 +83,7 @@ def pytest_configure(config):
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
-    """Deselect tests that need a missing module; sort the rest by expected duration."""
+    """Deselect tests that need a missing module; sort the others by expected duration."""
     if config.getoption('--quick'):
         slow = [item for item in items
                 if item.get_closest_marker('full') or item.get_closest_marker('clock')]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A small map with all files next to it: embeddings, keyframes, record of its origin."""
+"""A small map with all files next to it: embeddings, keyframes, and a record of its origin."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ ROOM = make_room()
 
 
 def made_map(number):
-    """Return a map whose files all contain its number: the room is moved by it."""
+    """Return a map whose files all contain its number, by which the room is also moved."""
     landmark_map = replace(ROOM, centers=ROOM.centers + np.array([0.01, 0.0, 0.0]) * number)
     count = len(ROOM)
     row = np.zeros((1, 8), dtype=np.float16)

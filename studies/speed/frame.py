@@ -144,7 +144,7 @@ def _measure(engine: str, yolo: str, clip: str, folder: str, *, crops: int, roun
         lambda: relocalizer.relocalize([observation]))
     wall_ms, processor_ms = [], []
     for stage in stages:
-        stage()  # kernels and memory for these sizes
+        stage()  # warm-up for these sizes
         times = []
         for _ in range(rounds):
             begin, used = time.perf_counter(), time.process_time()

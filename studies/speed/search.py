@@ -105,7 +105,7 @@ def _measure_hypotheses(scene: Scene) -> None:
     leaders = Leaders.none_yet()
     drain(strategies.search_samples(scene, samples[:_PLAIN_HYPOTHESES], leaders))
     print(f'{len(scene.bearings)} boxes, {len(scene.potential.detections)} pairs, one core:\n'
-          f'  {whole_us / solved:7.2f} us a hypothesis, P3P to whole verification\n'
+          f'  {whole_us / solved:7.2f} us a hypothesis, from P3P to complete verification\n'
           f'  {searched_us / len(samples):7.2f} us a sample, in a search\n'
           f'  {five_hundred_ms:7.2f} ms for N = 500\n'
           f'  {plain_us:7.0f} us a hypothesis, plain loop over OpenCV and NumPy: '
@@ -166,7 +166,7 @@ def _plain_pose(scene: Scene, duals: list[NDArray[np.float64]], pairs: NDArray[n
         pose = np.concatenate([cv2.Rodrigues(vector)[0], translation], axis=1)
         ious = [_plain_iou(scene.box_ellipses[detection], _plain_outline(pose, duals[landmark]))
                 for detection, landmark in pairs]
-        if sum(ious) > best_total:  # never true of NaN
+        if sum(ious) > best_total:  # always false for NaN
             best, best_total = pose, sum(ious)
     return best
 

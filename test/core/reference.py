@@ -59,7 +59,7 @@ def sample_pose(scene: Scene, sample: NDArray[np.int64]) -> tuple[Pose | None, f
     for pose in zip(*solve_p3p(scene.bearings[detections], scene.centers[landmarks]), strict=True):
         total = sum(pair_iou(scene, detection, outline) for detection, outline in zip(
             detections, outlines_of(scene, landmarks, pose), strict=True))
-        if total > best_total:  # never true of NaN
+        if total > best_total:  # always false for NaN
             best, best_total = pose, total
     return best, best_total
 
@@ -81,7 +81,7 @@ def score(scene: Scene, potential: NDArray[np.bool_], pose: Pose
         best = scene.iou_threshold
         for landmark in np.nonzero(mask)[0]:
             iou = pair_iou(scene, detection, outlines[landmark])
-            if iou > best:  # never true of NaN
+            if iou > best:  # always false for NaN
                 best, landmarks[detection] = iou, landmark
         total += best if landmarks[detection] >= 0 else 0.0
     return total, landmarks

@@ -59,7 +59,7 @@ def test_each_object_has_at_most_one_landmark_of_its_class(review):
 def test_false_landmarks_say_what_is_there(review):
     ids = review.landmark_map.landmark_ids
     false = {ids[landmark]: text for landmark, text in review.false.items()}
-    assert false == {'mug_b': 'mug_1 a second time', 'mug_c': f'can_1 is there: {HOSTILE}',
+    assert false == {'mug_b': 'a duplicate of mug_1', 'mug_c': f'can_1 is there: {HOSTILE}',
                      'mug_d': 'nothing is there; bowl_1 is 3.00 m away'}
 
 

@@ -155,7 +155,7 @@ def test_two_writers_at_once_leave_one_whole_set(path):
 
 
 def test_what_a_killed_writer_left_comes_not_into_a_later_set_without_it(path):
-    """As with build_map, killed and repeated with --no-keyframe-layer: equal landmarks."""
+    """As if build_map were killed and run again with --no-keyframe-layer: equal landmarks."""
     digest = set_digest(made_map(1).landmark_map)
     layer_path(path).rename(path.with_name(f'.{digest}.{layer_path(path).name}'))
     write_made_map(path, replace(made_map(1), layer=None), [],

@@ -63,7 +63,7 @@ def test_noise_and_missed_boxes_cost_little():
 def test_many_views_leave_an_uncertainty_that_all_share():
     few, many = (build_map(see(make_table(), walk_around(frames), noise_px=3.0)).landmark_map
                  for frames in (20, 180))
-    # with errors that are independent in each view it would be a third of that
+    # with independent errors in each view, it would be a third of that
     assert 0.6 < np.median(many.position_sigmas) / np.median(few.position_sigmas) < 1.0
 
 

@@ -183,7 +183,7 @@ def test_images_of_this_encoder_are_compared(clip, map_file, compare):
     assert (similar > np.sum(plain * images.means, axis=1) + 0.2).all()
     if compare == 'image':
         assert np.array_equal(rows, images.means)
-    # rows have the map's order, and added landmarks use their label
+    # rows follow the map's order; added landmarks use their label
     fewer = images_of(images.encoder_key).in_order(ROOM.landmark_ids[:0:-1])
     save_landmark_embeddings(embeddings_path(map_file), fewer)
     again = np.asarray(embed_map(clip, ROOM, [str(map_file)], compare))
