@@ -97,7 +97,7 @@ def test_the_tests_of_the_capabilities_exist():
 
 
 def texts(node):
-    """Return the strings of a syntax tree, with an ellipsis for inserted values."""
+    """Yield the strings of a syntax tree, with an ellipsis for inserted values."""
     if isinstance(node, ast.JoinedStr):
         yield ''.join(value.value if isinstance(value, ast.Constant) else '...'
                       for value in node.values)

@@ -67,7 +67,7 @@ def test_success_with_what_is_known(case, office_map, queries, judge, thresholds
 
 @pytest.mark.parametrize('case', ['nothing', 'vertical_1_deg'])
 def test_five_frames_joined_by_odometry(case, office_map, queries, judge, thresholds):
-    """Return the 52 queries with neighbours; noise of a step is 1 cm and 0.5 degrees an axis."""
+    """The 52 queries have neighbours; a step has noise of 1 cm and 0.5 degrees on each axis."""
     least, asked = thresholds['fused'][case], []
     for seed in range(2):
         frames = make_queries(queries, office_map, every_frame=True)

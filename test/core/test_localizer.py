@@ -41,7 +41,7 @@ def frame(seconds, degrees=0.0, metres=0.0, detections=SEEN):
 
 
 class Window:
-    """Return the fused frames, and their stamps [s]."""
+    """The fused frames, and their stamps [s]."""
 
     def __init__(self):
         self.frames = []
@@ -191,7 +191,7 @@ def test_the_same_frame_again_is_no_further_look(session):
 
 
 class Camera:
-    """Return a localizer for looks that need no search."""
+    """A camera whose looks need no search."""
 
     def __init__(self):
         self.looks = Looks()

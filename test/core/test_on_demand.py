@@ -61,7 +61,7 @@ def test_the_crops_that_say_most_come_first():
     lone = replace(ROOM, class_ids=('a', *'b' * 11))
     boxes = np.array([[0, 0, 90, 90], [0, 0, 90, 90], [0, 0, 40, 40], [0, 0, 99, 99.0]])
     seen = Observation(CAMERA, Detections(boxes, ('a', 'b', 'b', 'unknown'), np.ones(4)))
-    # first: classes with many landmarks, and large boxes; a class that the map lacks is no use
+    # classes with many landmarks and large boxes come first; an unmapped class does not help
     assert informative_first(lone, seen).tolist() == [1, 2, 0, 3]
 
 

@@ -173,7 +173,7 @@ def test_the_right_pose_is_the_rival_of_one_by_a_wrong_vertical(room):
 
 
 def test_two_objects_and_the_vertical_fix_a_pose(room):
-    """Three objects are refused, since four are required; without a vertical there is no pose."""
+    """The pose is refused, since four objects are required; without a vertical there is none."""
     options = RelocalizerOptions(matching='class')
     pair = np.array([0, 1])
     observation = with_vertical(room)

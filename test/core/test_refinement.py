@@ -258,7 +258,8 @@ def change_camera(rng, pose):
         fy=CAMERA.fy * np.exp(focal - aspect / 2), cy=CAMERA.cy + 500 * y)}
 
 
-# The error, its deviation as stated by the map or camera, and the greatest share without it.
+# For each error: the disturbance, arguments with and without its stated deviation, and the
+# greatest share in the ellipsoids without it.
 STATED = {
     'landmarks': (move_landmarks, {'sigma': 0.1}, {'sigma': DEFAULT_SIGMA_M}, 0.6),
     'the map': (move_map, {'shared': np.tile([0.05, np.radians(2.0)], (len(ROOM), 1))}, {}, 0.5),

@@ -42,7 +42,7 @@ def static():
 
 
 def test_crops_of_a_built_map_name_their_phrase():
-    """Draw the crops of each object as its true phrase, another object's phrase, and noise."""
+    """The crops of each object mix its true phrase, another object's phrase, and noise."""
     rng = np.random.default_rng(1)
     table = make_table()
     seen = see(table, walk_around(40))

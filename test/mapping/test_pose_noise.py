@@ -106,7 +106,7 @@ def test_a_wrong_mount_is_corrected():
 
 
 def test_a_height_that_level_motion_does_not_show_stays_and_is_named():
-    """Return poses of a level camera that turns about the vertical, its y axis."""
+    """A level camera turns about the vertical, which is its y axis."""
     angles = np.linspace(0.0, 5.0, 80)
     level = np.array([look_at(np.array([2.2 * np.cos(a), 2.2 * np.sin(a), 0.8]),
                               (0.2 * np.sin(3 * a), 0.2 * np.cos(2 * a), 0.8)) for a in angles])

@@ -22,7 +22,7 @@ _PERIOD_S = 0.2
 
 
 def frames(transport, count, quality):
-    """Return a frame for each request, each from another place, with a photo-like image."""
+    """Yield a frame for each request, each from another place, with a photo-like image."""
     rng = np.random.default_rng(0)
     small = rng.integers(0, 256, (30, 40, 3), dtype=np.uint8)
     pixels = cv2.resize(small, (640, 480), interpolation=cv2.INTER_CUBIC)

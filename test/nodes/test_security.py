@@ -17,7 +17,7 @@ GRAPH = {('topics', 'publish'): 'get_publisher_names_and_types_by_node',
          ('topics', 'subscribe'): 'get_subscriber_names_and_types_by_node',
          ('services', 'reply'): 'get_service_names_and_types_by_node',
          ('services', 'request'): 'get_client_names_and_types_by_node'}
-# The ROS graph entities of SROS 2's permission to call an action.
+# Topics and services that SROS 2's permission to call an action implies.
 CALL = {('topics', 'subscribe'): ('feedback', 'status'),
         ('services', 'request'): ('send_goal', 'cancel_goal', 'get_result')}
 

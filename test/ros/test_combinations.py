@@ -113,7 +113,7 @@ class Drive:
 
 
 def equal(one, other):
-    """Return whether two results are equal bit by bit, except for times."""
+    """Assert that two results are equal bit by bit, except for times."""
     np.testing.assert_array_equal(one.map_from_camera, other.map_from_camera)
     np.testing.assert_array_equal(one.covariance, other.covariance)
     assert (one.accepted, one.evidence, one.reason) == (other.accepted, other.evidence,

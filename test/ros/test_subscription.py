@@ -126,7 +126,7 @@ def test_an_event_that_comes_too_late_blocks_nothing_else(ear, context, wait):
 
 
 def test_after_an_empty_message_it_subscribes_anew(ear):
-    """Fast DDS delivers a truncated image if it was in transit when the subscription started."""
+    """Fast DDS delivers an image as an empty message if it was in transit during discovery."""
     publisher = ear.offer(RELIABLE)
     ear.wait_for_hearing(publisher, 'before')
     former, = ear.endpoints()

@@ -45,7 +45,7 @@ def studio(tmp_path):
 
 
 def test_depth_becomes_a_cloud_below_the_ceiling():
-    """Return a wall 2 m ahead, red on the left, of a camera 1 m above the floor at x = 3."""
+    """A camera at x = 3, 1 m above the floor, sees a wall 2 m ahead that is red on the left."""
     image = np.zeros((48, 64, 3), dtype=np.uint8)
     image[:, :32, 0] = 200
     depth = DepthImage(np.full((48, 64), 2.0, dtype=np.float32))
