@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: a robot wakes up in a synthetic room, and the whole system runs.
+"""The demo runs the complete system: a robot wakes up in a synthetic room.
 
-``python -m demo`` runs it, from the root of the repository; it is not installed. ``demo.world``
-built the room and trained the networks in ``assets``.
+Run it with ``python -m demo`` from the root of the repository; it is not installed. The programs
+in ``demo.world`` built the room and trained the networks in ``assets``.
 """
 
 from pathlib import Path

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Let a robot wake up in a synthetic room: ``python -m demo``; offline, with shipped models."""
+"""Let a robot wake up in a synthetic room: ``python -m demo``.
+
+The demo runs offline with the shipped models.
+"""
 
 import argparse
 import sys
@@ -12,7 +15,7 @@ from demo import ASSETS
 
 EPILOG = """\
 The demo plays a recording to the real detector and relocalizer, each in its own process. At each
-wake-up the robot stops, calls ~/relocalize, and goes on after the answer. At the end the demo
+wake-up the robot stops, calls ~/relocalize, and continues after the answer. At the end the demo
 writes a page of pictures to the folder of --out. With --map it first builds a map from a mapping
 walk and compares it with the room; the robot then wakes up in that map.
 """
@@ -42,24 +45,24 @@ def make_parser() -> argparse.ArgumentParser:
         help='a method of the paper, such as class_bf or clip_prosac (default: %(default)s)')
     parser.add_argument(
         '--assets', type=Path, default=ASSETS, metavar='DIR',
-        help='another world than the shipped one: sequence/ (a TUM folder), map.yaml, '
-        'yolo.onnx, for --map mapping/, and except for class_* clip/')
+        help='world to use instead of the shipped one: sequence/ (a TUM folder), map.yaml, '
+        'yolo.onnx, mapping/ for --map, and clip/ for all methods but class_*')
     parser.add_argument(
         '--map', action='store_true',
         help="build the map from the assets' mapping walk (mapping/), and wake up in it")
     parser.add_argument(
         '--cameras', type=int, choices=(1, 4), default=1,
-        help='4: a robot that looks in four directions at once and does not turn (default: 1)')
+        help='4: a robot with cameras in four directions, which does not turn (default: 1)')
     parser.add_argument(
         '--kidnapped', action='store_true',
-        help='carry a driving robot away: its watch notices, and it gets its pose back')
+        help='move a driving robot elsewhere: the watch detects it, and the robot relocalizes')
     parser.add_argument(
         '--rviz', action='store_true', help='show the topics in RViz, where it is installed')
     return parser
 
 
 def demonstrate(options: argparse.Namespace) -> int:
-    """Run the demo as the command line says; return the exit code."""
+    """Run the demo with the given options; return the exit code."""
     with needs_ros('the demo'):
         import rclpy  # noqa: F401
     from demo.run import DemoOptions, run_demo

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot that drives is carried away: the watch notices, it stops, and gets its pose back."""
+"""Kidnap a driving robot: the watch detects it, the robot stops, and is relocalized."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -49,20 +49,22 @@ from demo.run import DemoOptions, nodes, prepare
 
 PICTURE = 'kidnapped.png'
 _SPEED_M_S, _TICK_S = 0.3, 0.05
-# A robot that stands takes images at this period, and the localizer shows its pose.
+# Periods of the images of a standing robot, and of the localizer's pose.
 _IMAGE_PERIOD_S, _POSE_PERIOD_S = 0.25, 0.25
 _PATIENCE_S = 60.0
-# It drives on for so many looks after it was found lost: nothing may happen then.
+# The robot drives on for this number of looks after the watch reports it lost. No pose may be
+# published or delivered meanwhile.
 _LOOKS_LOST = 2
 _STANDS_ON_S = 2.0
 _FRAME = 'camera'
-# Images of the walk that it drives back, and where on the other walk it is put down: 3 m away.
+# Images of the walk that the robot drives backwards, and of the other walk, 3 m away, to which it
+# is moved.
 _BEFORE, _AFTER = slice(14, 1, -1), slice(1, 14)
 
 
 @dataclass(frozen=True)
 class View:
-    """An image of the room, and where it was taken (4, 4)."""
+    """An image of the room, and the pose of its camera (4, 4)."""
 
     file: Path
     map_from_camera: NDArray[np.float64]
@@ -71,7 +73,7 @@ class View:
 class KidnappedRobot(Node):
     """Publishes views, odometry and the pose of a localizer that follows odometry, as AMCL does.
 
-    ``check`` is called while time passes; it raises if a node has ended.
+    ``check`` is called in each tick; it raises an error if a node has ended.
     """
 
     def __init__(self, camera: Camera, frame_id: str, check: Callable[[], None]) -> None:
@@ -93,13 +95,13 @@ class KidnappedRobot(Node):
         self._truth = self._odom_from_camera = self._map_from_odom = np.eye(4)
         self._show_at = 0.0
         self.began_at, self.looks, self.state = time.monotonic(), 0, ''
-        #: When it was found lost [s], and after how many looks; None until then.
+        #: Time [s] and number of looks when the watch first reported it lost; None before.
         self.lost: tuple[float, int] | None = None
-        #: Of poses, when they came [s].
+        #: Arrival times of the relocalizer's poses, and of those delivered to the localizer [s].
         self.relocalized_s: list[float] = []
         self.delivered_s: list[float] = []
         self.moments: list[Moment] = []
-        #: The newest view that was detected, and what.
+        #: The newest view with detections, and these detections.
         self.seen: tuple[View, Detections] | None = None
         self._views: dict[int, View] = {}
 
@@ -110,7 +112,7 @@ class KidnappedRobot(Node):
 
     @property
     def error_m(self) -> float:
-        """Return how far the localizer is from the truth [m]."""
+        """Return the position error of the localizer [m]."""
         return pose_error(self._map_from_odom @ self._odom_from_camera, self._truth)[0]
 
     def put(self, view: View) -> None:
@@ -118,12 +120,12 @@ class KidnappedRobot(Node):
         self._truth = view.map_from_camera
 
     def begin(self, view: View) -> None:
-        """Begin at a view that the localizer knows."""
+        """Start at a view, with a localizer that knows the true pose."""
         self.put(view)
         self._map_from_odom = view.map_from_camera
 
     def drive(self, views: Sequence[View]) -> Iterator[None]:
-        """Drive through views from the first; yield after each of the others."""
+        """Drive from the first view through the others; yield at each view after the first."""
         for last, view in pairwise(views):
             step = invert_transform(last.map_from_camera) @ view.map_from_camera
             way_m = float(np.linalg.norm(step[:3, 3]))
@@ -137,7 +139,7 @@ class KidnappedRobot(Node):
             yield
 
     def stand(self, view: View, until: Callable[[], bool], what: str) -> None:
-        """Stand at a view until a condition holds. DemoError: it never does."""
+        """Stand at a view until a condition holds. DemoError: time-out."""
         end, image_at = self.now_s + _PATIENCE_S, 0.0
         while not until():
             if self.now_s > end:
@@ -148,7 +150,7 @@ class KidnappedRobot(Node):
             self._pass(view if is_due else None)
 
     def _pass(self, view: View | None) -> None:
-        """Let a tick pass: tell odometry and pose, and take an image if there is a view."""
+        """Run for one tick: publish odometry and pose, and an image if there is a view."""
         self._check()
         end = time.monotonic() + _TICK_S
         stamp = self.get_clock().now()
@@ -181,7 +183,7 @@ class KidnappedRobot(Node):
             p=np.c_[camera.matrix, np.zeros(3)].ravel()))
 
     def _take(self, msg: PoseWithCovarianceStamped) -> None:
-        """Take a pose, as AMCL does at rest."""
+        """Adopt a pose, as AMCL does at rest."""
         pose = pose_from_msg(msg.pose.pose)
         assert pose is not None
         self._map_from_odom = pose @ invert_transform(self._odom_from_camera)
@@ -193,7 +195,7 @@ class KidnappedRobot(Node):
 
     def _on_state(self, msg: String) -> None:
         if (self.state, msg.data) != (WatchState.LOST, WatchState.UNCERTAIN):
-            self.looks += 1  # else the watch has begun again, with the pose that was delivered
+            self.looks += 1  # otherwise the watch has restarted with the delivered pose
         self.state = msg.data
         if self.state == WatchState.LOST and self.lost is None:
             self.lost = self.now_s, self.looks
@@ -207,7 +209,7 @@ class KidnappedRobot(Node):
 def run_kidnapped(options: DemoOptions) -> list[Step]:
     """Kidnap the robot, print what happens, and draw it; return the steps.
 
-    CliplocError: assets are missing, the nodes do not run, or the robot does not find itself.
+    CliplocError: assets are missing, the nodes do not run, or the robot is not relocalized.
     """
     prepare(options)
     landmark_map = LandmarkMap.from_file(options.map_file)
@@ -233,7 +235,7 @@ def run_kidnapped(options: DemoOptions) -> list[Step]:
 
 
 def _kidnap(robot: KidnappedRobot, before: Sequence[View], after: Sequence[View]) -> list[Step]:
-    """Let the robot drive, carry it away, and wait until its localizer is right again."""
+    """Let the robot drive, move it elsewhere, and wait until its localizer is correct again."""
     steps: list[Step] = []
     carried_s, first = 0.0, 0
 
@@ -252,17 +254,17 @@ def _kidnap(robot: KidnappedRobot, before: Sequence[View], after: Sequence[View]
     tell(f'the watch agrees with the localizer, {robot.error_m:.2f} m from the truth')
     carried_s, first = robot.now_s, robot.looks
     robot.put(after[0])
-    tell(f'carried by {robot.error_m:.2f} m; odometry and localizer do not notice')
+    tell(f'moved by {robot.error_m:.2f} m, unknown to odometry and localizer')
     way = robot.drive(after)
     last = next((view for view, _ in zip(after[1:], way, strict=False)
                  if robot.lost and robot.looks >= robot.lost[1] + _LOOKS_LOST), None)
     if robot.lost is None or last is None:
-        raise DemoError('the watch did not notice before the way ended')
-    tell('noticed: lost; it drives on', *robot.lost)
+        raise DemoError('the watch did not report the robot lost before its walk ended')
+    tell('the watch reports it lost; the robot drives on', *robot.lost)
     stopped_s = robot.now_s
-    tell('it stops')
+    tell('the robot stops')
     if robot.relocalized_s or robot.delivered_s:
-        raise DemoError('a pose came while the robot drove')
+        raise DemoError('a pose arrived while the robot was driving')
     robot.stand(last, lambda: bool(robot.delivered_s), 'a pose to be delivered')
     tell(f'relocalized, {robot.relocalized_s[0] - stopped_s:.1f} s after it stopped',
          robot.relocalized_s[0])
@@ -274,9 +276,9 @@ def _kidnap(robot: KidnappedRobot, before: Sequence[View], after: Sequence[View]
     return steps
 
 
-def _between(one: NDArray[np.float64], other: NDArray[np.float64], share: float
+def _between(start: NDArray[np.float64], end: NDArray[np.float64], share: float
              ) -> NDArray[np.float64]:
-    """Return a pose (4, 4) between two."""
-    quat = slerp(quaternion_from_transform(one), quaternion_from_transform(other), share)
-    place = one[:3, 3] + share * (other[:3, 3] - one[:3, 3])
+    """Interpolate between two poses (4, 4)."""
+    quat = slerp(quaternion_from_transform(start), quaternion_from_transform(end), share)
+    place = start[:3, 3] + share * (end[:3, 3] - start[:3, 3])
     return transform_from_pose(place, quat)

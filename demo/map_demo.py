@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo with a map of its own: build it from the mapping walk, judge it, wake up in it."""
+"""Run the demo with a map that it builds from the mapping walk and compares with the room."""
 
 import json
 import subprocess
@@ -68,7 +68,7 @@ def run_map_demo(options: DemoOptions) -> None:
 
 
 def _build(options: DemoOptions, walk: Path, files: Mapping[str, Path]) -> None:
-    """Write map, report and detections as a user does, with the installed executable."""
+    """Write map, report and detections with the installed executable, as a user does."""
     arguments = ['build_map', '--tum', walk, '--out', files['yaml'], '--report', files['json'],
                  '--record-to', files['npz'], '--model', options.assets / 'yolo.onnx',
                  '--clip-pretrained', options.assets / 'clip']
@@ -80,7 +80,7 @@ def _build(options: DemoOptions, walk: Path, files: Mapping[str, Path]) -> None:
 
 
 def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
-    """Return the success of one look at each image of the wake-ups, in the built and true map."""
+    """Localize each image of the wake-ups once in the built and the true map."""
     clip = ClipOptions(pretrained=str(options.assets / 'clip'))
     sequence = read_tum(options.assets / 'sequence')
     print(f'localizing all {len(sequence)} images of the wake-ups in both maps', flush=True)

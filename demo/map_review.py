@@ -27,7 +27,7 @@ from cliploc_ros.offline.page import ACCEPTED, BAD, figure, fold, table
 from cliploc_ros.units import NS_PER_S
 from demo.truth import TrueFrame, TrueObject, true_ids
 
-#: A landmark this near to an object stands for it [m]. The objects are 0.2 m apart and more.
+#: Greatest distance of a landmark from its object [m]. The objects are at least 0.2 m apart.
 NEAR_M = 0.1
 PICTURE = 'built_map.png'
 _DPI = 110
@@ -36,8 +36,8 @@ _MISSED = '#E69F00'
 _TRUTH = '#222222'
 _HEADING_M = 0.2
 _NAME_OFFSET_M = 0.2
-# Axes of the map across and up in each panel, and where these meet in a symmetric matrix that is
-# stored as xx, xy, xz, yy, yz, zz.
+# Horizontal and vertical map axis of each panel, and the indices of their entries in a symmetric
+# matrix that is stored as xx, xy, xz, yy, yz, zz.
 _PANELS = ((0, 1, (0, 1, 3)), (0, 2, (0, 2, 5)), (1, 2, (3, 4, 5)))
 _AXIS_NAMES = 'xyz'
 
@@ -48,7 +48,7 @@ class Found:
 
     object_row: int
     landmark: int
-    offset_m: float  #: Of the landmark's centre [m]
+    offset_m: float  #: Error of the landmark's centre [m]
     size_ratio: float  #: Mean radius of the landmark over that of the object
 
 
@@ -65,16 +65,16 @@ class MapReview:
     @property
     def landmark_of(self) -> dict[str, str]:
         """Return the id of the landmark of each found object, by the object's id."""
-        return {self.objects[one.object_row].object_id:
-                self.landmark_map.landmark_ids[one.landmark] for one in self.found}
+        return {self.objects[hit.object_row].object_id:
+                self.landmark_map.landmark_ids[hit.landmark] for hit in self.found}
 
     def summary(self) -> str:
         """Return the figures in one line."""
         text = (f'{len(self.found)} of {len(self.objects)} objects found, {len(self.missed)} '
                 f'missed, {len(self.false)} false')
         if self.found:
-            offsets_cm = [100 * one.offset_m for one in self.found]
-            size_error = np.median([abs(one.size_ratio - 1) for one in self.found])
+            offsets_cm = [100 * hit.offset_m for hit in self.found]
+            size_error = np.median([abs(hit.size_ratio - 1) for hit in self.found])
             text += (f'; centres {np.median(offsets_cm):.1f} cm off (median), '
                      f'{max(offsets_cm):.1f} cm at most; sizes {size_error:.0%} off (median)')
         return text
@@ -82,7 +82,7 @@ class MapReview:
 
 @dataclass(frozen=True)
 class Sightings:
-    """How the images show an object."""
+    """The number of images that show an object, and of those in which it was detected."""
 
     shown: int  #: Images that show enough of it
     detected: 'Counter[str]'  #: Images with a detection of it, by the detection's class
@@ -91,13 +91,13 @@ class Sightings:
 def review_map(landmark_map: LandmarkMap, objects: Sequence[TrueObject],
                sightings: Mapping[str, Sightings], left_out: Sequence[Mapping[str, Any]]
                ) -> MapReview:
-    """Return what a map found, missed and made up.
+    """Compare a map with the true objects.
 
-    The sightings are by the object's id; ``left_out`` is that of build_map's report.
+    ``sightings`` is keyed by the object's id; ``left_out`` comes from build_map's report.
     """
-    offsets_m = np.linalg.norm(np.array([one.center for one in objects])[:, None]
+    offsets_m = np.linalg.norm(np.array([item.center for item in objects])[:, None]
                                - landmark_map.centers, axis=2)
-    is_class = np.array([one.class_id for one in objects])[:, None] == np.array(
+    is_class = np.array([item.class_id for item in objects])[:, None] == np.array(
         landmark_map.class_ids)
     costs = np.where(is_class & (offsets_m < NEAR_M), offsets_m, 2 * NEAR_M)
     pairs = [(int(row), int(landmark)) for row, landmark in zip(
@@ -108,28 +108,28 @@ def review_map(landmark_map: LandmarkMap, objects: Sequence[TrueObject],
                         float(radii[landmark] / np.cbrt(np.prod(objects[row].semi_axes))))
                   for row, landmark in pairs)
     false = {}
-    for landmark in sorted(set(range(len(landmark_map))) - {one.landmark for one in found}):
+    for landmark in sorted(set(range(len(landmark_map))) - {hit.landmark for hit in found}):
         row = int(np.argmin(offsets_m[:, landmark]))
         nearest, offset_m = objects[row], offsets_m[row, landmark]
         if offset_m >= NEAR_M:
             false[landmark] = f'nothing is there; {nearest.object_id} is {offset_m:.2f} m away'
         elif nearest.class_id == landmark_map.class_ids[landmark]:
-            false[landmark] = f'{nearest.object_id} a second time'
+            false[landmark] = f'a duplicate of {nearest.object_id}'
         else:
             false[landmark] = f'{nearest.object_id} is there: {nearest.label}'
     missed = {}
-    for row, one in enumerate(objects):
+    for row, item in enumerate(objects):
         if row in {hit.object_row for hit in found}:
             continue
         instead = [landmark_map.class_ids[landmark] for landmark in false
                    if offsets_m[row, landmark] < NEAR_M]
-        missed[row] = _why_missed(one, instead, sightings.get(one.object_id), left_out)
+        missed[row] = _why_missed(item, instead, sightings.get(item.object_id), left_out)
     return MapReview(tuple(objects), landmark_map, found, missed, false)
 
 
 def count_sightings(frames: Sequence[TrueFrame], detections: PosedDetections
                     ) -> dict[str, Sightings]:
-    """Return how often the images show each object, and as what it was detected."""
+    """Count the images that show each object, and its detections by class."""
     stamps_ns = np.round(detections.stamps_s * NS_PER_S)
     shown: Counter[str] = Counter()
     detected: dict[str, Counter[str]] = {}
@@ -138,17 +138,19 @@ def count_sightings(frames: Sequence[TrueFrame], detections: PosedDetections
         stamp_ns = parse_stamp_ns(frame.timestamp, 'truth.json')
         number = int(np.argmin(np.abs(stamps_ns - stamp_ns)))
         if abs(stamps_ns[number] - stamp_ns) > 1e3:  # the detections hold a stamp as a float
-            continue  # the image was no keyframe
+            continue  # not a keyframe
         rows = slice(*detections.frame_offsets[number:number + 2])
         ids = true_ids(detections.bboxes_xyxy[rows], frame.boxes)
-        for one, class_number in sorted(set(zip(ids, detections.classes[rows], strict=True))):
-            detected.setdefault(one, Counter())[detections.class_names[class_number]] += 1
-    return {one: Sightings(count, detected.get(one, Counter())) for one, count in shown.items()}
+        for object_id, class_number in sorted(set(zip(ids, detections.classes[rows],
+                                                      strict=True))):
+            detected.setdefault(object_id, Counter())[detections.class_names[class_number]] += 1
+    return {object_id: Sightings(count, detected.get(object_id, Counter()))
+            for object_id, count in shown.items()}
 
 
-def _why_missed(one: TrueObject, instead: Sequence[str], seen: Sightings | None,
+def _why_missed(item: TrueObject, instead: Sequence[str], seen: Sightings | None,
                 left_out: Sequence[Mapping[str, Any]]) -> str:
-    """Return the first cause that applies, with how often the object was detected."""
+    """Return the first applicable cause, and how often the object was detected."""
     if seen is None:
         return 'no image shows it'
     names = ', '.join(f'{count} as {name}' for name, count in seen.detected.most_common())
@@ -156,9 +158,9 @@ def _why_missed(one: TrueObject, instead: Sequence[str], seen: Sightings | None,
     if instead:
         return f'mapped as {instead[0]}; {sightings}'
     near = [entry for entry in left_out
-            if np.linalg.norm(np.array(entry['center']) - one.center) < NEAR_M]
+            if np.linalg.norm(np.array(entry['center']) - item.center) < NEAR_M]
     if near:
-        best = max(near, key=lambda entry: entry['class_id'] == one.class_id)
+        best = max(near, key=lambda entry: entry['class_id'] == item.class_id)
         return f'left out as {best["class_id"]}, {best["reason"]}; {sightings}'
     return sightings
 
@@ -173,7 +175,7 @@ def console_lines(review: MapReview) -> Iterator[str]:
 
 
 def success_lines(summaries: Mapping[str, Summary]) -> Iterator[str]:
-    """Yield the table of success in both maps."""
+    """Yield the lines of the table that compares success in both maps."""
     for row in _success_rows(summaries):
         yield '  '.join(cell.ljust(13) for cell in row).rstrip()
 
@@ -181,13 +183,14 @@ def success_lines(summaries: Mapping[str, Summary]) -> Iterator[str]:
 def _success_rows(summaries: Mapping[str, Summary]) -> list[tuple[str, ...]]:
     return [('', *(f'within {limit:g} m' for limit in LIMITS_M), 'median error', 'accepted',
              'false accepts'),
-            *((name, *(f'{one.success(limit):.2f}' for limit in LIMITS_M),
-               f'{one.median_error_m:.3f} m', f'{one.accepted.sum()} of {one.errors_m.size}',
-               str(one.false_accepts())) for name, one in summaries.items())]
+            *((name, *(f'{summary.success(limit):.2f}' for limit in LIMITS_M),
+               f'{summary.median_error_m:.3f} m',
+               f'{summary.accepted.sum()} of {summary.errors_m.size}',
+               str(summary.false_accepts())) for name, summary in summaries.items())]
 
 
 def section(review: MapReview, summaries: Mapping[str, Summary], images: int) -> str:
-    """Return the section of the page."""
+    """Return the page's section on the built map, as HTML."""
     objects, landmark_map = review.objects, review.landmark_map
     head, *rows = _success_rows(summaries)
     parts = [
@@ -209,17 +212,17 @@ def section(review: MapReview, summaries: Mapping[str, Summary], images: int) ->
             for landmark, instead in review.false.items()))]
     found = table(
         ('object', "a person's label", 'landmark', "the map's label", '#off by', '#size'),
-        ((objects[one.object_row].object_id, objects[one.object_row].label,
-          landmark_map.landmark_ids[one.landmark], landmark_map.labels[one.landmark],
-          f'{one.offset_m * 100:.1f} cm', f'{one.size_ratio - 1:+.0%}')
-         for one in sorted(review.found, key=lambda one: -one.offset_m)))
+        ((objects[hit.object_row].object_id, objects[hit.object_row].label,
+          landmark_map.landmark_ids[hit.landmark], landmark_map.labels[hit.landmark],
+          f'{hit.offset_m * 100:.1f} cm', f'{hit.size_ratio - 1:+.0%}')
+         for hit in sorted(review.found, key=lambda hit: -hit.offset_m)))
     return fold(f'The map that was built: {review.summary()}', *parts,
                 fold('All found objects, the least accurate first', found))
 
 
 def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], path: Path) -> None:
     """Draw found, missed and false objects, and the poses (F, 4, 4) of the mapping walk."""
-    points = np.concatenate([[one.center for one in review.objects], review.landmark_map.centers,
+    points = np.concatenate([[item.center for item in review.objects], review.landmark_map.centers,
                              map_from_camera[:, :3, 3]])
     low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
     extents = high - low
@@ -235,7 +238,7 @@ def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], pat
         axes.grid(color='#EEEEEE', zorder=0)
         _draw_panel(axes, review, (across, up), entries)
         if up == 1:
-            # Draw where the camera was, and where it looked.
+            # Draw the camera's positions and viewing directions.
             positions, forward = map_from_camera[:, :2, 3], map_from_camera[:, :2, 2]
             axes.plot(*positions.T, ':', color='#888888', linewidth=1.0, zorder=2)
             axes.plot(*positions.T, '.', color='#666666', markersize=5, zorder=2)
@@ -264,16 +267,16 @@ def _draw_panel(axes: Axes, review: MapReview, plane: tuple[int, int],
         outline = outline_points(np.array([*center[[*plane]], *shape[[*entries]]]))
         axes.add_patch(Polygon(outline, closed=True, facecolor=color, edgecolor='none', alpha=0.45,
                                zorder=4 if landmark in review.false else 3))
-    shapes = shape_matrices(np.array([one.semi_axes for one in review.objects]),
-                            np.array([one.orientation for one in review.objects]))
-    for row, (one, shape) in enumerate(zip(review.objects, shapes, strict=True)):
+    shapes = shape_matrices(np.array([item.semi_axes for item in review.objects]),
+                            np.array([item.orientation for item in review.objects]))
+    for row, (item, shape) in enumerate(zip(review.objects, shapes, strict=True)):
         is_missed = row in review.missed
-        outline = outline_points(np.array([*one.center[[*plane]], *shape[[*entries]]]))
+        outline = outline_points(np.array([*item.center[[*plane]], *shape[[*entries]]]))
         axes.add_patch(Polygon(outline, closed=True, fill=False, zorder=6 if is_missed else 5,
                                edgecolor=_MISSED if is_missed else _TRUTH,
                                linewidth=2.0 if is_missed else 0.6))
         if is_missed:
-            write_name(axes, one.center[[*plane]] + (0.0, _NAME_OFFSET_M), one.object_id,
+            write_name(axes, item.center[[*plane]] + (0.0, _NAME_OFFSET_M), item.object_id,
                        color='#8A5A00')
     for landmark in review.false:
         write_name(axes, landmark_map.centers[landmark, [*plane]] - (0.0, _NAME_OFFSET_M),

@@ -24,30 +24,30 @@ _COLUMNS = (('', 3), ('image at', 8), ('answer', 8), ('score', 6), ('landmarks',
 _BRIEF = [_COLUMNS[column][0] for column in _BRIEF_COLUMNS]
 
 _SYNTHETIC = """\
-<p class="note"><b>This world is synthetic.</b> A program rendered room, objects and images;
-detector and CLIP are small networks trained on renders of other such rooms. Nodes, messages and
-search are those that run on a robot. So the page shows that the whole works, and <em>not</em> how
-well it recognizes real objects in real light. To find out, run the nodes on your own
-recordings.</p>"""
+<p class="note"><b>This world is synthetic.</b> A program rendered the room, its objects and the
+images; detector and CLIP are small networks trained on renders of similar rooms. Nodes, messages
+and search are the same as on a robot. The page shows that the system works end to end,
+<em>not</em> how well it recognizes real objects in real light. To measure that, run the nodes on
+your own recordings.</p>"""
 
 _HOW = """\
-<p class="note">The two nodes sent boxes, hypotheses and figures of the table over ROS. The errors
-compare with the recording's ground truth, which the nodes never see. No topic carries the matches
-of boxes and landmarks. For the pictures the demo therefore repeats the search on the same
-detections with the same code, networks, options and seed, and compares its pose with the one from
-ROS ({repeated}).</p>"""
+<p class="note">The two nodes published the boxes, the hypotheses and the numbers in the table. The
+errors are relative to the recording's ground truth, which the nodes never see. The matches of
+boxes and landmarks are not published. For the pictures the demo therefore repeats the search on
+the same detections with the same code, networks, options and seed, and compares its pose with the
+published pose ({repeated}).</p>"""
 
 _LIST = """\
 <p class="note">CLIP is the cosine similarity of crop and label, rank its place among all labels of
-the map, IoU the overlap of box and projected landmark. ✓ and ✗ compare a match with what the
-renderer drew there. A ✗ can also mean that the object was moved after mapping, or is not in the
-map.</p>"""
+the map, IoU the overlap of box and projected landmark. ✓ and ✗ compare a match with the object
+that the renderer drew there. A ✗ can also mean that the object was moved after mapping, or is not
+in the map.</p>"""
 
 
 def rig_section(cameras: Sequence[str], alone: int, count: int) -> str:
-    """Return what the page says of several cameras: how many are accepted with the first alone."""
+    """Return the page's note on a rig: how many wake-ups its first camera alone would accept."""
     return (f'<p class="note">The robot has {len(cameras)} cameras, {escape(", ".join(cameras))}, '
-            'and does not turn. Its pose is that of the first. With the first alone, '
+            'and does not turn. Its pose is that of the first camera. With this camera alone, '
             f'{alone} of {count} wake-ups would be accepted.</p>')
 
 
@@ -68,14 +68,14 @@ def console_row(judged: Judged) -> str:
 
 def summary(judged: Sequence[Judged]) -> str:
     """Summarize all wake-ups in one line."""
-    accepted = [one for one in judged if one.wake_up.accepted]
-    wrong = sum(one.is_wrong for one in accepted)
-    errors = [one.error[0] for one in accepted if one.error is not None]
+    accepted = [case for case in judged if case.wake_up.accepted]
+    wrong = sum(case.is_wrong for case in accepted)
+    errors = [case.error[0] for case in accepted if case.error is not None]
     text = (f'{len(judged)} wake-ups: {len(accepted)} accepted, {len(judged) - len(accepted)} '
             f'refused, {wrong or "none"} wrong by more than {WRONG_M:g} m')
     if errors:
         text += f'; error {np.median(errors):.3f} m (median), {max(errors):.3f} m at most'
-    return text + f'; answer time {np.median([one.wake_up.answer_s for one in judged]):.2f} s ' \
+    return text + f'; answer time {np.median([case.wake_up.answer_s for case in judged]):.2f} s ' \
         '(median)'
 
 
@@ -85,15 +85,15 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
     The section is HTML to put before the wake-ups.
     """
     judged = [review.judged for review in reviews]
-    accepted = [one for one in judged if one.wake_up.accepted]
-    wrong = sum(one.is_wrong for one in accepted)
-    errors = [one.error[0] for one in accepted if one.error is not None]
+    accepted = [case for case in judged if case.wake_up.accepted]
+    wrong = sum(case.is_wrong for case in accepted)
+    errors = [case.error[0] for case in accepted if case.error is not None]
     repeated = sum(review.repeated for review in reviews)
     how = _HOW.format(repeated=f'equal in {repeated} of {len(reviews)} cases')
-    rows = [[(cell, cell) if cell in ('accepted', 'refused') else cell for cell in _cells(one)]
-            for one in judged]
-    pictures = [figure(picture_name(one), f'“{one.wake_up.message}”',
-                       f'wake-up {one.number}: {one.verdict}') for one in judged]
+    rows = [[(cell, cell) if cell in ('accepted', 'refused') else cell for cell in _cells(case)]
+            for case in judged]
+    pictures = [figure(picture_name(case), f'“{case.wake_up.message}”',
+                       f'wake-up {case.number}: {case.verdict}') for case in judged]
     numbers = [(f'{len(accepted)} of {len(judged)}', 'wake-ups accepted', bool(accepted)),
                (str(wrong), f'wrong by more than {WRONG_M:g} m', not wrong)]
     if errors:
@@ -115,7 +115,7 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
 
 
 def _cells(judged: Judged) -> list[str]:
-    """Return a wake-up's cells; the error of a refused pose is in brackets."""
+    """Return the cells of a wake-up; the error of a refused pose is in parentheses."""
     wake_up = judged.wake_up
     position = error = '–'
     if wake_up.accepted and judged.pose is not None:

@@ -39,7 +39,7 @@ _TOP_VIEW_DPI = 160
 _TRUTH = '#222222'
 _MARGIN_M = 0.45
 _HEADING_M = 0.28
-# Of what the watch says.
+# Colours of the watch's states.
 _STATES = {'localized': '#CDE8D8', 'uncertain': '#F5ECC8', 'lost': '#F3CFC3'}
 
 
@@ -64,7 +64,7 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
     figure.legend(loc='lower left', bbox_to_anchor=(0.0, 0.0), ncol=4, frameon=False, fontsize=9,
                   handles=[
         Line2D([], [], color=_BOX, linewidth=2, label='box with its landmark'),
-        Line2D([], [], color='#888888', linewidth=2, linestyle='--', label='box without one'),
+        Line2D([], [], color='#888888', linewidth=2, linestyle='--', label='box without landmark'),
         Line2D([], [], color=_ELLIPSE, linewidth=2, label='matched landmark, projected'),
         Line2D([], [], color='#B8A800', linewidth=1.5, linestyle=':',
                label='any other landmark of the map')])
@@ -110,9 +110,10 @@ def _draw_image(axes: Axes, review: Review, landmark_map: LandmarkMap, numbers: 
 def _draw_outlines(axes: Axes, camera: Camera, landmark_map: LandmarkMap,
                    pose: NDArray[np.float64], matched: Set[int], width: float = 0.9,
                    is_edged: bool = False) -> None:
-    """Draw the outlines of all landmarks as seen from a pose, those of the matched ones bold.
+    """Draw the outlines of all landmarks as seen from a pose.
 
-    The others are dotted, of a width, with or without an edge.
+    Matched landmarks are bold. The others are dotted, with a given line width and optionally a
+    dark edge.
     """
     for landmark, outline in enumerate(project_ellipsoids(
             invert_transform(pose), landmark_map.centers, landmark_map.shapes)):
@@ -173,7 +174,7 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
                   path_xyz: NDArray[np.float64], path: Path) -> None:
     """Draw map, the camera's walk (t, 3) [m], and a line from each estimate to its truth.
 
-    A refused hypothesis beyond the map is not drawn; its number is red all the same.
+    A refused hypothesis outside the map is not drawn, but its number is red.
     """
     points = np.concatenate([landmark_map.centers[:, :2], path_xyz[:, :2]])
     low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
@@ -189,11 +190,11 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
     axes.set_axisbelow(True)
     class_colors = draw_map(axes, landmark_map)
     axes.plot(path_xyz[:, 0], path_xyz[:, 1], color='#999999', linewidth=1.0, zorder=2)
-    for one in judged:
-        pose = one.pose
+    for wake_up in judged:
+        pose = wake_up.pose
         if pose is not None and not ((low <= pose[:2, 3]) & (pose[:2, 3] <= high)).all():
             pose = None
-        _draw_wake_up(axes, one, pose)
+        _draw_wake_up(axes, wake_up, pose)
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=_TRUTH, marker='o', markersize=9, markerfacecolor='none',
                label='ground truth and view'),
@@ -210,7 +211,7 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
 
 
 def _draw_wake_up(axes: Axes, judged: Judged, pose: NDArray[np.float64] | None) -> None:
-    """Draw truth and estimated pose as arrows along the view, with a line between them."""
+    """Draw true and estimated pose as arrows in the viewing direction, joined by a line."""
     accepted, truth = judged.wake_up.accepted, judged.truth
     color = ACCEPTED if accepted else BAD
     seen_from = pose if truth is None else truth
@@ -248,13 +249,13 @@ class Moment:
 
     time_s: float  #: [s]
     truth: NDArray[np.float64]  #: (4, 4): map_from_camera
-    localized: NDArray[np.float64]  #: (4, 4): the same, of the localizer
+    localized: NDArray[np.float64]  #: (4, 4): map_from_camera of the localizer
     state: str
 
 
 @dataclass(frozen=True)
 class Step:
-    """What happened, when [s], and after how many looks."""
+    """An event, its time [s], and the number of looks before it."""
 
     time_s: float
     looks: int
@@ -263,9 +264,10 @@ class Step:
 
 def draw_kidnapped(file: Path, camera: Camera, detections: Detections, landmark_map: LandmarkMap,
                    moments: Sequence[Moment], steps: Sequence[Step], path: Path) -> None:
-    """Draw a kidnapped robot: its last view before it was found lost, its ways, and its error.
+    """Draw a kidnapped robot: the last view before the watch reported it lost, paths, and error.
 
-    The boxes are of the view; the outlines are what the localizer's pose of that time expects.
+    The boxes are detections in that view. The outlines are the landmarks, projected with the
+    localizer's pose at that time.
     """
     figure = Figure(figsize=(14.0, 9.0), dpi=_DPI, layout='constrained')
     (view, top), (timeline, _) = figure.subplots(2, 2, height_ratios=(3, 2))
@@ -278,8 +280,9 @@ def draw_kidnapped(file: Path, camera: Camera, detections: Detections, landmark_
     _draw_ways(top, landmark_map, moments)
     times = np.array([moment.time_s for moment in moments])
     errors = [pose_error(moment.localized, moment.truth)[0] for moment in moments]
-    for one, end in zip(moments, times[1:], strict=False):
-        timeline.axvspan(one.time_s, end, color=_STATES.get(one.state, '#FFFFFF'), linewidth=0)
+    for moment, end in zip(moments, times[1:], strict=False):
+        timeline.axvspan(moment.time_s, end, color=_STATES.get(moment.state, '#FFFFFF'),
+                         linewidth=0)
     timeline.plot(times, errors, color=_TRUTH, linewidth=2.0)
     for number, step in enumerate(steps):
         timeline.axvline(step.time_s, color='#666666', linewidth=0.8, linestyle=':')
@@ -296,7 +299,8 @@ def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detection
                    landmark_map: LandmarkMap, pose: NDArray[np.float64]) -> None:
     axes.imshow(cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB))
     axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), xticks=[], yticks=[])
-    axes.set_title("seen (boxes), and what the localizer's pose expects (dotted)", fontsize=10)
+    axes.set_title("detections (boxes), and landmarks seen from the localizer's pose (dotted)",
+                   fontsize=10)
     for left, top, right, bottom in detections.bboxes_xyxy:
         axes.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False,
                                  edgecolor=_BOX, linewidth=1.5, path_effects=_EDGED))
@@ -304,7 +308,7 @@ def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detection
 
 
 def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence[Moment]) -> None:
-    """Draw the way of the robot, and that of its localizer's poses."""
+    """Draw the path of the robot, and the path of its localizer's poses."""
     draw_map(axes, landmark_map)
     for name, color, style in (('truth', _TRUTH, '-'), ('localized', BAD, '--')):
         way = np.array([getattr(moment, name)[:2, 3] for moment in moments])

@@ -45,7 +45,7 @@ class Process:
         deadline = time.monotonic() + patience_s
         while text not in (output := self._log.read_text(errors='replace')):
             if '[ERROR]' in output or time.monotonic() > deadline:
-                raise DemoError(f'the {self._name} does not become ready: {self._last_line()}')
+                raise DemoError(f'the {self._name} did not become ready: {self._last_line()}')
             self.check()
             time.sleep(_POLL_S)
 
@@ -56,7 +56,7 @@ class Process:
             raise DemoError(f'the {self._name} ended with exit code {code}: {self._last_line()}')
 
     def wait(self) -> None:
-        """Wait until the process ends by itself."""
+        """Wait until the process ends."""
         self._popen.wait()
 
     def end(self) -> None:

@@ -81,14 +81,13 @@ class Review:
     matches: tuple[Match, ...]  #: Inliers of the best hypothesis
     #: (n, L): similarity of each crop and each label; None if the method matches classes only
     similarities: NDArray[np.float32] | None
-    #: The landmark of the object that each detection shows, '' if none; None if the recording does
-    #: not say it
+    #: The landmark of the object that each detection shows, '' if none; None without ground truth
     true_landmarks: tuple[str, ...] | None
     #: Whether the repeated search found the pose that the node sent. If not, there are no matches.
     repeated: bool
-    camera_name: str = ''  #: Of one of several cameras
-    accepted_alone: bool = True  #: Whether the first camera alone would do
-    #: What the other cameras of the robot saw, by their names
+    camera_name: str = ''  #: '' for the only camera of a robot
+    accepted_alone: bool = True  #: Whether a pose from the first camera alone would be accepted
+    #: Reviews of the robot's other cameras, by name
     beside: Mapping[str, 'Review'] = field(default_factory=dict)
 
 
@@ -101,8 +100,9 @@ def judge(wake_up: WakeUp, number: int, sequence: TumSequence) -> Judged:
 class Reviewer:
     """Repeats the relocalizer's search of a wake-up with the same code, options and seed.
 
-    Each camera has a sequence, and a mount on the first. ``landmark_of`` returns the id of an
-    object's landmark, '' if the map lacks it. By default the two ids are equal.
+    ``sequences`` and ``mounts`` have an entry for each camera; a mount is relative to the first
+    camera. ``landmark_of`` returns the id of an object's landmark, '' if the map lacks it. By
+    default the two ids are equal.
     """
 
     def __init__(self, values: RelocalizerParameters, landmark_map: LandmarkMap,
@@ -113,7 +113,7 @@ class Reviewer:
                         for name, mount in mounts.items()}
         self._options = values.options()
         self._relocalizer = Relocalizer(landmark_map, self._options)
-        # what it learns of the camera decides how many crops a request compares
+        # its estimate of the camera's height and tilt decides how many crops a request compares
         self._localizer = Localizer(self._relocalizer)
         self._observer = None
         if self._options.needs_similarities:
@@ -122,7 +122,7 @@ class Reviewer:
             self._observer = Observer(*load_encoder_for_map(
                 ClipOptions(model=values.clip_model, pretrained=values.clip_pretrained),
                 landmark_map, [values.map_file], values.landmark_embeddings))
-        # the true boxes of each image, where the recording says them
+        # the true boxes of each image, if the recording has them
         self._true_boxes = {
             (name, parse_stamp_ns(frame.timestamp, 'truth.json')): frame.boxes
             for name, sequence in sequences.items()
@@ -139,17 +139,17 @@ class Reviewer:
         else:
             error_m, error_deg = pose_error(found.map_from_camera, judged.pose)
             repeated = error_m < _SAME_POSE[0] and error_deg < _SAME_POSE[1]
-        # the search has the first camera last
+        # the query lists the first camera last
         matches = [*found.frame_matches[-1:], *found.frame_matches[:-1]] \
             if repeated and found.solved else [()] * len(seen)
-        reviews = {name: self._review(name, judged, *one, its, repeated)
-                   for (name, one), its in zip(seen.items(), matches, strict=True)}
+        reviews = {name: self._review(name, judged, *observed, camera_matches, repeated)
+                   for (name, observed), camera_matches in zip(seen.items(), matches, strict=True)}
         first_review, *_ = reviews.values()
         return replace(first_review, beside=dict(list(reviews.items())[1:]), accepted_alone=(
             self._search(Localizer(self._relocalizer), first, []) if others else found).accepted)
 
     def _observed(self, name: str, wake_up: WakeUp) -> tuple[NDArray[np.uint8], Observation]:
-        """Return the image (h, w, 3) of a camera, and what was detected in it."""
+        """Return the image (h, w, 3) of a camera, and the observation made in it."""
         sequence, stamp_ns = self._sequences[name], wake_up.stamp_ns
         camera, _ = find_camera(None, sequence.folder)
         path = sequence.image_paths[sequence.stamps_ns.index(stamp_ns)]
@@ -166,12 +166,12 @@ class Reviewer:
 
     def _search(self, localizer: Localizer, first: Observation, others: Sequence[Observation]
                 ) -> Relocalization:
-        """Return the pose of the first camera, as the relocalizer finds it."""
+        """Localize the first camera as the relocalizer does."""
         return localizer.answer(Query((*others, first), run=None))
 
     def _review(self, name: str, judged: Judged, image_rgb: NDArray[np.uint8],
                 observation: Observation, matches: tuple[Match, ...], repeated: bool) -> Review:
-        """Return the review of what one camera saw, from its own pose."""
+        """Return the review of one camera, with the hypotheses transformed to its pose."""
         poses = tuple(pose @ self._mounts[name] for pose in judged.wake_up.hypotheses)
         detections = observation.detections
         true_boxes = self._true_boxes.get((name, judged.wake_up.stamp_ns))

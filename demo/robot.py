@@ -42,11 +42,11 @@ class WakeUp:
     stamp_ns: int  #: Stamp of the answer's image [ns]
     accepted: bool  #: Whether the relocalizer published a pose
     message: str  #: The answer's message
-    #: tuple of (4, 4): ``map_from_camera`` of the distinct best, best first; an accepted pose is
-    #: the first
+    #: tuple of (4, 4): ``map_from_camera`` of the best distinct hypotheses, best first; an
+    #: accepted pose is the first
     hypotheses: tuple[NDArray[np.float64], ...]
-    detections: Mapping[str, Detections]  #: The detector's, by the name of the camera
-    answer_s: float  #: From the request to the answer, including detection [s]
+    detections: Mapping[str, Detections]  #: Output of the detector, by the name of the camera
+    answer_s: float  #: Time from the request to the answer, including detection [s]
 
     @property
     def score(self) -> float:
@@ -69,7 +69,7 @@ class WakeUp:
         return '' if self.accepted else self.message.removeprefix('refused: ').split(' [')[0]
 
     def _stated(self, pattern: str) -> str:
-        # The reason before the bracket may hold a score too.
+        # The reason before the bracket may also contain a score.
         found = re.search(pattern, self.message.rpartition(' [')[2])
         return found[1] if found else '0'
 
@@ -77,7 +77,7 @@ class WakeUp:
 class Robot(Node):
     """Publishes the recording of each camera and stops for each wake-up.
 
-    ``check`` is called while waiting; it raises if a node has ended.
+    ``check`` is called while waiting; it raises an error if a node has ended.
     """
 
     def __init__(self, readers: Mapping[str, BagReader], check: Callable[[], None]) -> None:
@@ -105,9 +105,9 @@ class Robot(Node):
                    and self.count_publishers('relocalizer/hypotheses') > 0)
 
     def walk(self, wake_up_at: Collection[int], rate: float) -> Iterator[WakeUp]:
-        """Play the recording; stop at the images of some stamps [ns] and yield the pose there.
+        """Play the recording; wake up at the images with the given stamps [ns].
 
-        The rate is the speed between wake-ups; 1 is as recorded.
+        ``rate`` is the speed between wake-ups; 1 is as recorded.
         """
         last_ns = min(reader.start_ns for reader in self._readers.values())
         messages = heapq.merge(*(reader.messages() for reader in self._readers.values()),
@@ -128,13 +128,13 @@ class Robot(Node):
         """Request the pose of this frame, and publish it until the answer arrives."""
         start = time.monotonic()
         future = self._client.call_async(Trigger.Request())
-        # Of images published right after the request and larger than Fast DDS's shared memory, one
-        # in nine was lost, and DDS resent it after up to 3 s.
+        # One in nine images was lost and resent after up to 3 s if it was published right after
+        # the request and larger than Fast DDS's shared memory.
         shown_at = start + _HEAD_START_S - _FRAME_PERIOD_S
 
         def answered() -> bool:
             nonlocal shown_at
-            # The relocalizer alone listens to camera_info, and only until it has its frame.
+            # Only the relocalizer subscribes to camera_info, and only until it has its frame.
             if (all(publisher.get_subscription_count() > 0 for name, publisher
                     in self._topics.items() if name.endswith('/camera_info'))
                     and time.monotonic() - shown_at >= _FRAME_PERIOD_S):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Run the demo from its start to its page of pictures."""
+"""Run the demo: convert the walk, start the nodes, wake up, and draw the page of pictures."""
 
 import json
 import shutil
@@ -41,12 +41,12 @@ _PATIENCE_S = 180.0
 
 @dataclass(frozen=True)
 class WakeUpMap:
-    """Another map than the assets' to wake up in."""
+    """A map to wake up in, instead of the assets' map."""
 
     file: Path
     #: Returns the id of an object's landmark, '' if the map lacks it
     landmark_of: Callable[[str], str]
-    section: str  #: What the page says of the map, as HTML
+    section: str  #: The page's section on the map, as HTML
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class DemoOptions:
     rviz: bool = False  #: Whether to open RViz if it is installed
     wake_up_map: WakeUpMap | None = None  #: The map to wake up in; None: the assets' map.yaml
     has_rig: bool = False  #: Whether the robot has the cameras of rig/ instead of one
-    is_watched: bool = False  #: Whether its localizer is watched, and a lost robot relocalized
+    is_watched: bool = False  #: Whether the localizer is watched and a lost robot is relocalized
 
     @property
     def map_file(self) -> Path:
@@ -72,7 +72,7 @@ class DemoOptions:
 
     @property
     def mounts(self) -> dict[str, list[float]]:
-        """Return the mount of each camera on the first: x, y, z [m], quaternion x, y, z, w."""
+        """Return each camera's pose in the first: x, y, z [m], quaternion x, y, z, w."""
         if not self.has_rig:
             return {'': [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]}
         file = self.assets / 'rig' / 'mounts.json'
@@ -95,7 +95,7 @@ class DemoOptions:
         parameters: dict[str, object] = {'map_file': self.map_file,
                                          'matching': matching, 'algorithm': algorithm,
                                          'require_localizer': False,  # the demo has no AMCL
-                                         # a search that the clock ends cannot be repeated
+                                         # a search that ends by time is not reproducible
                                          'time_budget_ms': 10_000.0}
         if self.is_watched:
             parameters |= {'watch': 'amcl_pose', 'watch_period_s': 1.0, 'on_lost': 'relocalize',
@@ -110,9 +110,9 @@ class DemoOptions:
 
     @property
     def of_detector(self) -> dict[str, object]:
-        """Return what differs from a detector of one camera.
+        """Return the detector's parameters for a rig; none for a single camera.
 
-        Raw images of four cameras at once are more than Fast DDS delivers as it is.
+        Fast DDS with its default settings does not deliver the raw images of four cameras at once.
         """
         return {'cameras': list(self.mounts), 'image_transport': 'compressed'} \
             if self.has_rig else {}
@@ -136,8 +136,8 @@ def run_demo(options: DemoOptions) -> list[Judged]:
     sequences = {name: read_tum(folder) for name, folder in options.folders.items()}
     sequence = next(iter(sequences.values()))
     with TemporaryDirectory(prefix='cliploc_demo_') as folder, ExitStack() as stack:
-        for name, one in sequences.items():
-            convert_tum(one, find_camera(None, one.folder)[0], Path(folder) / f'walk_{name}',
+        for name, walk in sequences.items():
+            convert_tum(walk, find_camera(None, walk.folder)[0], Path(folder) / f'walk_{name}',
                         ConversionOptions(
                             world_frame=landmark_map.frame_id, prefix=name,
                             image_format='compressed' if options.has_rig else 'raw'))
@@ -204,7 +204,7 @@ def _walk(options: DemoOptions, folder: Path, sequence: TumSequence, domain: int
 
 @contextmanager
 def nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
-    """Run detector and relocalizer; yield a function that raises if one has ended."""
+    """Run detector and relocalizer; yield a function that raises an error if one has ended."""
     start = time.monotonic()
     print(f'starting detector and relocalizer ({options.method}); to see their topics: export '
           f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', flush=True)
@@ -231,9 +231,9 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequences: dict[str, 
     reviewer = Reviewer(options.values, landmark_map, sequences, options.mounts,
                         str if own is None else own.landmark_of)
     reviews = []
-    for one in judged:
-        reviews.append(reviewer.review(one))
-        draw_wake_up(reviews[-1], landmark_map, options.out / page.picture_name(one))
+    for wake_up in judged:
+        reviews.append(reviewer.review(wake_up))
+        draw_wake_up(reviews[-1], landmark_map, options.out / page.picture_name(wake_up))
     # The camera's path while it took images (t, 3) [m].
     truth = sequence.trajectory
     first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
@@ -242,7 +242,7 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequences: dict[str, 
     section = '' if own is None else own.section
     if options.has_rig:
         alone = sum(review.accepted_alone for review in reviews)
-        print(f'{len(sequences)} cameras; with the first of them alone, {alone} of {len(reviews)} '
+        print(f'{len(sequences)} cameras; with the first camera alone, {alone} of {len(reviews)} '
               'would be accepted', flush=True)
         section += page.rig_section(list(sequences), alone, len(reviews))
     return page.write_page(options.out, reviews, options.method, section)

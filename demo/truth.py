@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read what each image of a synthetic room shows, as its generator recorded it."""
+"""Read the ground truth of a synthetic room: its objects, and the boxes in each image."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -13,9 +13,9 @@ import numpy.typing as npt
 from cliploc_ros.core.geometry.ellipsoid import box_ious
 from cliploc_ros.errors import DatasetError
 
-#: A detector need not find a box that shows less of its object than this share.
+#: A detector is not expected to find objects with a smaller visible share than this.
 LEAST_VISIBILITY = 0.3
-#: Boxes that overlap more show one object.
+#: Boxes with a greater IoU show the same object.
 SAME_OBJECT_IOU = 0.5
 
 
@@ -53,7 +53,7 @@ class TrueFrame:
 
 
 def read_objects(world: Path) -> tuple[TrueObject, ...]:
-    """Return the objects of a world, whether they are in its map or not.
+    """Return all objects of a world, including those that its map lacks.
 
     DatasetError: truth.json is missing or lacks them.
     """
@@ -84,7 +84,7 @@ def read_frames(world: Path, least_visibility: float = LEAST_VISIBILITY) -> Iter
 
 def true_ids(bboxes_xyxy: npt.NDArray[np.float64], true_boxes: Sequence[TrueBox]
              ) -> tuple[str, ...]:
-    """Return the object whose visible part fills each box (n, 4), or ''."""
+    """Return the id of the object whose visible part matches each box (n, 4), or ''."""
     ids = []
     of_objects = np.array([box.bbox_xyxy for box in true_boxes]).reshape(-1, 4)
     for ious in box_ious(bboxes_xyxy, of_objects):

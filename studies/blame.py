@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What makes queries fail: ``python -m studies.blame --help``.
+"""Find the causes of failed queries: ``python -m studies.blame --help``.
 
-The true pose is refined on the boxes of its query like any hypothesis, and compared with what the
-search found. The first of these that holds is to blame:
+The true pose is refined on the boxes of its query like any hypothesis, and compared with the
+result of the search. The cause is the first of these that applies:
 
 objects     the true pose explains fewer objects than a sample needs
-map         refinement leads the true pose away from the truth
+map         refinement moves the true pose away from the truth
 candidates  too few of the pairs that it explains are correspondence candidates
-choice      the search found a right pose, or the best one has more support than the true one
-search      the true pose has more support than any that the search found
+choice      the search found a correct pose, or its best pose has more support than the true pose
+search      the true pose has more support than all poses that the search found
 
-The last column counts failing queries with five or more objects whose true landmark is a candidate
-of a box: there association allows a right pose. In several images an object counts once.
+The last column counts failed queries with five or more objects whose true landmark is a candidate
+of a box: their association allows a correct pose. An object in several images counts once.
 """
 
 import argparse
@@ -47,7 +47,7 @@ _MANY = 5
 
 
 class Blame(NamedTuple):
-    """What makes a query fail."""
+    """The cause of a failed query."""
 
     cause: str  #: One of CAUSES; empty if the query does not fail
     #: Number of landmarks that are correspondence candidates of a box that shows them
@@ -56,24 +56,25 @@ class Blame(NamedTuple):
 
 def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: PosedQuery, limit_m: float
           ) -> Blame:
-    """Return what makes a query fail.
+    """Return the cause of a failed query.
 
     Parameters
     ----------
     relocalizer : Relocalizer
-        Of this map.
+        Relocalizer of this map.
     limit_m : float
-        A pose within this distance of the truth is right [m].
+        A pose within this distance of the truth is correct [m].
     """
-    frames = [relocalizer.search(one) for one in (*query.neighbours, query.observation)]
+    frames = [relocalizer.search(observation)
+              for observation in (*query.neighbours, query.observation)]
     found = relocalizer.locate(frames)
     errors = [pose_error(hypothesis.map_from_camera, query.map_from_camera)[0]
               for hypothesis in found.hypotheses]
     joined = join_frames(landmark_map, relocalizer.options, frames)
     true, = contenders_of(joined, [refined(joined, unrefined(query.map_from_camera))], [True])
-    candidates = [{one.landmark for one in its
-                   if [one.detection, one.landmark] in frame.scene.pairs.tolist()}
-                  for frame, its in zip(frames, true.matches, strict=True)]
+    candidates = [{match.landmark for match in matches
+                   if [match.detection, match.landmark] in frame.scene.pairs.tolist()}
+                  for frame, matches in zip(frames, true.matches, strict=True)]
     least = frames[-1].sample_size
     if errors and errors[0] <= limit_m:
         cause = ''
@@ -86,16 +87,17 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: PosedQuery
     elif any(error <= limit_m for error in errors):
         cause = 'choice'
     else:
-        best = [(one.support, one.map_from_camera) for one in found.hypotheses[:1]]
-        leads = [_lead(*one, relocalizer.options) for one in ((true.support, true.pose), *best)]
+        best = [(hypothesis.support, hypothesis.map_from_camera)
+                for hypothesis in found.hypotheses[:1]]
+        leads = [_lead(*pose, relocalizer.options) for pose in ((true.support, true.pose), *best)]
         cause = 'search' if int(np.argmax(leads)) == 0 else 'choice'
     return Blame(cause, len(set().union(*candidates)))
 
 
-def _lead(its: Support, pose: NDArray[np.float64], options: RelocalizerOptions) -> float:
-    """Return the utility by which a pose is chosen."""
+def _lead(support: Support, pose: NDArray[np.float64], options: RelocalizerOptions) -> float:
+    """Return the utility of a pose, by which the search chooses."""
     handicap = tilt_handicaps(pose[None], options.tilt_deviation_deg)
-    return float((utilities([its]) - handicap)[0])
+    return float((utilities([support]) - handicap)[0])
 
 
 def run(arguments: list[str]) -> int:
@@ -106,7 +108,7 @@ def run(arguments: list[str]) -> int:
     parser.set_defaults(frames='main')
     parser.add_argument('--matching', nargs='+', choices=_MATCHINGS, default=list(_MATCHINGS))
     parser.add_argument('--limit', type=float, default=0.5, metavar='M',
-                        help='error of a right pose (%(default)s)')
+                        help='greatest error of a correct pose (%(default)s)')
     options = parser.parse_args(arguments)
     places = [chosen_place.load() for chosen_place in chosen_places(options)]
     rows = []
@@ -118,10 +120,10 @@ def run(arguments: list[str]) -> int:
             queries = place.ask(mode) if mode in place.modes else []
             found += [blame(place.landmark_map, relocalizer, query, options.limit)
                       for query in queries]
-        counts = Counter(one.cause for one in found)
+        counts = Counter(outcome.cause for outcome in found)
         rows.append([_MATCHINGS[matching], mode, len(found), *(
             counts[cause] for cause in ('', *CAUSES)), sum(
-                bool(one.cause) and one.candidates >= _MANY for one in found)])
+                bool(outcome.cause) and outcome.candidates >= _MANY for outcome in found)])
     print(table(['by', 'known', 'queries', f'right within {options.limit:g} m', *CAUSES,
                  f'fail with {_MANY} candidates or more'], rows))
     return 0

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Does a localizer notice a wrong camera? ``python -m studies.camera --help``.
+"""Does a localizer detect a wrong camera? ``python -m studies.camera --help``.
 
-One localizer gets all images of a recording, or of drives through simulated worlds, in their
-order; a second one starts over at each image. Their boxes or their camera_info are wrong by one of
-several rules. Poses that are accepted are counted, and the looks until the camera is called wrong.
+One localizer gets all images of a recording, or of drives through simulated worlds, in order; a
+new one is made for each image as well. Boxes or camera_info are wrong by one of several rules.
+The table counts accepted poses, and the looks until the localizer reports the camera as wrong.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from studies.acceptance.searches import look_on
 from studies.reports import Answer, answer_table, grouped
 from studies.worlds.world import make_drive
 
-#: What is wrong with all images, from nothing to much: a change and its level.
+#: Errors of all images, by name: a change and its level.
 CAMERAS: dict[str, tuple[wrong_sensors.Change, float]] = {
     'right': (wrong_sensors.scaled_focal, 1.0),
     'focal length x 1.03': (wrong_sensors.scaled_focal, 1.03),
@@ -57,27 +57,27 @@ class Look(Answer):
     camera: str
     localizer: str  #: 'one', or 'new' for each image
     drive: int
-    is_called_wrong: bool  #: The camera, by then
+    is_called_wrong: bool  #: Whether the localizer has reported the camera as wrong
 
 
 def _drive(place: AnyPlace, options: argparse.Namespace
            ) -> tuple[LandmarkMap, Sequence[PosedQuery]]:
-    """Return a map, and queries in order."""
+    """Return a map, and the queries of a drive in order."""
     if isinstance(place, Simulated):
         world = make_drive(place.kind, place.seed, options.images).world
         return world.landmark_map, world.queries
     found = place.load()
-    in_order = sorted(found.frames, key=lambda one: one.observation.stamp_ns)
+    in_order = sorted(found.frames, key=lambda query: query.observation.stamp_ns)
     # query files do not hold the size of the images
-    return found.landmark_map, [replace(one, observation=replace(
-        one.observation, camera=replace(one.observation.camera, width=options.size[0],
+    return found.landmark_map, [replace(query, observation=replace(
+        query.observation, camera=replace(query.observation.camera, width=options.size[0],
                                         height=options.size[1])))
-        for one in in_order[::options.every]]
+        for query in in_order[::options.every]]
 
 
 def _looks(number: int, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
            cameras: Sequence[str]) -> Iterator[Look]:
-    """Yield the answers on a drive by each of some cameras."""
+    """Yield the answers on a drive, for each of the named cameras."""
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(k=min(3, len(landmark_map))))
     for name in cameras:
         change, level = CAMERAS[name]
@@ -89,10 +89,11 @@ def _looks(number: int, landmark_map: LandmarkMap, queries: Sequence[PosedQuery]
 
 
 def _alarms(looks: Sequence[Look]) -> list[int]:
-    """Return after how many looks the camera of each drive is called wrong; 0: never."""
-    return [next((count for count, one in enumerate(its, start=1) if one.is_called_wrong), 0)
-            for its in grouped(looks, ['localizer', 'drive']).values()
-            if its[0].localizer == 'one']
+    """Return for each drive the number of looks until the camera is called wrong; 0: never."""
+    return [next((count for count, look in enumerate(drive_looks, start=1)
+                  if look.is_called_wrong), 0)
+            for drive_looks in grouped(looks, ['localizer', 'drive']).values()
+            if drive_looks[0].localizer == 'one']
 
 
 def _called_wrong(looks: Sequence[Look]) -> str:
@@ -111,21 +112,22 @@ def run(arguments: Sequence[str]) -> int:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     add_arguments(parser, worlds=4, first_seed=3000)
     parser.add_argument('--size', type=positive_int, nargs=2, default=(640, 480),
-                        metavar=('W', 'H'), help='of the images of the query files [px]')
+                        metavar=('W', 'H'), help='size of the images of the query files [px]')
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='take each N-th image of a query file')
     parser.add_argument('--images', type=positive_int, default=60, metavar='N',
-                        help='of a drive')
+                        help='images of a drive (%(default)s)')
     parser.add_argument('--wrong', nargs='+', choices=CAMERAS, default=[*CAMERAS],
                         metavar='WHAT', help=f'{", ".join(CAMERAS)} (all)')
-    parser.add_argument('--vertical', action='store_true', help='it is known to a degree')
+    parser.add_argument('--vertical', action='store_true', help='give a vertical, to 1 degree')
     options = parser.parse_args(arguments)
     places = chosen_places(options)
     if options.cameras > 1 or options.workers > 1:
-        raise OptionsError('--cameras and --workers: one camera looks in order, in one process')
-    if options.depth and any(isinstance(one, Simulated) for one in places):
-        raise OptionsError('--depth: the simulated drives have none; it is for --queries and '
-                           '--observations')
+        raise OptionsError('--cameras and --workers must be 1: one process handles the images of '
+                           'one camera in order')
+    if options.depth and any(isinstance(place, Simulated) for place in places):
+        raise OptionsError('--depth needs --queries or --observations: the simulated drives have '
+                           'no depth')
     looks: list[Look] = []
     for number, place in enumerate(tqdm(places, 'drives', disable=None)):
         landmark_map, queries = _drive(place, options)

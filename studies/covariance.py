@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Do covariances hold the errors? ``python -m studies.covariance consistency --help``.
+"""Are covariances consistent with errors? ``python -m studies.covariance consistency --help``.
 
-For each mode: how many of the accepted poses within 1 m lie in the ellipsoid that their covariance
-says holds 95 %. Verticals are off by 1 degree on each axis, the same for all images of a group.
-Odometry is off by 1 cm and 0.5 degrees in each step. Worlds are simulated.
+The table gives, for each mode, the share of the accepted poses within 1 m of the truth that lie
+in the 95 % ellipsoid of their covariance. Verticals are off by 1 degree on each axis, the same for
+all images of a group. Odometry is off by 1 cm and 0.5 degrees in each step. Worlds are simulated.
 """
 
 import argparse
@@ -35,14 +35,14 @@ from studies.reports import draw, interval, print_section, table
 from studies.wrong_sensors import with_mount_error
 
 MODES = ('one image', 'vertical', 'five images', 'five, vertical')
-_FREEDOMS = (6, 3, 3)  # of the whole error, of position and of orientation
+_FREEDOMS = (6, 3, 3)  # of the pose error, the position error and the orientation error
 
 
 def squares_of(place: Place, seed: int) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Yield the mode of each accepted, right pose, and its squared errors in its covariance.
+    """Yield the mode of each accepted, correct pose, and its squared normalized errors.
 
-    Of the whole pose, of the position and of the orientation: chi-squared distributed with six,
-    three and three degrees of freedom.
+    The three errors are those of the pose, the position and the orientation. They are chi-squared
+    distributed with six, three and three degrees of freedom if the covariance is consistent.
     """
     relocalizer = Relocalizer(place.landmark_map,
                               RelocalizerOptions(k=min(3, len(place.landmark_map))))
@@ -60,13 +60,13 @@ def squares_of(place: Place, seed: int) -> Iterator[tuple[str, tuple[float, ...]
             assert found.map_from_camera is not None and found.covariance is not None
             error = pose_difference(found.map_from_camera, query.map_from_camera)
             if np.linalg.norm(error[:3]) < RIGHT_M:
-                yield mode, tuple(float(one @ np.linalg.solve(own, one)) for one, own in (
+                yield mode, tuple(float(part @ np.linalg.solve(block, part)) for part, block in (
                     (error, found.covariance), (error[:3], found.covariance[:3, :3]),
                     (error[3:], found.covariance[3:, 3:])))
 
 
 def shares(squares: NDArray[np.float64], expected: float = 0.95) -> list[float]:
-    """Return the shares (3,) of squares (n, 3) in the ellipsoids that should hold a share."""
+    """Return the shares (3,) of squares (n, 3) within the ellipsoids of an expected share."""
     return [float((own < chi2.ppf(expected, freedom)).mean())
             for own, freedom in zip(squares.T, _FREEDOMS, strict=True)]
 
@@ -78,7 +78,7 @@ def run(arguments: Sequence[str]) -> int:
     parser.add_argument('study', choices=['consistency'])
     add_arguments(parser, ('room', 'office', 'shop'), worlds=20)
     parser.set_defaults(frames='main')
-    parser.add_argument('--out', type=Path, metavar='DIR', help='draw the figure there')
+    parser.add_argument('--out', type=Path, metavar='DIR', help='folder to draw the figure in')
     options = parser.parse_args(arguments)
     found: dict[str, list[tuple[float, ...]]] = defaultdict(list)
     for place in tqdm(chosen_places(options), 'places', disable=None):
@@ -86,9 +86,10 @@ def run(arguments: Sequence[str]) -> int:
             found[mode].append(own)
     squares = {mode: np.array(found[mode]) for mode in MODES if mode in found}
     rows = []
-    for mode, its in squares.items():
-        whole, position, orientation = shares(its)
-        rows.append([mode, len(its), f'{whole:.3f} ({interval(whole * len(its), len(its), 3)})',
+    for mode, squares_of_mode in squares.items():
+        whole, position, orientation = shares(squares_of_mode)
+        count = len(squares_of_mode)
+        rows.append([mode, count, f'{whole:.3f} ({interval(whole * count, count, 3)})',
                      f'{position:.3f}', f'{orientation:.3f}'])
     print_section('Share within the 95 % ellipsoid', table(
         ['known', 'accepted, right', 'pose (95 % interval)', 'position', 'orientation'], rows))
@@ -103,9 +104,9 @@ def _draw(folder: Path, squares: Mapping[str, NDArray[np.float64]]) -> None:
               'share that they hold') as axes:
         axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.6, label='ideal')
         axes.axvline(0.95, color='#888888', linewidth=0.8, linestyle=':', label='95 %')
-        for mode, own in squares.items():
-            axes.plot(expected, [shares(own, one)[0] for one in expected], linewidth=1.4,
-                      label=f'{mode}: {shares(own)[0]:.3f}')
+        for mode, squares_of_mode in squares.items():
+            axes.plot(expected, [shares(squares_of_mode, share)[0] for share in expected],
+                      linewidth=1.4, label=f'{mode}: {shares(squares_of_mode)[0]:.3f}')
         axes.set(xlim=(0, 1), ylim=(0, 1.01))
 
 

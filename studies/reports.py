@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What all studies share: runs of tasks, answers and their one table, figures, fits of odds."""
+"""Common parts of the studies: run tasks, tabulate and draw answers, and fit logistic models."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -33,22 +33,22 @@ from cliploc_ros.offline.evaluation.summary import wilson_interval
 
 #: Errors below which a pose is a success [m].
 SUCCESS_M = (0.1, 0.25, 0.5, 1.0)
-#: Errors of poses that lead a robot astray, though they may be no false accepts.
+#: Poses with greater errors can mislead a robot even if they are not false accepts.
 FAR_M, FAR_DEG = 0.5, 20.0
 _PRECISION = 0.99
-#: Confidences (n,), and whether each pose is right (n,).
+#: Confidences (n,), and whether each pose is correct (n,).
 Judged = tuple[NDArray[np.float64], NDArray[np.bool_]]
 
 
 def run_all(make_work: MakeWork, tasks: Sequence[Any], what: str, workers: int) -> list[Any]:
-    """Return the outcomes of all tasks, in their order; show a progress bar.
+    """Return the outcomes of all tasks in order; show a progress bar.
 
-    RunError: workers died at a task: without its outcomes the rest would not be a fair sample.
+    RunError: workers died at a task; the other outcomes alone would not be a fair sample.
 
     Parameters
     ----------
     make_work : MakeWork
-        Makes the function that returns the outcomes of a task, a sequence.
+        Makes the function that returns the sequence of outcomes of a task.
     what : str
         Name of the tasks in the plural.
     """
@@ -56,22 +56,22 @@ def run_all(make_work: MakeWork, tasks: Sequence[Any], what: str, workers: int) 
     with closing(run_tasks(make_work, tasks, workers=workers)) as results:
         for task, outcomes in tqdm(results, what, len(tasks), disable=None):
             if outcomes is None:
-                raise RunError(f'workers died again and again at one of the {what}; use fewer '
+                raise RunError(f'workers died repeatedly at one of the {what}; use fewer '
                                '--workers')
             found[task] = outcomes
-    return [one for task in tasks for one in found[task]]
+    return [outcome for task in tasks for outcome in found[task]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """The best pose of one request; errors are infinite without one, and elsewhere."""
+    """The best pose of a request; errors are infinite if there is no pose or no true pose."""
 
     accepted: bool
     confidence: float
     error_m: float = inf
     error_deg: float = inf
     nees: float = inf
-    min_confidence: float = RelocalizerOptions.min_confidence  #: Of the acceptance
+    min_confidence: float = RelocalizerOptions.min_confidence  #: Threshold of the acceptance
 
     @property
     def right(self) -> bool:
@@ -80,7 +80,7 @@ class Answer:
 
 
 def judged(found: Relocalization, map_from_camera: NDArray[np.float64] | None) -> dict[str, Any]:
-    """Return the fields of an answer to a query; a query without a true pose is elsewhere."""
+    """Return the fields of an answer to a query; a query outside the map has no true pose."""
     fields = {'accepted': found.accepted, 'confidence': float(found.confidence)}
     pose = found.map_from_camera
     if pose is None or map_from_camera is None:
@@ -92,35 +92,36 @@ def judged(found: Relocalization, map_from_camera: NDArray[np.float64] | None) -
         else float(normalized_square(pose, found.covariance, map_from_camera))}
 
 
-def grouped[One](some: Iterable[One], by: Sequence[str]) -> dict[tuple[Any, ...], list[One]]:
-    """Return things in groups of equal fields."""
+def grouped[One](items: Iterable[One], by: Sequence[str]) -> dict[tuple[Any, ...], list[One]]:
+    """Group items by the values of some fields."""
     groups: dict[tuple[Any, ...], list[One]] = {}
-    for one in some:
-        groups.setdefault(tuple(getattr(one, name) for name in by), []).append(one)
+    for item in items:
+        groups.setdefault(tuple(getattr(item, name) for name in by), []).append(item)
     return groups
 
 
 def answer_table[One: Answer](answers: Iterable[One], by: Sequence[str],
                               **more: Callable[[list[One]], object]) -> str:
-    """Return what became of requests, as Markdown: a row for each group of equal fields.
+    """Return a Markdown table of answers, with a row for each group of equal fields.
 
-    The intervals are of the share of false accepts. Before the columns of ``more`` comes the share
-    of accepted poses within their 95 % ellipsoid.
+    The intervals are those of the share of false accepts. The share of accepted poses within their
+    95 % ellipsoid precedes the columns of ``more``.
     """
     rows = []
-    for key, its in grouped(answers, by).items():
-        errors_m = np.array([one.error_m for one in its])
-        accepted = np.array([one.accepted for one in its])
-        right, nees = errors_m < RIGHT_M, np.array([one.nees for one in its])
+    for key, group in grouped(answers, by).items():
+        errors_m = np.array([answer.error_m for answer in group])
+        accepted = np.array([answer.accepted for answer in group])
+        right, nees = errors_m < RIGHT_M, np.array([answer.nees for answer in group])
         judged = accepted & np.isfinite(nees)
         false, count = int((accepted & ~right).sum()), int(accepted.sum())
         rows.append([
-            *key, len(its), ' '.join(f'{(errors_m < limit).mean():.2f}' for limit in SUCCESS_M),
-            count, false, interval(false, count), interval(false, len(its), 4),
-            sum(one.accepted and (one.error_m > FAR_M or one.error_deg > FAR_DEG) for one in its),
+            *key, len(group), ' '.join(f'{(errors_m < limit).mean():.2f}' for limit in SUCCESS_M),
+            count, false, interval(false, count), interval(false, len(group), 4),
+            sum(answer.accepted and (answer.error_m > FAR_M or answer.error_deg > FAR_DEG)
+                for answer in group),
             f'{accepted[right].mean():.2f}' if right.any() else '',
             f'{within_ellipsoid(nees[judged]):.2f}' if judged.any() else '',
-            *(column(its) for column in more.values())])
+            *(column(group) for column in more.values())])
     return table([*by, 'n', f'within {" ".join(f"{limit:g}" for limit in SUCCESS_M)} m',
                   'accepted', 'false', '95 % of accepted', '95 % of n',
                   f'{FAR_M:g} m or {FAR_DEG:g} deg off', 'recall', 'in 95 %',
@@ -144,26 +145,26 @@ def crossed_table[One: Answer](answers: Iterable[One], row: str, column: str,
 
 
 def success_cell(answers: Sequence[Answer]) -> str:
-    """Return the share within .5 m; how many are accepted, and of these false."""
+    """Return the share of poses within .5 m, and accepted_cell."""
     within = np.mean([answer.error_m < FAR_M for answer in answers])
     return f'{short(float(within))}; {accepted_cell(answers)}'
 
 
 def accepted_cell(answers: Sequence[Answer]) -> str:
-    """Return how many answers are accepted, and of these false."""
+    """Return the numbers of accepted answers and of false accepts."""
     accepted = [answer for answer in answers if answer.accepted]
     return f'{len(accepted)} of {len(answers)}, {sum(not answer.right for answer in accepted)}'
 
 
 def recall_cell(answers: Sequence[Answer]) -> str:
-    """Return accepted_cell, and the share of right answers that is accepted."""
+    """Return accepted_cell, and the recall of the correct answers."""
     accepted = [answer.accepted for answer in answers if answer.right]
     recall = short(float(np.mean(accepted))) if accepted else '-'
     return f'{accepted_cell(answers)}; {recall}'
 
 
 def short(share: float) -> str:
-    """Return a share with two digits and no leading zero."""
+    """Format a share with two digits and no leading zero."""
     return f'{share:.2f}'.removeprefix('0')
 
 
@@ -174,18 +175,18 @@ def print_section(heading: str, text: str) -> None:
 
 def confidence_table(answers: Iterable[Answer], by: Sequence[str], thresholds: Sequence[float]
                      ) -> str:
-    """Return what several values of min_confidence accept, and the best recall at .99 precision.
+    """Return a table of answers for several min_confidence, with the best recall at .99 precision.
 
-    The recall is that of any threshold, see best_recall.
+    This recall does not depend on min_confidence, see best_recall.
     """
     return answer_table(
-        [replace(one, min_confidence=least, accepted=one.confidence >= least) for one in answers
-         for least in thresholds], [*by, 'min_confidence'],
-        best_recall=lambda its: f'{best_recall(*judged_of(its))[0]:.2f}')
+        [replace(answer, min_confidence=least, accepted=answer.confidence >= least)
+         for answer in answers for least in thresholds], [*by, 'min_confidence'],
+        best_recall=lambda group: f'{best_recall(*judged_of(group))[0]:.2f}')
 
 
 def best_recall(likely: NDArray[np.float64], right: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return the best recall of any threshold with a precision of .99, and the threshold."""
+    """Return the best recall with a precision of at least .99, and its threshold."""
     order = np.argsort(-likely, kind='stable')
     hits = np.cumsum(right[order])
     precise = np.nonzero(hits >= _PRECISION * np.arange(1, len(hits) + 1))[0]
@@ -201,14 +202,14 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def interval(count: float, total: int, digits: int = 2) -> str:
-    """Return the 95 % interval of a share, after Wilson."""
+    """Return the 95 % Wilson interval of a share."""
     low, high = wilson_interval(count, total) if total else (0.0, 1.0)
     return f'{low:.{digits}f} to {high:.{digits}f}'
 
 
 @contextmanager
 def draw(path: Path, xlabel: str, ylabel: str) -> Iterator[Axes]:
-    """Write what is drawn on the axes to a file."""
+    """Yield axes to draw on, and write their figure to a file."""
     make_folder(path.parent)
     figure, axes = new_axes(xlabel, ylabel)
     yield axes
@@ -224,12 +225,12 @@ def draw_judged(path: Path, title: str, judged: Mapping[str, Judged]) -> None:
 
 
 def judged_by(answers: Iterable[Answer], field: str) -> dict[str, Judged]:
-    """Return the confidences of answers, and if they are right, by a field."""
-    return {name: judged_of(its) for (name,), its in grouped(answers, [field]).items()}
+    """Return the confidences of answers and whether they are correct, by a field."""
+    return {name: judged_of(group) for (name,), group in grouped(answers, [field]).items()}
 
 
 def judged_of(answers: Sequence[Answer]) -> Judged:
-    """Return the confidences of answers, and if they are right."""
+    """Return the confidences of answers and whether they are correct."""
     return (np.array([answer.confidence for answer in answers]),
             np.array([answer.right for answer in answers], dtype=np.bool_))
 
@@ -237,16 +238,16 @@ def judged_of(answers: Sequence[Answer]) -> Judged:
 def fit_logistic(predictors: NDArray[np.float64], right: NDArray[np.bool_],
                  shrinkage: NDArray[np.float64], *, weights: NDArray[np.float64] | float = 1.0,
                  ceilings: NDArray[np.float64] | float = 1.0) -> NDArray[np.float64]:
-    """Return the coefficients (k,) of a logistic model, of maximum likelihood.
+    """Return the maximum-likelihood coefficients (k,) of a logistic model.
 
     Parameters
     ----------
     predictors : ndarray (n, k)
-        The first is 1.
+        The first column is 1.
     shrinkage : ndarray (k,)
-        Inverse variances of the Gaussian prior, for predictors of deviation 1.
+        Inverse variances of the Gaussian prior, for predictors with a standard deviation of 1.
     weights, ceilings : ndarray (n,), optional
-        Of the rows; a row's chance counts below its ceiling.
+        Weights of the rows, and factors of their chances.
     """
     scales = np.append(1.0, np.maximum(predictors[:, 1:].std(axis=0), 1e-6))
 

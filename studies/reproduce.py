@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper with one command: ``python -m studies.reproduce fr3``, or ``script/reproduce fr3``.
+"""Reproduce the paper: ``python -m studies.reproduce fr3``, or ``script/reproduce fr3``.
 
-It says what it downloads, under which licence, and asks. Then it downloads public sequences and
-the paper's networks, builds a map from every second frame, asks others of the frames, and prints
-the paper's Table 1 beside the results. Each stage leaves a finished file: the same command goes on
-after an interruption. results.tar is small enough to be attached to an issue. Addresses, digests
-and the paper's figures are in studies/reproduce.yaml.
+The program lists its downloads with their licences and asks for confirmation. Then it downloads
+public sequences and the paper's networks, builds a map from every second frame, localizes some of
+the other frames, and prints the paper's Table 1 beside the results. Each stage writes its files
+when it is complete, so the same command continues after an interruption. results.tar is small
+enough to attach to an issue. Addresses, digests and the paper's numbers are in
+studies/reproduce.yaml.
 """
 
 import argparse
@@ -48,17 +49,17 @@ from cliploc_ros.offline.evaluation.trials import Result
 
 _SOURCES = Path(__file__).with_suffix('.yaml')
 _NAMES = 'fr2', 'fr3', 'kitchen'
-# Of a usual line, to say how long a download takes.
+# Bandwidth of a typical connection, to estimate the time of a download.
 _MEGABYTES_A_S = 10.0
-# The bags of a sequence.
+# Names of a sequence's bags: for the map, and for the queries.
 _MAPPED, _ASKED = 'mapped', 'asked'
 _FIGURES = 'success_over_threshold', 'success_over_iterations', 'top_view'
-# Of the table of `evaluate`: all but accepted and precision. The paper's columns come after these.
+# Columns of the table of `evaluate`: all but accepted and precision. The paper's columns follow.
 _COLUMNS = (0, 1, 2, 3, 4, 7)
 _OF_PAPER = ('paper: success', 'paper: error [m]', 'paper: time [s]')
 _CSV_OF_PAPER = [f'paper_{name}{kind}' for name in ('success', 'error_m', 'time_s')
                  for kind in ('', '_std')]
-_AGAIN = 'run the same command again, it goes on from here'
+_AGAIN = 'run the same command again to continue from here'
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,8 @@ class Download:
     url: str
     megabytes: float
     licence: str
-    sha256: str = ''  #: '' where it is not known: that of the first download counts
-    option: str = ''  #: Of a network: the option of build_map and evaluate that it is for
+    sha256: str = ''  #: '' if unknown: the digest of the first download is used
+    option: str = ''  #: For a network: the option of build_map and evaluate that selects it
 
     @property
     def file(self) -> str:
@@ -80,14 +81,14 @@ class Download:
 
 @dataclass(frozen=True, kw_only=True)
 class Recording(Download):
-    """An archive with a sequence, and what is done with it."""
+    """An archive with a sequence, and settings for processing it."""
 
-    unpacked: float  #: What it takes on the disk besides the archive [MB]
+    unpacked: float  #: Disk space needed in addition to the archive [MB]
     queries: int
-    inner: str = ''  #: The archive in the archive that has the sequence; '' for none
-    minutes: Sequence[float] = (10, 60)  #: With a GPU, and without one
+    inner: str = ''  #: Nested archive that contains the sequence; '' for none
+    minutes: Sequence[float] = (10, 60)  #: Processing time with a GPU, and without [min]
     asking: Sequence[str] = ()  #: Options of evaluate
-    #: Success, error and time of the paper's methods, as it prints them
+    #: Success, error and time of the paper's methods, as printed in the paper
     paper: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
@@ -104,18 +105,19 @@ class Sources:
 
     @classmethod
     def of_file(cls, path: Path) -> 'Sources':
-        """Read a file; CliplocError: it is none, or lacks something."""
+        """Read a file; CliplocError: it cannot be read, or an entry is missing."""
         content = read_parameter_file(path)
         try:
-            recordings = {key: Recording(**one) for key, one in content.pop('sequences').items()}
-            networks = [Download(**one) for one in content.pop('networks')]
+            recordings = {key: Recording(**entry)
+                          for key, entry in content.pop('sequences').items()}
+            networks = [Download(**entry) for entry in content.pop('networks')]
             return cls(networks, recordings, **content)
         except (KeyError, TypeError, AttributeError) as error:
-            raise OptionsError(f'{path}: is not like {_SOURCES.name}: {error}') from error
+            raise OptionsError(f'{path} is not like {_SOURCES.name}: {error}') from error
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Reproduce; return the exit code."""
+    """Run the program; return the exit code."""
     return run_main(make_parser(), run, args)
 
 
@@ -124,25 +126,25 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='script/reproduce', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('sequence', choices=[*_NAMES, 'all'])
-    parser.add_argument('--yes', action='store_true', help='do not ask')
-    parser.add_argument('--plan', action='store_true', help='say what would be done, and end')
+    parser.add_argument('--yes', action='store_true', help='do not ask for confirmation')
+    parser.add_argument('--plan', action='store_true', help='print the plan, then exit')
     # The script asks before it installs PyTorch.
     parser.add_argument('--ask', action='store_true', help=argparse.SUPPRESS)
     parser.add_argument('--out', type=Path, default=Path('reproduction'), metavar='DIR',
-                        help='of downloads and results (%(default)s)')
+                        help='folder for downloads and results (%(default)s)')
     parser.add_argument('--trials', type=positive_int, default=5, metavar='N',
                         help="seeds of the methods that draw samples (the paper's %(default)s)")
     parser.add_argument('--sources', type=Path, default=_SOURCES, metavar='YAML',
-                        help='other addresses and digests (studies/reproduce.yaml)')
+                        help='file with addresses and digests (studies/reproduce.yaml)')
     return parser
 
 
 def run(options: argparse.Namespace) -> int:
-    """Reproduce as the command line asks; return the exit code."""
+    """Reproduce with the given options; return the exit code."""
     sources, out = Sources.of_file(options.sources), options.out
     names = _NAMES if options.sequence == 'all' else (options.sequence,)
     if missing := [name for name in names if name not in sources.recordings]:
-        raise OptionsError(f'{options.sources}: has no sequence {missing[0]}')
+        raise OptionsError(f'{options.sources} has no sequence {missing[0]}')
     if not options.plan:
         make_folder(out)
     _say_plan(names, sources, out)
@@ -165,43 +167,45 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _alone_in(out: Path) -> Iterator[None]:
-    """Keep other runs out of a folder meanwhile; OptionsError: one is there."""
+    """Lock a folder against other runs; OptionsError: another run has locked it."""
     with (out / '.lock').open('w') as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise OptionsError(f'{out}: another run is at work there: wait for it, or give '
+            raise OptionsError(f'{out}: another run is at work there: wait for it, or choose '
                                'another --out') from None
         yield
 
 
 def _missing(names: Sequence[str], sources: Sources, out: Path) -> list[Download]:
-    """Return what is still to be downloaded."""
+    """Return the downloads that are still missing."""
     needed = [*(sources.recordings[name] for name in names if not (
         (out / name / 'frames').exists() or _has_bags(out / name))), *sources.networks]
-    return [one for one in needed if not (out / 'downloads' / one.file).exists()]
+    return [download for download in needed if not (out / 'downloads' / download.file).exists()]
 
 
 def _say_plan(names: Sequence[str], sources: Sources, out: Path) -> None:
-    """Print what will be done; OptionsError: the disk has no room for it."""
+    """Print the plan; OptionsError: the disk does not have enough space."""
     missing = _missing(names, sources, out)
     print('\n'.join(f'{name}: {sources.recordings[name].name}' for name in names))
     if missing:
         print(summary.as_text([('to download', 'MB', 'licence', 'from'), *(
-            (one.name, f'{one.megabytes:.0f}', one.licence, one.url) for one in missing)]))
-        print('Their licences hold for you, and for the results. By going on you accept them.')
-    total = sum(one.megabytes for one in missing)
-    room = total + sum(one.unpacked for one in missing if isinstance(one, Recording))
+            (download.name, f'{download.megabytes:.0f}', download.licence, download.url)
+            for download in missing)]))
+        print('Their licences apply to you and to the results. By continuing you accept them.')
+    total = sum(download.megabytes for download in missing)
+    room = total + sum(download.unpacked for download in missing
+                       if isinstance(download, Recording))
     there = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
     free = shutil.disk_usage(there).free / 1e6
     slow, fast = (sum(sources.recordings[name].minutes[column] for name in names)
                   for column in (1, 0))
     print(f'{total:.0f} MB to download, {total / _MEGABYTES_A_S / 60:.0f} minutes at '
           f'{_MEGABYTES_A_S:g} MB/s; then about {slow} minutes on two cores, {fast} with a GPU (a '
-          f'guess). {out} will take {room / 1e3:.1f} GB more.')
+          f'guess). {out} will need {room / 1e3:.1f} GB more.')
     if find_spec('torch') is None:
-        print('PyTorch is installed first, by script/setup models: up to 7 GB.')
-    print('Not as in the paper:', *(f'\n  {line}' for line in sources.remarks), flush=True)
+        print('script/setup models will first install PyTorch: up to 7 GB.')
+    print('Differences from the paper:', *(f'\n  {line}' for line in sources.remarks), flush=True)
     if free < room:
         raise OptionsError(f'the disk of {out} has {free / 1e3:.1f} GB left, {room / 1e3:.1f} GB '
                            'are needed: make room, or set --out to another disk')
@@ -209,28 +213,28 @@ def _say_plan(names: Sequence[str], sources: Sources, out: Path) -> None:
 
 def _is_agreed() -> bool:
     try:
-        return input('Go on? [y/N] ').strip().lower() in ('y', 'yes')
+        return input('Continue? [y/N] ').strip().lower() in ('y', 'yes')
     except EOFError:
-        raise OptionsError('there is nobody to ask: give --yes') from None
+        raise OptionsError('standard input is closed, so nobody can confirm: give --yes') from None
 
 
-def _downloaded(one: Download, out: Path) -> Path:
-    """Return a downloaded file whose digest is right; CliplocError: there is none."""
-    file = out / 'downloads' / one.file
+def _downloaded(download: Download, out: Path) -> Path:
+    """Download a file and check its digest; CliplocError: one of the two fails."""
+    file = out / 'downloads' / download.file
     if not file.exists():
-        print(f'downloading {one.name}', flush=True)
-        download_file(one.url, file, f'Check network and address, then {_AGAIN}; or put the file '
-                      f'there yourself, as {file}', '--out')
+        print(f'downloading {download.name}', flush=True)
+        download_file(download.url, file, f'Check network and address, then {_AGAIN}; or put the '
+                      f'file there yourself, as {file}', '--out')
     with file.open('rb') as opened:
         digest = hashlib.file_digest(opened, 'sha256').hexdigest()
     kept = _digest_file(file)
-    expected = one.sha256 or (kept.read_text().strip() if kept.exists() else digest)
+    expected = download.sha256 or (kept.read_text().strip() if kept.exists() else digest)
     if digest != expected:
         refused = file.replace(file.with_name(f'{file.name}.refused'))
         raise DatasetError(
             f'{file} has SHA-256 {digest}, expected {expected}: it is damaged, or another file is '
-            f'at {one.url}. It is kept as {refused.name}. Run again to download it again; if it '
-            'is right, give --sources a copy of studies/reproduce.yaml with its digest')
+            f'at {download.url}. It is kept as {refused.name}. Run again to download it again; if '
+            'the file is correct, give --sources a copy of studies/reproduce.yaml with its digest')
     write_text(kept, digest + '\n')
     return file
 
@@ -241,29 +245,31 @@ def _digest_file(file: Path) -> Path:
 
 def _reproduce(name: str, sources: Sources, networks: Sequence[str],
                options: argparse.Namespace) -> None:
-    """Take a sequence from its archive to the results of `evaluate`."""
-    one, folder = sources.recordings[name], options.out / name
+    """Process a sequence from its archive to the results of `evaluate`."""
+    recording, folder = sources.recordings[name], options.out / name
     make_folder(folder)
-    settings = repr((one, sources.options, sources.mapping, sources.asking, options.trials))
+    settings = repr((recording, sources.options, sources.mapping, sources.asking, options.trials))
     begun = folder / 'settings.txt'
     if begun.exists() and begun.read_text() != settings:
         raise OptionsError(f'{folder} was begun with other --sources or --trials: give the same, '
                            'another --out, or remove it')
     write_text(begun, settings)
     if not _has_bags(folder):
-        write_bags(one, unpacked(one, folder, options.out), folder)
+        write_bags(recording, unpacked(recording, folder, options.out), folder)
     landmark_map, evaluation = folder / 'map.yaml', folder / 'evaluation'
     if not landmark_map.exists():
         print(f'{name}: the map', flush=True)
         if build_map.build(build_map.make_parser().parse_args([
                 '--bag', str(folder / _MAPPED), '--out', str(landmark_map), '--no-check',
                 '--no-keyframe-layer', *networks, *sources.mapping])):
-            raise MappingError(f'{name}: there is no map, see above: attach that text to an issue')
+            raise MappingError(f'{name}: no map was built, see above: attach that text to an '
+                               'issue')
     if not _is_evaluated(evaluation):
         print(f'{name}: the queries', flush=True)
         evaluate.evaluate(evaluate.make_parser().parse_args([
             '--bag', str(folder / _ASKED), '--map', str(landmark_map), '--out', str(evaluation),
-            '--trials', str(options.trials), '--resume', *networks, *sources.asking, *one.asking]))
+            '--trials', str(options.trials), '--resume', *networks, *sources.asking,
+            *recording.asking]))
 
 
 def _has_bags(folder: Path) -> bool:
@@ -274,70 +280,72 @@ def _is_evaluated(folder: Path) -> bool:
     return (folder / PAGE).exists() and not (folder / 'unfinished.jsonl').exists()
 
 
-def unpacked(one: Recording, folder: Path, out: Path) -> Path:
-    """Return the folder of a sequence; CliplocError: its archive cannot be had or unpacked."""
+def unpacked(recording: Recording, folder: Path, out: Path) -> Path:
+    """Unpack a sequence; CliplocError: its archive cannot be downloaded or unpacked."""
     frames, staging = folder / 'frames', folder / '.frames'
-    archive = inner = out / 'downloads' / one.file
+    archive = inner = out / 'downloads' / recording.file
     if not frames.exists():
-        _downloaded(one, out)
+        _downloaded(recording, out)
         print(f'unpacking {archive}', flush=True)
-        shutil.rmtree(staging, ignore_errors=True)  # of a run that was killed
+        shutil.rmtree(staging, ignore_errors=True)  # left by a killed run
         try:
-            if one.inner:
+            if recording.inner:
                 with zipfile.ZipFile(archive) as opened:
-                    inner = Path(opened.extract(one.inner, staging))
-            # a zip archive takes no filter, and writes nothing outside of the folder
+                    inner = Path(opened.extract(recording.inner, staging))
+            # zip archives accept no filter, and never write outside the folder
             shutil.unpack_archive(inner, staging,
                                   filter=None if inner.suffix == '.zip' else 'data')
         except (shutil.ReadError, tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError,
                 KeyError) as error:
             for file in (archive, _digest_file(archive)):
                 file.unlink(missing_ok=True)
-            raise DatasetError(f'{archive} cannot be unpacked ({error}): it was cut short or is '
-                               'another one, and is removed; run again to download it') from error
+            raise DatasetError(f'{archive} cannot be unpacked ({error}): it is truncated or a '
+                               'different file, and was removed; run again to download it'
+                               ) from error
         except OSError as error:
-            raise DatasetError(f'{staging} cannot be written: {error.strerror}; make room, then '
-                               f'{_AGAIN}') from error
+            raise DatasetError(f'{staging} cannot be written: {error.strerror}; make room, '
+                               f'then {_AGAIN}') from error
         staging.rename(frames)
     for sequence in (frames, *sorted(path for path in frames.rglob('*') if path.is_dir())):
         if find_layout(sequence) is not None:
             return sequence
-    raise DatasetError(f'{frames}: has no sequence of a known layout: remove it and {archive}*, '
+    raise DatasetError(f'{frames} has no sequence of a known layout: remove it and {archive}*, '
                        'and run again')
 
 
-def write_bags(one: Recording, frames: Path, folder: Path) -> None:
+def write_bags(recording: Recording, frames: Path, folder: Path) -> None:
     """Write every second frame with a true pose, and some of the others, as tum_to_bag does."""
     sequence, camera, _ = read_sequence(frames, None)
     rows = [row for row, stamp_ns in enumerate(sequence.stamps_ns)
             if sequence.pose_at(stamp_ns) is not None]
     others = rows[1::2]
-    chosen = np.linspace(0, len(others) - 1, min(one.queries, len(others))).round().astype(int)
-    for name, its in ((_MAPPED, rows[::2]), (_ASKED, [others[place] for place in chosen])):
-        for left in folder.glob(f'.{name}.*.partial'):  # by a run that was killed
-            shutil.rmtree(left, ignore_errors=True)
+    count = min(recording.queries, len(others))
+    chosen = np.linspace(0, len(others) - 1, count).round().astype(int)
+    for name, chosen_rows in ((_MAPPED, rows[::2]), (_ASKED, [others[place] for place in chosen])):
+        for partial_bag in folder.glob(f'.{name}.*.partial'):  # left by a killed run
+            shutil.rmtree(partial_bag, ignore_errors=True)
         if not (folder / name).exists():
             convert_tum(
-                replace(sequence, stamps_ns=tuple(sequence.stamps_ns[row] for row in its),
-                        image_paths=tuple(sequence.image_paths[row] for row in its)),
+                replace(sequence, stamps_ns=tuple(sequence.stamps_ns[row] for row in chosen_rows),
+                        image_paths=tuple(sequence.image_paths[row] for row in chosen_rows)),
                 camera, folder / name, ConversionOptions(image_format='compressed'),
                 progress=partial(tqdm, desc=name, unit='image', disable=None))
 
 
 def _table(folder: Path, paper: Mapping[str, Sequence[str]]) -> list[tuple[str, ...]]:
-    """Return the table of `evaluate`, its header first, with the paper's figures beside it."""
+    """Return the table of `evaluate`, header first, with the paper's numbers beside it."""
     results = json.loads((folder / 'results.json').read_text())
     summaries = summary.summarize(Result(**result) for result in results)
     rows = [tuple(row[column] for column in _COLUMNS) for row in summary.table_rows(summaries)]
     if not paper:
         return rows
-    beside = [_OF_PAPER, *(tuple(paper.get(one.method, ('', '', ''))) for one in summaries)]
+    beside = [_OF_PAPER, *(tuple(paper.get(method.method, ('', '', ''))) for method in summaries)]
     return [row + cells for row, cells in zip(rows, beside, strict=True)]
 
 
 def _csv_rows(name: str, folder: Path, paper: Mapping[str, Sequence[str]]
               ) -> Iterator[dict[str, str]]:
-    """Yield the rows of summary.csv of `evaluate`, with the paper's figures."""
+    """Yield the rows of summary.csv of `evaluate`, with the paper's numbers."""
     with (folder / 'summary.csv').open(newline='') as file:
         for row in csv.DictReader(file):
             beside = paper.get(row['method'], ('', '', ''))
@@ -346,22 +354,22 @@ def _csv_rows(name: str, folder: Path, paper: Mapping[str, Sequence[str]]
 
 
 def _write_results(names: Sequence[str], sources: Sources, out: Path) -> None:
-    """Print the tables, and write them as text, CSV, LaTeX and a page, and all as results.tar."""
+    """Print the tables, write them as text, CSV, LaTeX and a page, and pack all in results.tar."""
     texts: list[str] = []
     lines: list[dict[str, str]] = []
     latex, parts = [], []
     for name in names:
-        one, folder = sources.recordings[name], out / name / 'evaluation'
-        rows, title = _table(folder, one.paper), f'{name}: {one.name}'
+        recording, folder = sources.recordings[name], out / name / 'evaluation'
+        rows, title = _table(folder, recording.paper), f'{name}: {recording.name}'
         texts += [title, summary.as_text(rows), '']
         latex.append(f'% {title}\n{summary.as_latex(rows)}')
-        lines += _csv_rows(name, folder, one.paper)
+        lines += _csv_rows(name, folder, recording.paper)
         parts.append(html.fold(title, html.table(rows[0], rows[1:]), html.side_by_side(
             html.figure((folder / f'{figure}.png').read_bytes(), CAPTIONS[figure], figure)
             for figure in _FIGURES), is_open=True))
-    notes = ['± is the standard deviation over trials, of the time over searches.',
-             '~: the queries are too few to separate it from the method of most success within '
-             '1 m.', *sources.remarks]
+    notes = ['± is the standard deviation over trials; for the time, over searches.',
+             '~: there are too few queries to distinguish it from the method with the most '
+             'success within 1 m.', *sources.remarks]
     texts += notes
     print('\n'.join(['', *texts, '']), flush=True)
     write_text(out / 'table.txt', '\n'.join([*texts, '']))
@@ -385,7 +393,7 @@ def _write_results(names: Sequence[str], sources: Sources, out: Path) -> None:
 
 
 def _about(out: Path, names: Sequence[str], sources: Sources) -> dict[str, Any]:
-    """Return what the results depend on: machine, versions, files."""
+    """Describe the origin of the results: machine, versions, files."""
     versions = {}
     for package in ('cliploc_ros', 'numpy', 'torch', 'open_clip_torch', 'openvino',
                     'ultralytics-opencv-headless'):

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure what the pages show: ``python -m studies.results NAME... --data FOLDER``.
+"""Measure the tables of the pages: ``python -m studies.results NAME... --data FOLDER``.
 
-Runs the command of each NAME in results.yaml and writes its output to results/NAME.md, with the
-command, the revision and the time. script/document then copies sections of it into the pages. A
-digest at the end of the file shows edits by hand.
+The program runs the command of each NAME in results.yaml and writes its output to results/NAME.md,
+with the command, the revision and the time. script/document then copies sections of it into the
+pages. A digest at the end of the file reveals edits by hand.
 """
 
 import argparse
@@ -63,7 +63,7 @@ def _digest(text: str) -> str:
 
 
 def measure(name: str, command: str, data: Path) -> None:
-    """Run a command, and write what it prints to results/NAME.md."""
+    """Run a command, and write its output to results/NAME.md."""
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_results_') as out:
         words = [file for word in shlex.split(command)
                  for file in _files(word.replace('DATA', str(data)).replace('OUT', out))]
@@ -91,19 +91,19 @@ def _revision() -> str:
 
 
 def run() -> int:
-    """Measure the results that the command line names."""
+    """Measure the results named on the command line."""
     commands = yaml.safe_load(COMMANDS.read_text())
     parser = argparse.ArgumentParser(prog='python -m studies.results', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('names', nargs='+', choices=commands, metavar='NAME',
                         help=', '.join(commands))
     parser.add_argument('--data', type=Path, default=Path('data'),
-                        help='the folder DATA of results.yaml (%(default)s)')
+                        help='folder DATA of results.yaml (%(default)s)')
     options = parser.parse_args()
     for name in options.names:
         if 'DATA' in commands[name] and not options.data.is_dir():
-            raise OptionsError(f'--data {options.data}: there is no such folder; '
-                               'studies/README.md, "Data of the results", says what it holds')
+            raise OptionsError(f'--data {options.data}: no such folder; for its content see '
+                               'studies/README.md, "Data of the results"')
         measure(name, commands[name], options.data.resolve())
     return 0
 

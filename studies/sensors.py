@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of real wheel odometry, IMUs and accelerometers: ``python -m studies.sensors``.
+"""Measure errors of real wheel odometry, IMUs and accelerometers: ``python -m studies.sensors``.
 
 Wheels are compared with the gyroscope, the orientation of an IMU with its acceleration over
-seconds, and an accelerometer with motion capture. The verticals are
-those of the relocalizer's ``gravity: imu``.
+seconds, and an accelerometer with motion capture. The verticals are those of the relocalizer's
+``gravity: imu``.
 """
 
 import argparse
@@ -43,11 +43,12 @@ _LOST, _RATES_HZ = (0.0, 0.1), (5.0, 10.0, 25.0, 50.0)
 _TWISTS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
     'as it is': lambda twist: twist, 'empty': np.zeros_like}
 _LAGS_S = np.arange(-0.5, 0.51, 0.02)
-# A slower robot stands; the mean acceleration of so long before and after is that of gravity.
+# A slower robot counts as standing. The mean acceleration within this time before and after is
+# taken as gravity.
 _STANDS_M_S, _SLOW_NS = 0.01, 3 * NS_PER_S // 2
-# Between two instants of a vertical, and how many samples the node keeps.
+# Time between two instants of a vertical, and number of samples that the node keeps.
 _EVERY_S, _KEPT = 0.2, 1000
-# From the accelerometer of TUM's freiburg1 to the optical coordinate frame.
+# Rotation from the accelerometer of TUM's freiburg1 to the optical coordinate frame.
 _STATED_MOUNT = Rotation.from_matrix(np.diag([-1.0, -1.0, 1.0]))
 
 
@@ -58,17 +59,17 @@ class Robot:
     name: str
     poses: NDArray[np.float64]  #: (n, 8): stamp [s], position [m], quaternion x, y, z, w
     twists: NDArray[np.float64]  #: (n, 2, 3) [m/s], [rad/s]
-    samples: tuple[Sample, ...]  #: m
-    turn_rates: NDArray[np.float64]  #: (m, 3) of the gyroscope [rad/s]
+    samples: tuple[Sample, ...]  #: (m,)
+    turn_rates: NDArray[np.float64]  #: (m, 3): angular rates of the gyroscope [rad/s]
 
     @property
     def yaws(self) -> NDArray[np.float64]:
-        """Return the yaw (n,) of the poses [rad], without jumps by a turn."""
+        """Return the unwrapped yaw (n,) of the poses [rad]."""
         return np.unwrap(Rotation.from_quat(self.poses[:, 4:]).as_euler('ZYX')[:, 0])
 
     @property
     def ways(self) -> NDArray[np.float64]:
-        """Return the way (n,) driven until each pose [m]."""
+        """Return the distance (n,) driven up to each pose [m]."""
         return _summed(np.linalg.norm(np.diff(self.poses[:, 1:4], axis=0), axis=1))
 
     @property
@@ -78,7 +79,7 @@ class Robot:
 
 
 def read_robot(bag: Path) -> Robot:
-    """Read a bag of ROS 1 or 2 with one topic of odometry and one IMU."""
+    """Read a bag of ROS 1 or 2 with one odometry topic and one IMU topic."""
     poses, twists, samples, rates = [], [], list[Sample](), []
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         for topic, _, data in reader.messages():
@@ -97,9 +98,10 @@ def read_robot(bag: Path) -> Robot:
 
 
 def restarts_table(robot: Robot, rates_hz: Sequence[float], tries: int = 4) -> str:
-    """Return the table of restarts that are seen in a drive without any, with messages left out.
+    """Return the table of false restarts in a drive without restarts, with messages left out.
 
-    A row for each rate: each n-th message. Of each share of lost messages the sum of some tries.
+    A row uses each n-th message for a rate. Its cells sum several tries for a share of lost
+    messages.
     """
     rng, rows = np.random.default_rng(0), []
     for rate_hz in rates_hz:
@@ -123,7 +125,7 @@ def restarts_table(robot: Robot, rates_hz: Sequence[float], tries: int = 4) -> s
 
 
 def angle_table(robot: Robot) -> str:
-    """Return the table of the angle by wheels against that by the gyroscope."""
+    """Return the table that compares the angle of the wheels with that of the gyroscope."""
     lag_s, gyro = _gyro_yaw(robot)
     wheels, ways, errors = robot.yaws, robot.ways, OdometryErrors()
     turned = _summed(np.abs(np.diff(wheels)))
@@ -148,7 +150,7 @@ def angle_table(robot: Robot) -> str:
 
 
 def vertical_rows(robot: Robot) -> list[list[Any]]:
-    """Return rows of the vertical of an IMU: by orientation, and by acceleration alone."""
+    """Return rows for the vertical of an IMU: from orientation, and from acceleration alone."""
     stamps = np.array([sample.stamp_ns for sample in robot.samples])
     instants_s = np.arange(robot.poses[0, 0] + 2.0, robot.poses[-1, 0] - 2.0, _EVERY_S)
     off_slow, off_alone = [], []
@@ -161,7 +163,7 @@ def vertical_rows(robot: Robot) -> list[list[Any]]:
         slow = np.mean([sample.acceleration for sample in robot.samples[first:last]
                         if sample.acceleration is not None], axis=0)
         off_slow.append(_angle_deg(up, slow))
-        off_alone.append(_angle_deg(up, _up([one._replace(up=None) for one in near])))
+        off_alone.append(_angle_deg(up, _up([sample._replace(up=None) for sample in near])))
     stands = np.interp(instants_s, robot.poses[:, 0], robot.speeds) < _STANDS_M_S
     return [_vertical_row(f'{robot.name}, {what}, {state}', np.array(off)[chosen])
             for what, off in (('orientation, against acceleration over 3 s', off_slow),
@@ -170,7 +172,7 @@ def vertical_rows(robot: Robot) -> list[list[Any]]:
 
 
 def accelerometer_rows(folder: Path) -> list[list[Any]]:
-    """Return rows of the vertical of a TUM folder's accelerometer against motion capture."""
+    """Return rows for the vertical of a TUM folder's accelerometer against motion capture."""
     lines = (folder / 'accelerometer.txt').read_text(encoding='utf-8').splitlines()
     fields = [line.split() for line in lines if not line.startswith('#')]
     samples = [Sample(parse_stamp_ns(stamp, str(folder)), None, np.array(xyz, dtype=np.float64))
@@ -188,7 +190,7 @@ def accelerometer_rows(folder: Path) -> list[list[Any]]:
     fitted = Rotation.align_vectors(np.array(truth)[known], ups[known])[0]
     mount_deg = np.degrees((fitted * _STATED_MOUNT.inv()).magnitude())
     return [_vertical_row(f'{folder.name}, acceleration, {name}', np.array(
-        [_angle_deg(up, mount.apply(one)) for up, one in zip(truth, ups, strict=True)]))
+        [_angle_deg(up, mount.apply(found_up)) for up, found_up in zip(truth, ups, strict=True)]))
         for name, mount in (('stated mount', _STATED_MOUNT),
                             (f'fitted mount ({mount_deg:.1f} degrees off)', fitted))]
 
@@ -200,7 +202,7 @@ def _vertical_row(name: str, off_deg: NDArray[np.float64]) -> list[Any]:
 
 
 def _up(near: Sequence[Sample], recent: Sequence[Sample] = ()) -> NDArray[np.float64]:
-    """Return the vertical (3,) as the node has it; NaN where it has none."""
+    """Return the vertical (3,) as the node computes it; NaN if it cannot."""
     try:
         return mean_up(near, recent, 'imu')
     except NoVerticalError:
@@ -210,25 +212,26 @@ def _up(near: Sequence[Sample], recent: Sequence[Sample] = ()) -> NDArray[np.flo
 def _gyro_yaw(robot: Robot) -> tuple[float, NDArray[np.float64]]:
     """Return the lag of the IMU's stamps [s], and the yaw (n,) by gyroscope at the poses [rad].
 
-    The lag is the one with which the two fit best. The mean rate of a robot that stands is 0.
+    The lag fits the yaw of the wheels best. The mean rate of the standing robot is subtracted.
     """
     at_s = np.array([sample.stamp_ns for sample in robot.samples]) / NS_PER_S
-    ups = np.array([np.full(3, np.nan) if one.up is None else one.up for one in robot.samples])
+    ups = np.array([np.full(3, np.nan) if sample.up is None else sample.up
+                    for sample in robot.samples])
     rates = (robot.turn_rates * ups).sum(axis=1)
     stands = np.interp(at_s, robot.poses[:, 0], robot.speeds) < _STANDS_M_S
     rates -= rates[stands].mean() if stands.any() else 0.0
     yaws = _summed((rates[1:] + rates[:-1]) / 2 * np.diff(at_s))
     fits = [(float(np.std(np.diff(robot.yaws - shifted, 1))), float(lag), shifted)
             for lag in _LAGS_S for shifted in [np.interp(robot.poses[:, 0] + lag, at_s, yaws)]]
-    _, lag_s, best = min(fits, key=lambda one: one[0])
+    _, lag_s, best = min(fits, key=lambda fit: fit[0])
     return lag_s, best
 
 
 def _step(robot: Robot, first: int, last: int) -> NDArray[np.float64]:
     """Return the robot's motion (4, 4) between two poses, by odometry."""
-    one, other = (make_transform(Rotation.from_quat(robot.poses[row, 4:]).as_matrix(),
+    first_pose, last_pose = (make_transform(Rotation.from_quat(robot.poses[row, 4:]).as_matrix(),
                                  robot.poses[row, 1:4]) for row in (first, last))
-    return np.asarray(np.linalg.inv(one) @ other)
+    return np.asarray(np.linalg.inv(first_pose) @ last_pose)
 
 
 def _summed(steps: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -239,8 +242,8 @@ def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(values ** 2))) if len(values) else np.nan
 
 
-def _angle_deg(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    cosine = one @ other / (np.linalg.norm(one) * np.linalg.norm(other))
+def _angle_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    cosine = first @ second / (np.linalg.norm(first) * np.linalg.norm(second))
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
@@ -249,14 +252,14 @@ def run(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(prog='python -m studies.sensors', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--bags', type=Path, nargs='*', default=[], metavar='BAG',
-                        help='with odometry and an IMU with orientation')
+                        help='bags with odometry and an IMU with orientation')
     parser.add_argument('--tum', type=Path, nargs='*', default=[], metavar='DIR',
                         help='TUM folders with accelerometer.txt')
     options = parser.parse_args(arguments)
     robots = [read_robot(bag) for bag in options.bags]
     for robot in robots:
         most_hz = 1.1 / np.median(np.diff(robot.poses[:, 0]))
-        print(restarts_table(robot, [one for one in _RATES_HZ if one <= most_hz]), '\n')
+        print(restarts_table(robot, [rate for rate in _RATES_HZ if rate <= most_hz]), '\n')
         print(angle_table(robot), '\n')
     rows = [row for robot in robots for row in vertical_rows(robot)]
     rows += [row for folder in options.tum for row in accelerometer_rows(folder)]

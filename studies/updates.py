@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Does an update find what changed? ``python -m studies.updates OBSERVATIONS.npz...``.
+"""Does an update find the changes? ``python -m studies.updates OBSERVATIONS.npz...``.
 
-A part of each recording is mapped, another part updates the map: the splits of the splits.json
-beside it, or halves and images in turn. Nothing moves there: changes are made, of landmarks that
-the other part shows well and that stand apart from others of their class.
+One part of each recording is mapped, another part updates the map. The splits come from
+splits.json beside the recording, or are halves and every second image. Nothing moves in the
+recordings, so the study simulates changes of landmarks that the other part shows well and that
+stand apart from others of their class.
 
-wrong map   the boxes are real; the map has some landmarks displaced by .3 to 1 m, lacks some, and
-            has some in places that are free and in view.
-away, back  a first update lacks the boxes of some landmarks, and has those of others where the
-            displaced objects would show. The second one is the recording as it is.
+wrong map   The boxes are real. In the map, some landmarks are displaced by .3 to 1 m, some are
+            missing, and some are added in places that are free and in view.
+away, back  In a first update, the boxes of some landmarks are missing, and those of others are
+            where the displaced objects would appear. The second update uses the original boxes.
 """
 
 import argparse
@@ -47,22 +48,23 @@ from studies.reports import grouped, run_all, table
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 _WAYS_M = 0.3, 1.0
-# A landmark is in its place within this; others of its class are no nearer to those that are
-# changed; a kept one has moved by more than this [m].
+# A landmark within the first distance of its place is in its place; changed landmarks are at least
+# this far from others of their class. A kept landmark has moved if its centre changed by more than
+# the second distance [m].
 _IN_PLACE_M, _MOVED_M = 0.15, 0.05
 _PLACES_TRIED = 1000
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A map of a part of a recording, and the other part: L landmarks, n boxes of that."""
+    """A map of one part of a recording (L landmarks), and the other part (n boxes)."""
 
     recording: str
     name: str
     old: LandmarkMap
     later: PosedDetections
-    views: Views  #: Of the later part
-    true: Landmarks  #: Where all images put the landmarks
+    views: Views  #: Views of the later part
+    true: Landmarks  #: The landmarks, refitted to all images
     things: Floats  #: (m, 3): centres of the map of all images
     shown: Rows  #: (n,): the landmark that each box shows, -1 for none
     known: Rows  #: Landmarks that may be changed
@@ -70,17 +72,17 @@ class Part:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a landmark."""
+    """The state of a landmark after an update."""
 
     recording: str
     part: str
     kind: str
-    change: str  #: What was done to it
+    change: str  #: The simulated change
     name: str
     is_found: bool  #: A landmark of its class is in its place
-    is_back: bool  #: It has its id
-    is_ghost: bool  #: A landmark with its id is where nothing is
-    way_m: float  #: By how much its centre changed, if it is in both maps
+    is_back: bool  #: A landmark in its place has its id
+    is_ghost: bool  #: A landmark with its id is where there is no object
+    way_m: float  #: Displacement of its centre, if it is in both maps [m]
     is_worse: bool  #: It is farther from its place by more than 5 cm
 
 
@@ -90,7 +92,7 @@ def run() -> int:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('observations', nargs='+', type=Path, metavar='NPZ')
     parser.add_argument('--changes', type=positive_int, default=4, metavar='N',
-                        help='of each kind in each map (%(default)s)')
+                        help='changes of each kind in each map (%(default)s)')
     parser.add_argument('--draws', type=positive_int, default=3, metavar='N')
     parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
     options = parser.parse_args()
@@ -99,19 +101,21 @@ def run() -> int:
         [(path, name) for path in options.observations for name in _splits(path)], 'parts',
         options.workers)
     columns: dict[str, Callable[[Outcome], bool]] = {
-        'in its place': lambda one: one.is_found, 'with its id': lambda one: one.is_back,
-        'ghosts': lambda one: one.is_ghost, 'moved by 5 cm': lambda one: one.way_m > _MOVED_M,
-        'worse by 5 cm': lambda one: one.is_worse}
+        'in its place': lambda outcome: outcome.is_found,
+        'with its id': lambda outcome: outcome.is_back,
+        'ghosts': lambda outcome: outcome.is_ghost,
+        'moved by 5 cm': lambda outcome: outcome.way_m > _MOVED_M,
+        'worse by 5 cm': lambda outcome: outcome.is_worse}
     for by in (['kind', 'change'], ['recording', 'part', 'kind', 'change']):
         print(table([*by, 'n', *columns], [
-            (*key, len(its), *(f'{np.mean(list(map(column, its))):.3f}'
+            (*key, len(outcomes), *(f'{np.mean(list(map(column, outcomes))):.3f}'
                                for column in columns.values()))
-            for key, its in grouped(found, by).items()]) + '\n')
+            for key, outcomes in grouped(found, by).items()]) + '\n')
     return 0
 
 
 def _splits(path: Path) -> dict[str, tuple[Rows, Rows]]:
-    """Return the frames of the map and of the update, by the name of the split."""
+    """Return the frames of the map and those of the update, by the name of the split."""
     rows = np.arange(len(load_observations(path)))
     maps = {'even': rows[::2], 'half0': rows[:len(rows) // 2], 'half1': rows[len(rows) // 2:]}
     if (file := path.with_name('splits.json')).exists():
@@ -134,7 +138,7 @@ def _make_work(changes: int, draws: int) -> Callable[[tuple[Path, str]], list[Ou
 
 
 def make_part(path: Path, name: str) -> Part:
-    """Return a split of the observations in a file."""
+    """Build the map of one split of the observations in a file."""
     observations = load_observations(path)
     mapped, rest = _splits(path)[name]
     old = build_map(observations.select_frames(mapped)).landmark_map
@@ -160,7 +164,7 @@ def _stands_apart(old: LandmarkMap, true: Landmarks, row: int) -> bool:
 
 
 def change(part: Part, changes: int, rng: np.random.Generator) -> Iterator[Outcome]:
-    """Yield what became of landmarks that were changed, and of the others."""
+    """Simulate changes and update the map; yield the outcomes of all landmarks."""
     count = min(changes, len(part.known) // 5)
     displaced, removed, models = rng.permutation(part.known)[:3 * count].reshape(3, count)
     old, taken = part.old, part.things
@@ -190,9 +194,9 @@ def change(part: Part, changes: int, rng: np.random.Generator) -> Iterator[Outco
 def _judged(part: Part, kind: str, before: LandmarkMap, after: LandmarkMap,
             changed: Mapping[str, Rows], places: Mapping[int, Floats] | None = None,
             gone: Sequence[int] = ()) -> Iterator[Outcome]:
-    """Yield what became of all landmarks; some objects are in other places, and some are gone."""
-    first, last = (dict(zip(one.landmark_ids, one.centers, strict=True))
-                   for one in (before, after))
+    """Yield the outcomes of all landmarks, with objects moved to other places or gone."""
+    first, last = (dict(zip(landmark_map.landmark_ids, landmark_map.centers, strict=True))
+                   for landmark_map in (before, after))
     there = np.setdiff1d(np.arange(len(part.old)), gone)
     moved = {} if places is None else places
     things = np.concatenate([part.old.centers[there], part.true.centers[there], *(
@@ -210,7 +214,7 @@ def _judged(part: Part, kind: str, before: LandmarkMap, after: LandmarkMap,
         way_m, is_worse = 0.0, False
         if change == 'kept' and name in last:
             way_m = float(np.linalg.norm(last[name] - first[name]))
-            was_off, is_off = (np.linalg.norm(one[name] - own[0]) for one in (first, last))
+            was_off, is_off = (np.linalg.norm(centers[name] - own[0]) for centers in (first, last))
             is_worse = bool(is_off > was_off + _MOVED_M)
         return Outcome(part.recording, part.name, kind, change, name, is_found,
                        name in {after.landmark_ids[number] for number in near}, bool(is_ghost),
@@ -227,12 +231,12 @@ def _judged(part: Part, kind: str, before: LandmarkMap, after: LandmarkMap,
 
 def _free_place(part: Part, model: int, beside: int, taken: Floats, rng: np.random.Generator
                 ) -> Floats:
-    """Return a place for a landmark beside another one, free and in view of the later part."""
+    """Return a free place for a landmark beside another one, in view of the later part."""
     basis = part.true.bases[[model]]
     shapes = np.concatenate([part.true.bases, np.repeat(basis, len(taken), axis=0)])
     shapes = shapes @ shapes.transpose(0, 2, 1) + basis @ basis.transpose(0, 2, 1)
     others = np.concatenate([part.true.centers, taken])
-    for number in range(_PLACES_TRIED):  # farther and farther away where all is full
+    for number in range(_PLACES_TRIED):  # the distance grows with the number of failed tries
         angle, way = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*_WAYS_M) + number // 100
         place = part.true.centers[beside] + way * np.array([np.cos(angle), np.sin(angle), 0.0])
         if (normalized_lengths(others - place, shapes) < STANDS_IN).any():
@@ -247,14 +251,14 @@ def _free_place(part: Part, model: int, beside: int, taken: Floats, rng: np.rand
 
 
 def _elsewhere(part: Part, displaced: Rows, places: Floats, removed: Rows) -> PosedDetections:
-    """Return the later part with objects in other places, and without some."""
+    """Return the later part with some objects in other places, and some removed."""
     views, true, boxes = part.views, part.true, part.later.bboxes_xyxy.copy()
     depths = None if part.later.depths is None else part.later.depths.copy()
     nameless = find_overlaps(views._replace(classes=np.zeros_like(views.classes)),
                              true._replace(classes=np.zeros_like(true.classes)), MIN_MEDIAN_IOU)
     on_gone = np.isin(nameless.landmarks, np.concatenate([displaced, removed]))
     kept = np.ones(len(boxes), dtype=np.bool_)
-    # other boxes on an object go with it
+    # other boxes on a changed object are removed as well
     kept[nameless.boxes[on_gone & (part.shown[nameless.boxes] < 0)]] = False
     kept[np.isin(part.shown, removed)] = False
     here, there = np.empty(4), np.empty(4)
@@ -266,7 +270,7 @@ def _elsewhere(part: Part, displaced: Rows, places: Floats, removed: Rows) -> Po
                 project_box(*pose, place, true.bases[row], there))
             if not kept[box]:
                 continue
-            # the detector errs there as it does here
+            # the detector's error is the same at both places, relative to the size of the box
             sizes = np.tile((there[2:] - there[:2]) / (here[2:] - here[:2]), 2)
             edges = there + (views.edges[box] - here) * sizes
             bounds = views.bounds[frame]

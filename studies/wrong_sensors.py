@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors that are wrong in a way that the robot does not know."""
+"""Simulate sensor errors that are unknown to the robot."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,19 +17,19 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.offline.evaluation.trials import PosedQuery, turned
 
 Floats = NDArray[np.float64]
-#: A change of queries by a level.
+#: A function that changes queries by a level.
 Change = Callable[[Sequence[PosedQuery], float], tuple[PosedQuery, ...]]
 
 
 def _of_frames(change: Callable[[Observation, float, np.random.Generator], Observation],
                salt: int = 3) -> Change:
-    """Return the change of queries whose frames are all changed by one rule.
+    """Return a change that applies one rule to all frames of the queries.
 
-    All frames of a query have equal random numbers.
+    All frames of a query get the same random numbers.
     """
     def changed(queries: Sequence[PosedQuery], level: float) -> tuple[PosedQuery, ...]:
-        def of_frame(one: Observation, number: int) -> Observation:
-            return change(one, level, np.random.default_rng([0, number, salt]))
+        def of_frame(frame: Observation, number: int) -> Observation:
+            return change(frame, level, np.random.default_rng([0, number, salt]))
 
         return tuple(replace(
             query, observation=of_frame(query.observation, query.number),
@@ -40,33 +40,33 @@ def _of_frames(change: Callable[[Observation, float, np.random.Generator], Obser
 
 
 def _of_boxes(change: Callable[[Floats, Camera, float], Floats]) -> Change:
-    """Return the change of queries whose boxes (n, 4) are all changed by one rule."""
-    return _of_frames(lambda one, level, rng: replace(one, detections=replace(
-        one.detections, bboxes_xyxy=np.ascontiguousarray(change(
-            one.detections.bboxes_xyxy.reshape(-1, 4), one.camera, level), dtype=np.float64))))
+    """Return a change that applies one rule to the boxes (n, 4) of each frame."""
+    return _of_frames(lambda frame, level, rng: replace(frame, detections=replace(
+        frame.detections, bboxes_xyxy=np.ascontiguousarray(change(
+            frame.detections.bboxes_xyxy.reshape(-1, 4), frame.camera, level), dtype=np.float64))))
 
 
 def _of_camera(change: Callable[[Camera, float], Camera]) -> Change:
-    """Return the change of queries whose intrinsics are wrong by a level."""
-    return _of_frames(lambda one, level, rng: replace(one, camera=change(one.camera, level)))
+    """Return a change that makes the intrinsics wrong by a level."""
+    return _of_frames(lambda frame, level, rng: replace(frame, camera=change(frame.camera, level)))
 
 
 def _of_depths(change: Callable[[Floats, float, np.random.Generator], Floats]) -> Change:
-    """Return the change of queries whose depths (n,) are wrong, where they have some."""
-    return _of_frames(lambda one, level, rng: one if one.depths is None else replace(
-        one, depths=change(one.depths, level, rng)))
+    """Return a change that makes the depths (n,) wrong, in frames that have depths."""
+    return _of_frames(lambda frame, level, rng: frame if frame.depths is None else replace(
+        frame, depths=change(frame.depths, level, rng)))
 
 
 def with_mount_error(queries: Sequence[PosedQuery], groups: Sequence[int], noise_deg: float,
                      seed: int = 0) -> tuple[PosedQuery, ...]:
-    """Return queries with a known vertical, wrong by the same in all frames of a group.
+    """Return queries with a known vertical that has the same error in all frames of a group.
 
-    That is the error of a sensor, or of its mount.
+    Such an error is that of a sensor, or of its mount.
 
     Parameters
     ----------
     groups : sequence of int
-        The group of each.
+        The group of each query.
     noise_deg : float
         Standard deviation of the error on each of two axes [deg].
     seed : int
@@ -81,37 +81,37 @@ def with_mount_error(queries: Sequence[PosedQuery], groups: Sequence[int], noise
 
 
 @partial(_of_frames, salt=2)
-def tilted_vertical(one: Observation, angle_deg: float, rng: np.random.Generator) -> Observation:
+def tilted_vertical(frame: Observation, angle_deg: float, rng: np.random.Generator) -> Observation:
     """Return a frame whose vertical is off by an angle."""
-    return one if one.up_in_camera is None else replace(one, up_in_camera=turned(
-        one.up_in_camera, np.radians(angle_deg), rng))
+    return frame if frame.up_in_camera is None else replace(frame, up_in_camera=turned(
+        frame.up_in_camera, np.radians(angle_deg), rng))
 
 
 @_of_frames
-def wrong_mount(one: Observation, angle_deg: float, rng: np.random.Generator) -> Observation:
-    """Return a frame of a camera that is turned in its mount by an angle, in a random direction.
+def wrong_mount(frame: Observation, angle_deg: float, rng: np.random.Generator) -> Observation:
+    """Return a frame of a camera that is turned in its mount by an angle about a random axis.
 
-    The robot's tilt and odometry reach the camera through the mount, so both are wrong.
+    The robot's tilt and odometry are transformed to the camera by the mount, so both are wrong.
     """
-    axis, up, pose = rng.normal(size=3), one.up_in_camera, one.odom_from_camera
+    axis, up, pose = rng.normal(size=3), frame.up_in_camera, frame.odom_from_camera
     turn = Rotation.from_rotvec(np.radians(angle_deg) * axis / np.linalg.norm(axis))
     wrong = make_transform(turn.as_matrix(), np.zeros(3))
-    return replace(one, up_in_camera=None if up is None else wrong[:3, :3].T @ up,
+    return replace(frame, up_in_camera=None if up is None else wrong[:3, :3].T @ up,
                    odom_from_camera=None if pose is None else pose @ wrong)
 
 
-#: Depths too large by a factor: of a scale, or of a unit.
+#: Depths too large by a factor, such as a wrong scale or unit.
 scaled_depth = _of_depths(lambda depths, factor, rng: factor * depths)
-#: A share of the depths is anything from .3 to 6 m.
+#: A share of the depths is random, from .3 to 6 m.
 random_depth = _of_depths(lambda depths, share, rng: np.where(
     rng.random(len(depths)) < share, rng.uniform(0.3, 6.0, len(depths)), depths))
-#: A share of the depths is not known.
+#: A share of the depths is missing.
 missing_depth = _of_depths(lambda depths, share, rng: np.where(
     rng.random(len(depths)) < share, np.nan, depths))
 
 
 def depth_elsewhere(queries: Sequence[PosedQuery], share: float) -> tuple[PosedQuery, ...]:
-    """Return queries with a share of depths of other boxes: the depth camera looks elsewhere."""
+    """Return queries with a share of depths of other boxes, as if the depth camera were turned."""
     known = [query.observation.depths for query in queries
              if query.observation.depths is not None]
     every = np.concatenate(known) if known else np.empty(0)
@@ -120,10 +120,10 @@ def depth_elsewhere(queries: Sequence[PosedQuery], share: float) -> tuple[PosedQ
 
 
 def scaled_odometry(queries: Sequence[PosedQuery], factor: float) -> tuple[PosedQuery, ...]:
-    """Return queries whose odometry counts distances and turns too long by a factor."""
+    """Return queries whose odometry overestimates distances and turns by a factor."""
     found = []
     for query in queries:
-        frames = sorted((*query.neighbours, query.observation), key=lambda one: one.stamp_ns)
+        frames = sorted((*query.neighbours, query.observation), key=lambda frame: frame.stamp_ns)
         poses = [np.eye(4)]
         for before, after in pairwise(frames):
             assert before.odom_from_camera is not None
@@ -134,7 +134,8 @@ def scaled_odometry(queries: Sequence[PosedQuery], factor: float) -> tuple[Posed
         scaled = {frame.stamp_ns: replace(frame, odom_from_camera=pose)
                   for frame, pose in zip(frames, poses, strict=True)}
         found.append(replace(query, observation=scaled[query.observation.stamp_ns],
-                             neighbours=tuple(scaled[one.stamp_ns] for one in query.neighbours)))
+                             neighbours=tuple(scaled[neighbour.stamp_ns]
+                                              for neighbour in query.neighbours)))
     return tuple(found)
 
 
@@ -146,7 +147,7 @@ shifted_boxes = _of_boxes(lambda boxes, camera, share: boxes + [share * camera.w
 
 @_of_boxes
 def middle_crop(boxes: Floats, camera: Camera, side_px: float) -> Floats:
-    """Return the boxes of a network that sees the middle square, in its pixels."""
+    """Return boxes in the pixels of a network whose input is the middle square of the image."""
     side = min(camera.width, camera.height)
     corner = np.tile([camera.width - side, camera.height - side], 2) / 2
     return np.clip((boxes - corner) * side_px / side, 0.0, side_px)
@@ -172,23 +173,23 @@ def mirrored_boxes(boxes: Floats, camera: Camera, level: float) -> Floats:
     return np.stack([camera.width - right, top, camera.width - left, bottom], axis=1)
 
 
-#: Numbers of a box in the order of some convention, made of corners (2, n) and the image's size.
+#: Conventions for the four numbers of a box, computed from its corners and the image's size.
 CONVENTIONS: tuple[Callable[..., tuple[NDArray[np.float64], NDArray[np.float64]]], ...] = (
     lambda low, high, size: (0.5 * (low + high), high - low),  # x and y of the centre, sides
     lambda low, high, size: (low, high - low),  # corner and sides
     lambda low, high, size: (low / size, high / size),  # shares of the image
     lambda low, high, size: (low[:, ::-1], high[:, ::-1]),  # rows before columns
-    # corners taken for centre and sides, and for corner and sides
+    # corners interpreted as centre and sides, and as corner and sides
     lambda low, high, size: (low - 0.5 * high, low + 0.5 * high),
     lambda low, high, size: (low, low + high))
-#: Boxes of another one of CONVENTIONS, taken for corners.
+#: Boxes in one of the CONVENTIONS, interpreted as corners.
 of_convention = _of_boxes(lambda boxes, camera, number: np.hstack(CONVENTIONS[int(number)](
     boxes[:, :2], boxes[:, 2:], np.array([camera.width, camera.height]))))
 
 
 @_of_boxes
 def fisheye_boxes(boxes: Floats, camera: Camera, level: float) -> Floats:
-    """Return the boxes that an ideal fisheye sees, taken for a pinhole's."""
+    """Return the boxes of an ideal fisheye camera, interpreted as those of a pinhole camera."""
     middle, scale = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
     x, y = boxes.reshape(-1, 2, 2).transpose(2, 0, 1)
     # the middles of the edges: left, top, right, bottom

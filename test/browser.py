@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Chromium, and a person in front of it, for the tests of the studio's page."""
+"""Chromium with a simulated person at it, for the tests of the studio's page."""
 
 import os
 import re
@@ -35,7 +35,7 @@ def running_chromium():
 
 
 class Person:
-    """Who looks at the page; without the scene, which takes seconds a frame, unless asked for."""
+    """A person at the page. The scene takes seconds per frame, so it is off unless requested."""
 
     def __init__(self, chromium, url, has_scene=False):
         self.page = chromium.new_page(viewport={'width': 1000, 'height': 800})
@@ -83,7 +83,7 @@ class Person:
         self.page.get_by_text(re.compile(f'^view {view}\\b')).first.wait_for()
 
     def on_image(self, pixel):
-        """Return where a pixel (2,) of the image is on the page."""
+        """Return the position on the page of a pixel (2,) of the image."""
         return self.page.evaluate("""([x, y]) => {
             const at = new DOMPoint(x, y).matrixTransform($('image').getScreenCTM());
             return [at.x, at.y];}""", [float(value) for value in pixel])
@@ -104,6 +104,6 @@ class Person:
         wait_for(lambda: view in studio.new.boxes, 'the box')
 
     def picture(self, name):
-        """Keep a picture of the page where the environment names a folder for it."""
+        """Save a picture of the page if the environment names a folder for it."""
         if folder := os.environ.get('CLIPLOC_SCREENSHOTS'):
             self.page.screenshot(path=Path(folder) / f'{name}.png', timeout=TIMEOUT_S * 1000)

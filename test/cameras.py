@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot with four cameras among objects: simulated."""
+"""A simulated robot with four cameras among objects."""
 
 import numpy as np
 from scene import CAMERA, boxes_of, make_room
@@ -19,7 +19,7 @@ def turned(row):
 
 
 def make_surroundings():
-    """The room's objects, four times around the robot, each time moved a little."""
+    """Return the room's objects four times around the robot, each time moved a little."""
     room, rng = make_room(), np.random.default_rng(11)
     centers, quats = [], []
     for row in range(4):
@@ -37,7 +37,7 @@ MOUNTS = [make_transform(turned(row)[:3, :3], turned(row)[:3, :3] @ [0.0, 0.0, 0
 
 
 def look(rng, map_from_robot=None, objects=3, stamp_ns=0, mounts=MOUNTS, noise_px=1.0):
-    """What each camera sees: a few of the objects before it, and where the mounts say it is."""
+    """Return the observation of each camera: a few of the objects before it, with its mount."""
     map_from_robot = np.eye(4) if map_from_robot is None else map_from_robot
     seen = []
     for name, mount, stated in zip(NAMES, mounts, MOUNTS, strict=True):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's walk as each program or device would write it, by the public definitions.
+"""Write the demo's walk in the format of each program or device, from its public definition.
 
 COLMAP's models are written by pycolmap itself.
 """
@@ -22,7 +22,7 @@ from cliploc_ros.offline.datasets.folders import read_folder
 ASSETS = Path(__file__).resolve().parents[1] / 'demo/assets'
 WALK = ASSETS / 'mapping'
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-# ARKit's and HoloLens's map from one with z up
+# map of ARKit and HoloLens from a map with z up
 Y_UP = np.eye(4)
 Y_UP[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
 DEPTH_MM = np.full((192, 256), 2000, dtype=np.uint16)
@@ -43,7 +43,7 @@ def shots_of(folder=WALK):
 
 
 def write_colmap(folder, shots, text=False, camera_of=None, scale=1.0, world=None):
-    """A project; camera_of(number) returns a camera's model, size and values."""
+    """Write a project; camera_of(number) returns a camera's model, size and values."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -170,7 +170,7 @@ def write_hololens(folder, shots):
     return folder
 
 
-#: Layout, and what writes it.
+#: Layouts, and the functions that write them.
 WRITERS = {
     'COLMAP model': write_colmap, 'transforms.json': write_nerf, 'Polycam': write_polycam,
     'Record3D': write_record3d, 'Stray Scanner': write_stray, 'ARKitScenes': write_arkitscenes,

@@ -14,7 +14,7 @@ TIMEOUT_S = 300.0
 
 @contextmanager
 def local_cluster(workers=2, allowed_failures=3):
-    """A scheduler with some workers, each a process with one thread, which start again."""
+    """Start a scheduler with single-threaded worker processes, which restart when they die."""
     with (dask.config.set({'distributed.scheduler.allowed-failures': allowed_failures}),
           LocalCluster(n_workers=workers, threads_per_worker=1, processes=True,
                        dashboard_address='127.0.0.1:0') as cluster):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Shared by all tests: the data beside the project, one ROS domain a process, the summary."""
+"""Fixtures and options of all tests: shared data, one ROS domain per process, the summary."""
 
 import faulthandler
 import importlib.util
@@ -20,16 +20,16 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 SHARED_DATA = PROJECT.parent / 'shared' / 'data'
-# The order of the folders. pytest-xdist gives each worker an equal run of tests; who is done takes
-# half of what another has left.
+# Order of the folders. pytest-xdist gives each worker an equal run of tests; an idle worker takes
+# half of another worker's remaining tests.
 LONGEST_FIRST = ('nodes', 'demo', 'models', 'studies', 'evaluation', 'mapping', 'cli', 'core')
-# A fixture, or a test, that takes longer hangs. The longest take a minute on a busy machine, and
-# several in a niced process, which gets a tenth of a core there.
+# Time limit of a test or fixture. The longest take a minute on a busy machine, and several minutes
+# in a niced process, which gets a tenth of a core there.
 PATIENCE_S = 650 if os.nice(0) else 300
-#: The tests that do not run here, by the Python module they need.
+#: Tests that are not run here, by the Python module they need.
 NOT_RUN = pytest.StashKey[dict[str, list[str]]]()
 
-# Equal runs draw equal examples; the first call of a compiled kernel would break any deadline.
+# Equal runs draw equal examples. No deadline, since the first call of a kernel compiles it.
 hypothesis.settings.register_profile('cliploc_ros', deadline=None, derandomize=True)
 hypothesis.settings.load_profile('cliploc_ros')
 
@@ -53,14 +53,14 @@ def reserve_ros_domain() -> tuple[int, socket.socket]:
 
 
 def pytest_addoption(parser):
-    parser.addoption('--no-skips', action='store_true', help='a skipped test fails the run')
+    parser.addoption('--no-skips', action='store_true', help='fail the run if a test is skipped')
     parser.addoption('--quick', action='store_true',
-                     help='leave out the tests that are marked full or clock, and import none of '
+                     help='leave out the tests that are marked full or clock, and do not import '
                           'the files that are marked full')
 
 
 def pytest_ignore_collect(collection_path, config):
-    """Leave out a file that is marked full: it may import what is not installed."""
+    """Leave out a file that is marked full: it may import modules that are not installed."""
     if config.getoption('--quick') and collection_path.suffix == '.py' and re.search(
             r'^pytestmark = .*mark\.full\b', collection_path.read_text(), re.MULTILINE):
         return True
@@ -68,22 +68,22 @@ def pytest_ignore_collect(collection_path, config):
 
 
 def pytest_configure(config):
-    """Isolate the tests' nodes from all others; they inherit this environment."""
+    """Isolate the nodes of the tests from all others; processes inherit this environment."""
     config.stash[NOT_RUN] = {}
     # A shell's background jobs ignore SIGINT, and the processes of the tests would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     domain, config.ros_domain_reservation = reserve_ros_domain()
     os.environ['ROS_DOMAIN_ID'] = str(domain)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    # The older variable for the same: ROS warns where both are set.
+    # The older variable for this setting: ROS warns if both are set.
     os.environ.pop('ROS_LOCALHOST_ONLY', None)
-    # As in the nodes: PyTorch's threads sleep while they wait for work, and do not spin.
+    # As in the nodes: waiting threads of PyTorch sleep instead of spinning.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
-    """Deselect tests that need a missing module; sort the rest by expected duration."""
+    """Deselect tests that need a missing module; sort the others by expected duration."""
     if config.getoption('--quick'):
         slow = [item for item in items
                 if item.get_closest_marker('full') or item.get_closest_marker('clock')]
@@ -95,8 +95,8 @@ def pytest_collection_modifyitems(config, items):
     config.hook.pytest_deselected(items=left_out)
     items[:] = sorted((item for item in items if not missing_module(item)), key=place)
     for item in items:
-        # Processes that race on two busy cores fail once in a thousand tests; a test of anything
-        # else has to pass at once, unless it hangs.
+        # Processes that race on two busy cores fail about once in a thousand tests. All other
+        # tests have to pass at the first attempt, unless they hang.
         if not item.get_closest_marker('clock'):
             of_processes = (item.path.parent.name in {'nodes', 'demo'}
                             or item.path.name == 'test_cluster.py')
@@ -105,13 +105,13 @@ def pytest_collection_modifyitems(config, items):
 
 
 def fail_slow_test(_number, _frame):
-    faulthandler.dump_traceback(sys.__stderr__)  # of all threads
+    faulthandler.dump_traceback(sys.__stderr__)  # dump the stacks of all threads
     pytest.fail(f'the test hangs: it took more than {PATIENCE_S} s')
 
 
 @pytest.hookimpl(wrapper=True)
 def limit_time(item):
-    """End a test that hangs, so that the others run. Each attempt has its own time."""
+    """Stop a test that hangs, so that the others run. The time limit applies to each attempt."""
     signal.signal(signal.SIGALRM, fail_slow_test)
     signal.alarm(PATIENCE_S)
     try:
@@ -124,7 +124,7 @@ pytest_runtest_setup = pytest_runtest_call = limit_time
 
 
 def missing_module(item: pytest.Item) -> str | None:
-    """Return the first of the test's ``needs``, modules or programs, that is not installed."""
+    """Return the first module or program in the test's ``needs`` that is not installed."""
     needed = [name for marker in item.iter_markers('needs') for name in marker.args]
     return next((name for name in needed if importlib.util.find_spec(name) is None
                  and shutil.which(name) is None), None)
@@ -148,7 +148,7 @@ def pytest_sessionfinish(session, exitstatus):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node, error):
-    """Take over a worker's list of tests that do not run; every worker has the same."""
+    """Adopt a worker's list of tests that are not run; every worker has the same list."""
     node.config.stash[NOT_RUN] |= getattr(node, 'workeroutput', {}).get('not_run', {})
 
 
@@ -157,7 +157,7 @@ def count(reporter, *outcomes: str) -> int:
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """Print first attempts that failed, measurements, what did not run, and the counts."""
+    """Print failed first attempts, measurements, the tests not run, and the counts."""
     reran = terminalreporter.stats.get('rerun', [])
     if reran:
         terminalreporter.section('attempts that failed, and ran again')
@@ -186,7 +186,7 @@ def pytest_terminal_summary(terminalreporter, config):
 
 @pytest.fixture(scope='session')
 def shared_data() -> Path:
-    """The folder of recordings and weights beside the project."""
+    """Return the folder of recordings and weights beside the project."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f'the shared data folder is missing: {SHARED_DATA}')
     return SHARED_DATA
@@ -194,7 +194,7 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def run_here(capsys):
-    """Run the main of an executable in this process, which has done the imports."""
+    """Run the main function of an executable in this process, which has done the imports."""
     handler = signal.getsignal(signal.SIGTERM)
 
     def run(main, *arguments):
@@ -206,7 +206,7 @@ def run_here(capsys):
 
 @pytest.fixture(scope='session')
 def executables() -> Path:
-    """The folder of the installed executables, in the sourced workspace or else in install/."""
+    """Return the folder of the installed executables, in the sourced workspace or in install/."""
     from ament_index_python import get_package_prefix
 
     try:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What only one process sees: a small or read-only disk, numbers of processes."""
+"""Environments for single processes: a small or read-only disk, a process namespace."""
 
 import subprocess
 
@@ -13,8 +13,8 @@ _MOUNT = ['unshare', '--map-root-user', '--mount', 'sh', '-c',
 def small_disk(folder) -> list[str]:
     """Return the prefix of a command that runs it with a disk of 64 KiB mounted on a folder.
 
-    The command gets a mount namespace of its own, which needs no privileges; the test is skipped
-    where the system forbids that.
+    The command gets a separate mount namespace, which needs no privileges; the test is skipped if
+    the system forbids that.
     """
     return _tried([*_MOUNT, 'size=64k', str(folder)])
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Poses and odometry with simulated errors, and how far the maps that they make are off."""
+"""Simulated errors of poses and odometry, and errors of the resulting maps."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from cliploc_ros.offline.mapping.options import OdometryErrors, PoseErrors
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 KINDS = ('independent', 'correlated', 'drifting')
-DRIFT_S = 10.0  # a random walk reaches its level after so long
+DRIFT_S = 10.0  # time after which a random walk reaches its level
 _ALIGNING_STEPS, _ALIGNED_SHARE = 10, 0.7
 
 
@@ -66,12 +66,12 @@ def draw_errors(kind: str, stamps_s: NDArray[np.float64], errors: PoseErrors,
 
 
 def offsets_m(found: LandmarkMap, truth: LandmarkMap) -> NDArray[np.float64]:
-    """Return how far each true landmark (L,) is from the nearest found one of its class [m]."""
+    """Return the distance of each true landmark (L,) to the nearest found one of its class [m]."""
     return _nearest(found.centers, found, truth)[0]
 
 
 def aligned_offsets_m(found: LandmarkMap, truth: LandmarkMap) -> NDArray[np.float64]:
-    """Return the same after the rigid motion that lays most landmarks on one another."""
+    """Return these distances after the rigid motion that aligns most landmarks."""
     centers = found.centers
     for _ in range(_ALIGNING_STEPS):
         distances, nearest = _nearest(centers, found, truth)
@@ -90,7 +90,7 @@ def _nearest(centers: NDArray[np.float64], found: LandmarkMap, truth: LandmarkMa
              ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return distance and row of the landmark nearest to each true one, infinite and -1 if none.
 
-    The found landmarks are at centers.
+    ``centers`` are those of the found landmarks.
     """
     same = np.array(truth.class_ids)[:, None] == np.array(found.class_ids)
     distances = np.linalg.norm(truth.centers[:, None] - centers, axis=2)

@@ -11,13 +11,13 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parents[1]
 PAGES = [PROJECT / 'README.md', PROJECT / 'CONTRIBUTING.md', PROJECT / 'SECURITY.md',
          PROJECT / 'studies/README.md', *sorted((PROJECT / 'doc').glob('*.md'))]
-# Programs of others, and words of the shell. A program that is in no list fails the test.
+# Programs of other packages, and keywords of the shell. An unlisted program fails the test.
 FOREIGN = {'bloom-release', 'cd', 'cp', 'dask', 'docker', 'done', 'export', 'git', 'grep', 'pip',
            'rosdep', 'rosdoc2', 'rsync', 'rviz2', 'sleep', 'source', 'sudo', 'touch'}
 _BEGINS_SHELL = re.compile(r'(ros2|script/|python3? -|install/lib/cliploc_ros/|cliploc_\w+ |'
                            r'source |pip |sudo |\w+=\$|until |rviz2 |(evaluate|build_map) -)')
 _FENCE = re.compile(r'^```(\w*)\n(.*?)^```$', re.MULTILINE | re.DOTALL)
-# A block of four spaces, or of eight in a list; the text of a list item itself is no block.
+# A block is indented by four spaces, or by eight in a list; text of a list item is not a block.
 _INDENTED = re.compile(r'(?<=\n\n)(?: {4,}\S.*\n(?:\n(?= {4}))?)+')
 _OPERATORS = {'|', ';', '&&', '&', '||'}
 _WORDS = {'until', 'do', 'then', 'while', 'if'}
@@ -25,18 +25,18 @@ _WORDS = {'until', 'do', 'then', 'while', 'if'}
 
 @dataclass(frozen=True)
 class Command:
-    """A program with its arguments, and the page it stands on."""
+    """A program with its arguments, and the page that contains it."""
 
     page: str
     words: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return it as a line, for the name of a test."""
+        """Return the command as a line, for the name of a test."""
         return f'{self.page}: {shlex.join(self.words)}'
 
 
 def commands() -> list[Command]:
-    """Return every command of every page, each once."""
+    """Return every command of every page, without duplicates."""
     return list(dict.fromkeys(command for page in PAGES for command in commands_of(page)))
 
 
@@ -47,14 +47,14 @@ def commands_of(page: Path) -> list[Command]:
 
 
 def shell_blocks(text: str) -> list[str]:
-    """Return the fenced blocks marked sh, and the indented ones that begin with a command."""
+    """Return the fenced blocks marked sh, and the indented blocks that begin with a command."""
     fenced = [body for language, body in _FENCE.findall(text) if language == 'sh']
     indented = [match.group() for match in _INDENTED.finditer(_FENCE.sub('', text))]
     return fenced + [block for block in indented if _BEGINS_SHELL.match(block.lstrip())]
 
 
 def split(line: str) -> Iterator[tuple[str, ...]]:
-    """Split a line into its commands; what $( ) holds is a command of its own."""
+    """Split a line into its commands; the content of $( ) is a separate command."""
     line = re.sub(r'(?<=\s)\[|\](?=\s|$)', '', line)  # [--option] may be left out
     for inner in re.findall(r'\$\(([^)]*)\)', line):
         yield from split(inner)
@@ -74,7 +74,7 @@ def split(line: str) -> Iterator[tuple[str, ...]]:
 
 
 def inline_commands() -> list[Command]:
-    """Return the commands that stand inside of a sentence, with at least one option."""
+    """Return the commands within sentences that have at least one option."""
     found = []
     for page in PAGES:
         text = _INDENTED.sub('', _FENCE.sub('', page.read_text()))

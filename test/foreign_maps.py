@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write maps as other systems save them."""
+"""Write maps in the formats of other systems."""
 
 import csv
 import io
@@ -94,7 +94,7 @@ def oaslam_files(landmark_map: LandmarkMap) -> tuple[bytes, bytes]:
 
 
 def msgloc_node(number: int, center, semi_axes, quat_xyzw, **labels) -> dict:
-    """Return a node of MSG-Loc: a quaternion w, x, y, z, one radius negative."""
+    """Return a node of MSG-Loc, with a quaternion w, x, y, z and one negative radius."""
     x, y, z, w = map(float, quat_xyzw)
     radii = [float(radius) for radius in semi_axes]
     return {'id': (ord('q') << 56) + number, 'translation': [float(value) for value in center],
@@ -103,7 +103,7 @@ def msgloc_node(number: int, center, semi_axes, quat_xyzw, **labels) -> dict:
 
 
 def msgloc_text(landmark_map: LandmarkMap) -> str:
-    """Return a map of MSG-Loc, whose likeliest class is not the one detected most."""
+    """Return a map of MSG-Loc whose likeliest class is not the one detected most often."""
     nodes = [
         msgloc_node(row, landmark_map.centers[row], landmark_map.semi_axes[row],
                     landmark_map.quats_xyzw[row],
@@ -116,7 +116,7 @@ def msgloc_text(landmark_map: LandmarkMap) -> str:
 
 
 def table_text(landmark_map: LandmarkMap) -> str:
-    """Return a table with every column of an ellipsoid."""
+    """Return a CSV table with every column of an ellipsoid."""
     out = io.StringIO()
     writer = csv.writer(out)
     writer.writerow(HEADER.split(','))

@@ -1,18 +1,20 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the tests notice faults: ``python test/mutants.py --help``.
+"""Measure whether the tests detect faults: ``python test/mutants.py --help``.
 
-Faults are planted in lines drawn at random, one at a time and in memory: a comparison is turned, a
-constant changed, a term dropped, a sign flipped, a condition negated, two arguments exchanged, a
-call left out, or None returned. The tests that run the line have to fail, the quick ones first.
+Faults are planted in random lines, one at a time and in memory: a comparison is reversed, a
+constant changed, a term dropped, a sign flipped, a condition negated, two arguments swapped, a
+call removed, or None returned. At least one test that runs the line has to fail; fast tests run
+first.
 
-``record`` runs tests once and stores the lines that each of them runs, and its time. A line that
-runs at import has the tests of the lines that use its name. Nobody sees the lines of compiled
-kernels. So ``record --plain`` runs tests with kernels that are not compiled, which are slow and
-divide otherwise than compiled ones; it leaves out tests that then fail or take too long. A fault
-in a kernel meets those tests, and as plain Python.
+``record`` runs the tests once, and stores their times and the lines that each test runs. A line
+that runs on import gets the tests of the lines that use its names. The lines of compiled kernels
+cannot be traced. ``record --plain`` therefore runs tests with uncompiled kernels, which are slow
+and divide differently; it excludes tests that then fail or take too long. A fault in a kernel runs
+those tests with the kernel as plain Python.
 
-A fault that a test notices which fails without it, too, does not count: the test is left out.
+If a test that detects a fault also fails without it, the detection does not count and the test is
+excluded.
 """
 
 import argparse
@@ -56,18 +58,18 @@ _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.And: ast.Or,
     ast.Or: ast.And, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd}
 _QUIET = ('-q', '-x', '-p', 'no:cacheprovider', '-p', 'no:rerunfailures', '-p', 'no:xdist')
-# Calls whose arguments may be exchanged, or whose exchange no type checker lets pass.
+# Calls whose arguments may be swapped, or for which a type checker would reject the swap.
 _ALIKE = re.compile(r'(^|\.)(max|min|maximum|minimum|hypot|logaddexp|isinstance|cast)$')
 _FORK = multiprocessing.get_context('fork')
 _LOGS = re.compile(r'(self\._?)?([\w.]+\.get_)?log(ger)?(\(\))?\.(debug|info|warning|error)\(')
-# A test with a fault may take so much longer [s], and a fault may cost this time in all.
+# Additional time of a test with a fault, and time of all tests of a fault [s].
 _PATIENCE_S, _MOST_S = 60.0, 20.0
 
 
 class Record(NamedTuple):
-    """What a test ran."""
+    """The processor time of a test, and the lines that it ran."""
 
-    seconds: float  #: Of processor time, of this process
+    seconds: float  #: Processor time of this process [s]
     lines: frozenset[tuple[str, int]]  #: File, relative to the project, and line
 
 
@@ -76,20 +78,20 @@ class Mutant(NamedTuple):
 
     file: str
     line: int
-    number: int  #: Of the faults of this file
+    number: int  #: Number of the fault in its file
     what: str
-    lines: tuple[int, ...]  #: Those of its statement; a test that runs one of them runs it
-    names: tuple[str, ...]  #: Where it runs at import: names that it defines
+    lines: tuple[int, ...]  #: Lines of its statement; a test that runs one of them runs it
+    names: tuple[str, ...]  #: Names that the statement defines, if it runs on import
     function: tuple[str, int] | None  #: Name and first line of the outermost function around it
     is_compiled: bool  #: Whether numba compiles it
 
 
 class Outcome(NamedTuple):
-    """What the tests made of a fault."""
+    """The result of the tests for a fault."""
 
     mutant: Mutant
-    tests: int  #: How many tests could notice it
-    killer: str = ''  #: The test that noticed it, or 'time' where they did not end
+    tests: int  #: Number of tests that could detect it
+    killer: str = ''  #: The test that detected it, or 'time' if a test did not end
 
 
 # ---- faults -------------------------------------------------------------------------------------
@@ -110,7 +112,7 @@ def planted(mutant: Mutant) -> tuple[CodeType, str]:
 
 
 class _Site(NamedTuple):
-    """A place of a tree, and what a fault puts there."""
+    """A node of a syntax tree, and its replacement by a fault."""
 
     parent: ast.AST
     field: str
@@ -131,7 +133,7 @@ class _Site(NamedTuple):
 
     def as_mutant(self, file: str, number: int) -> Mutant:
         one = self.statement
-        body = getattr(one, 'body', None)  # of a compound statement the head alone counts
+        body = getattr(one, 'body', None)  # for a compound statement only the head counts
         last = body[0].lineno - 1 if body else one.end_lineno or one.lineno
         names: tuple[str, ...] = ()
         if self.function is None:
@@ -153,7 +155,7 @@ def _sites(tree: ast.Module) -> list[_Site]:
 
 def _walk(parent: ast.AST, statement: ast.stmt | None, function: ast.FunctionDef | None
           ) -> Iterator[_Site]:
-    """Yield the sites below a node. Annotations, messages, logs and documents have none."""
+    """Yield the sites below a node. Annotations, messages, logs and docstrings have none."""
     for field, value in ast.iter_fields(parent):
         if field in ('annotation', 'returns', 'decorator_list', 'type_params', 'type_comment'):
             continue
@@ -176,7 +178,7 @@ def _walk(parent: ast.AST, statement: ast.stmt | None, function: ast.FunctionDef
 
 
 def _changes(node: ast.AST, parent: ast.AST, field: str) -> Iterator[tuple[str, ast.AST]]:
-    """Yield what a fault makes of a node."""
+    """Yield the faulty replacements of a node."""
     if field == 'test' and isinstance(parent, (ast.If, ast.While, ast.IfExp)):
         yield 'condition negated', ast.UnaryOp(ast.Not(), copy.deepcopy(node))  # type: ignore
     yield from _changes_of_statement(node)
@@ -228,7 +230,7 @@ def _with(node: ast.AST, **fields: Any) -> ast.AST:
 
 
 def draw(folders: Sequence[str], count: int, seed: int) -> list[Mutant]:
-    """Return faults in lines of some folders of the package, drawn at random: one a line."""
+    """Draw faults in lines of some folders of the package at random, one per line."""
     by_line = defaultdict(list)
     for folder in folders:
         for path in sorted((PROJECT / PACKAGE / folder).rglob('*.py')):
@@ -242,9 +244,9 @@ def draw(folders: Sequence[str], count: int, seed: int) -> list[Mutant]:
 # ---- the lines of tests -------------------------------------------------------------------------
 
 class Recorder:
-    """A plugin of pytest that notes which lines of the package each test runs.
+    """A pytest plugin that records the lines of the package that each test runs.
 
-    The lines of a fixture that several tests share count for each of them.
+    Lines of a fixture that several tests share count for each of them.
     """
 
     def __init__(self, most_s: float) -> None:
@@ -265,7 +267,7 @@ class Recorder:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
-        """Note the lines of a shared fixture."""
+        """Record the lines of a shared fixture."""
         if fixturedef.scope == 'function':
             return (yield)
         before, self._lines = self._lines, set()
@@ -279,7 +281,7 @@ class Recorder:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: Any) -> Iterator[None]:
-        """Note the lines of a test that passes."""
+        """Record the lines of a test that passes."""
         self._lines, self._failed, start = set(), False, time.process_time()
         sys.monitoring.restart_events()
         if self._most_s:
@@ -307,14 +309,14 @@ def _end_test(*_: object) -> None:
 
 
 def _plain_kernels() -> None:
-    """Leave kernels as they are written, before anything imports them."""
+    """Disable the compilation of kernels, before they are imported."""
     from cliploc_ros.core.kernels import compiled
 
     compiled.compiled = lambda function: function  # type: ignore[assignment]
 
 
 def record(arguments: argparse.Namespace) -> int:
-    """Run tests, and add what they ran to the records."""
+    """Run tests, and add their lines to the records."""
     if arguments.plain:
         _plain_kernels()
     recorder = Recorder(arguments.plain)
@@ -348,9 +350,9 @@ class Tests:
                 self._of_line[line].add(name)
 
     def of(self, mutant: Mutant) -> list[str]:
-        """Return the tests that can notice a fault, as time allows.
+        """Return the tests that can detect a fault, within the time limit.
 
-        The files whose tests run the fewest lines come first: they say most about each.
+        Files whose tests run the fewest lines come first, since they are the most specific.
         """
         lines = [(mutant.file, line) for line in mutant.lines]
         if mutant.names:
@@ -372,7 +374,7 @@ class Tests:
         return chosen
 
     def seconds(self, name: str) -> float:
-        """Return how long a test takes."""
+        """Return the time of a test."""
         return self.records[name].seconds
 
 
@@ -385,8 +387,8 @@ def _sources() -> list[tuple[str, list[tuple[int, str]]]]:
 class Judge:
     """Tries faults, each in a child of this process.
 
-    Faults in functions meet tests that are collected already: as a plugin of pytest, this takes
-    the place of the loop over the tests. A fault in a line that runs at import meets a new pytest.
+    Faults in functions are tried with tests that are already collected: as a pytest plugin, this
+    replaces the loop over the tests. A fault in a line that runs on import needs a new pytest.
     """
 
     def __init__(self, mutants: Sequence[Mutant], tests: Tests, workers: int) -> None:
@@ -404,15 +406,15 @@ class Judge:
             if isinstance(one, FunctionType):
                 code = one.__code__
                 self._functions[code.co_filename, code.co_name, code.co_firstlineno].append(one)
-        gc.freeze()  # children share what they do not change
+        gc.freeze()  # child processes share unmodified memory
         self.run()
         return True
 
     def run(self) -> None:
-        """Try all faults; each worker tries a part of them."""
+        """Try all faults, distributed over the workers."""
         started = [_start(partial(self._outcomes, part)) for part in self._parts]
-        for one in started:
-            self.outcomes += _finish(*one)
+        for process in started:
+            self.outcomes += _finish(*process)
 
     def _outcomes(self, mutants: Sequence[Mutant]) -> list[Outcome]:
         return [self._outcome(mutant) for mutant in mutants]
@@ -437,7 +439,7 @@ class Judge:
                 lambda: self._try(mutant, names, Path(folder) / 'tmp')), allowed))
 
     def _try(self, mutant: Mutant | None, names: list[str], folder: Path) -> str:
-        """Run tests in this process, a child; return the first that fails."""
+        """Run tests in this child process; return the first that fails."""
         for stream in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
         if not self._items:
@@ -457,16 +459,16 @@ class Judge:
         return ''
 
     def _plant(self, mutant: Mutant) -> None:
-        """Give a function the code with a fault."""
+        """Replace the code of a function by the code with a fault."""
         assert mutant.function is not None
-        faulty = next(one for one in _codes_of(planted(mutant)[0])
-                      if (one.co_name, one.co_firstlineno) == mutant.function)
+        faulty = next(code for code in _codes_of(planted(mutant)[0])
+                      if (code.co_name, code.co_firstlineno) == mutant.function)
         for function in self._functions[str(PROJECT / mutant.file), *mutant.function]:
             function.__code__ = faulty
 
 
 def _start(work: Callable[[], object]) -> tuple[Any, Any]:
-    """Start work in a child, a process group of its own; return it and what has its result."""
+    """Start work in a child with its process group; return it and the pipe of its result."""
     here, there = _FORK.Pipe(duplex=False)
 
     def run() -> None:
@@ -480,7 +482,7 @@ def _start(work: Callable[[], object]) -> tuple[Any, Any]:
 
 
 def _finish(child: Any, here: Any, limit_s: float | None = None) -> Any:
-    """Return the result of a child, 'time' or an exit code; end what it started."""
+    """Return the result of a child, 'time' or an exit code; end its processes."""
     try:
         result = here.recv() if here.poll(limit_s) else 'time'
     except EOFError:
@@ -493,7 +495,7 @@ def _finish(child: Any, here: Any, limit_s: float | None = None) -> Any:
 
 
 class _Failures:
-    """A plugin of pytest that keeps the first test that fails."""
+    """A pytest plugin that stores the first test that fails."""
 
     first = ''
 
@@ -504,7 +506,7 @@ class _Failures:
 
 
 def _plant_at_import(mutant: Mutant) -> None:
-    """Give a module that is not imported yet the code with a fault."""
+    """Load a module that is not imported yet with a fault."""
     code, name = planted(mutant)[0], mutant.file.removesuffix('.py').removesuffix('/__init__')
     get_code = SourceFileLoader.get_code
 
@@ -521,7 +523,7 @@ def _codes_of(code: CodeType) -> Iterator[CodeType]:
 
 
 def judge(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
-    """Return the outcome of each fault. Kernels are judged in a process of their own."""
+    """Return the outcome of each fault. Kernels are judged in a separate process."""
     kernels = [mutant for mutant in mutants if mutant.is_compiled]
     outcomes = list(_finish(*_start(lambda: _judge_kernels(kernels, workers))))
     import hypothesis, numba, scipy.optimize, scipy.spatial, scipy.stats, yaml  # noqa: E401,F401,I001
@@ -549,13 +551,14 @@ def _judge_functions(mutants: Sequence[Mutant], tests: Tests, workers: int) -> l
 # ---- the report ---------------------------------------------------------------------------------
 
 def report(outcomes: Sequence[Outcome]) -> str:
-    """Return a table by folder, and the faults that no test noticed."""
+    """Return a table by folder, and the faults that no test detected."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
-    for one in outcomes:
-        folder = str(Path(one.mutant.file).parent.relative_to(PACKAGE))
+    for outcome in outcomes:
+        folder = str(Path(outcome.mutant.file).parent.relative_to(PACKAGE))
         for row in {folder, f'{folder.split("/")[0]}, all', 'all',
-                    'kernels' if one.mutant.is_compiled else 'Python'}:
-            counts[row]['killed' if one.killer else 'survived' if one.tests else 'not run'] += 1
+                    'kernels' if outcome.mutant.is_compiled else 'Python'}:
+            counts[row]['killed' if outcome.killer else
+                        'survived' if outcome.tests else 'not run'] += 1
     text = f'{"folder":28}{"killed":>8}{"survived":>10}{"not run":>9}{"share":>7}\n'
     for row, its in sorted(counts.items()):
         text += (f'{row:28}{its["killed"]:8}{its["survived"]:10}{its["not run"]:9}'
@@ -566,7 +569,7 @@ def report(outcomes: Sequence[Outcome]) -> str:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plant faults; print the table."""
+    """Plant faults, and print the table."""
     mutants = draw(arguments.folders, arguments.count, arguments.seed)
     if arguments.only:
         mutants = [one for one in mutants if arguments.only in f'{one.file}:{one.line}']
@@ -584,18 +587,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog='python test/mutants.py', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = parser.add_subparsers(required=True)
-    part = parts.add_parser('record', help='note which lines tests run')
+    part = parts.add_parser('record', help='record the lines that tests run')
     part.add_argument('tests', nargs=argparse.REMAINDER,
                       help='arguments of pytest, such as test/core')
     part.add_argument('--plain', type=float, default=0.0, metavar='S',
                       help='kernels are not compiled; tests that take longer are left out')
     part.set_defaults(run=record)
     part = parts.add_parser('run', help='plant faults')
-    part.add_argument('folders', nargs='+', help='of the package, such as core ros/inputs')
+    part.add_argument('folders', nargs='+', help='folders of the package, such as core ros/inputs')
     part.add_argument('--seed', type=int, default=0)
     part.add_argument('--count', type=int, default=300)
     part.add_argument('--workers', type=int, default=2)
-    part.add_argument('--only', default='', help='faults in FILE or FILE:LINE alone')
+    part.add_argument('--only', default='', help='only faults in FILE or FILE:LINE')
     part.set_defaults(run=run)
     arguments = parser.parse_args()
     warnings.filterwarnings('ignore', '.*use of fork', DeprecationWarning)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""YOLO-World and YOLOE as ultralytics builds them, with random weights, and a small text tower."""
+"""YOLO-World and YOLOE from ultralytics with random weights, and a small text tower."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ def write_open_yolo(file: Path, config: str, task: str = 'detect') -> Path:
     kind = tasks.WorldModel if 'world' in config else {
         'detect': tasks.YOLOEModel, 'segment': tasks.YOLOESegModel}[task]
     model = kind(config, verbose=False)
-    for module in model.modules():  # else all boxes have nearly the same score
+    for module in model.modules():  # otherwise all boxes have nearly the same score
         if isinstance(module, torch.nn.BatchNorm2d):
             module.running_var.uniform_(0.1, 0.3)
             module.running_mean.normal_(0.0, 0.1)
@@ -29,7 +29,7 @@ def write_open_yolo(file: Path, config: str, task: str = 'detect') -> Path:
 
 
 class TextTower(torch.nn.Module):
-    """From CLIP's tokens (n, 77) to embeddings (n, d)."""
+    """Maps CLIP's tokens (n, 77) to embeddings (n, d)."""
 
     def __init__(self, embed_dim: int) -> None:
         super().__init__()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A small world for evaluations: the simulated room, and queries seen in it."""
+"""A small world for evaluations: the simulated room, with queries."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ QUERIES = 12
 
 
 def make_recording(room):
-    """Views of two to twelve objects; boxes are shaken a little, labels are half sure."""
+    """Return views of two to twelve objects, with slightly noisy boxes and ambiguous labels."""
     rng = np.random.default_rng(3)
     seen = see_room(room)
     frames = []

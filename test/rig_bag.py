@@ -16,7 +16,7 @@ from cliploc_ros.offline.datasets.poses import mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum
 
 RIG = Path(__file__).resolve().parents[1] / 'demo/assets/rig'
-#: By camera: x y z qx qy qz qw on the robot, which is where the front camera is.
+#: By camera: x y z qx qy qz qw on the robot, whose origin is the front camera.
 MOUNTS = json.loads((RIG / 'mounts.json').read_text())
 TF = 'tf2_msgs/msg/TFMessage'
 
@@ -68,7 +68,7 @@ def write_rig_bag(path, cameras=tuple(MOUNTS), halved=(), in_tf=tuple(MOUNTS)):
 
 
 def transform(stamp, parent, child, pose):
-    """Make a message of tf with the pose of a coordinate frame in another one."""
+    """Make a tf message with the pose of one coordinate frame in another."""
     types, header = typestore().types, bag_messages.pose_message(stamp, parent, pose).header
     numbers = [pose[:3, 3], quaternion_from_transform(pose)]
     translation, rotation = (

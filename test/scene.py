@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A room of twelve objects and a perfect view of it: simulated, for tests without recordings."""
+"""A simulated room of twelve objects with a perfect view, for tests without recordings."""
 
 from dataclasses import replace
 
@@ -27,13 +27,13 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.recording.keyframe_layer import learn_words
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
-#: Looks along the map's z axis, not level: turn room and pose first where a vertical matters.
+#: Looks along the map's z axis, not level: rotate room and pose first if a vertical matters.
 MAP_FROM_CAMERA = transform_from_pose(np.array([0.3, -0.2, -0.5]),
                                       np.array([0.02, -0.05, 0.03, 0.99794]))
 
 
 def make_room() -> LandmarkMap:
-    """Twelve objects of three classes, scattered before the camera."""
+    """Return twelve objects of three classes, scattered in front of the camera."""
     rng, count = np.random.default_rng(7), 12
     quats = rng.normal(size=(count, 4))
     return LandmarkMap(
@@ -45,7 +45,7 @@ def make_room() -> LandmarkMap:
 
 
 def doubled_room(offset) -> LandmarkMap:
-    """The room twice; the second one is an offset (3,) away [m]."""
+    """Return the room and a copy of it at an offset (3,) [m]."""
     room = make_room()
     return replace(room, landmark_ids=(*room.landmark_ids, *(f'{landmark_id}_2' for landmark_id in
                                                             room.landmark_ids)),
@@ -56,19 +56,19 @@ def doubled_room(offset) -> LandmarkMap:
 
 
 def boxes_of(landmarks: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, camera=CAMERA):
-    """Boxes (n, 4) of landmarks for a perfect detector; NaN of those behind the camera."""
+    """Return the boxes (n, 4) of landmarks from a perfect detector; NaN behind the camera."""
     outlines = project_ellipsoids(invert_transform(map_from_camera), landmarks.centers,
                                   landmarks.shapes)
     return ellipse_bboxes(ellipses_in_pixels(outlines, camera))
 
 
 def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:
-    """What a perfect detector sees of the room, one box for each landmark in its order."""
+    """Return a perfect observation of the room, one box for each landmark in order."""
     return Detections(boxes_of(room, map_from_camera), room.class_ids, np.full(len(room), 0.9))
 
 
 def depth_image(room: LandmarkMap, map_from_camera, bboxes_xyxy):
-    """Depth (h, w) [m]: boxes (n, 4) at the near side of their objects, before a wall at 8 m."""
+    """Return depth (h, w) [m]: boxes (n, 4) at the near side of objects, and a wall at 8 m."""
     camera_from_map = invert_transform(map_from_camera)
     centers = room.centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
     with np.errstate(invalid='ignore', divide='ignore'):
@@ -84,7 +84,7 @@ def depth_image(room: LandmarkMap, map_from_camera, bboxes_xyxy):
 
 
 def make_layer(room: LandmarkMap, keyframes=6, points=40) -> KeyframeLayer:
-    """Keyframes with random points: no image shows them."""
+    """Return keyframes with random points that no image shows."""
     rng, total = np.random.default_rng(0), keyframes * points
     descriptors = rng.integers(0, 120, (total, DIMENSIONS)).astype(np.uint8)
     vocabulary = learn_words(descriptors)
@@ -109,7 +109,7 @@ def write_map(room: LandmarkMap, path) -> None:
 
 
 def write_bare_map(path, layer) -> None:
-    """Write a map of keyframes alone, and its layer, as build_map does."""
+    """Write a map with keyframes only, and its layer, as build_map does."""
     map_file.write_map(path, LandmarkMap.empty(layer.frame_id), besides={
         layer_path(path): lambda place, digest: save_layer(place, replace(layer,
                                                                           set_digest=digest))})

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tasks on a real Dask cluster, whose workers die, are missing, or are of another version."""
+"""Tasks on a real Dask cluster with workers that die, are missing, or have another version."""
 
 from dataclasses import dataclass
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every command in the documents is one that the programs accept; the cheap ones run."""
+"""The programs accept every command in the documents; the cheap ones are run."""
 
 import argparse
 import importlib
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.full
 NODES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
 EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
                if 'def make_parser' in path.read_text()}
-# Needs a robot, a person, or a sourced ROS: here only the arguments are checked.
+# These need a robot, a person, or a sourced ROS; only their arguments are checked.
 OF_ROS = {'bag', 'pkg', 'security', 'topic'}
 OTHER_PACKAGES = {'robot_localization', 'tf2_ros'}
 OF_STUDIES = ('studies.speed.',)
@@ -32,7 +32,7 @@ MODULES = re.compile(r'(cliploc_ros|demo|studies)\.')
 
 
 class _CaughtError(Exception):
-    """The parser that a program asks to parse its command line."""
+    """Raised with the parser that a program uses for its command line."""
 
     def __init__(self, parser):
         super().__init__()
@@ -41,7 +41,7 @@ class _CaughtError(Exception):
 
 @cache
 def parser_of(module: str) -> argparse.ArgumentParser:
-    """Return the parser that a program makes for itself, by its module."""
+    """Return the parser of a program, by its module."""
     if module.startswith(('cliploc_ros.cli.', 'demo.__', 'studies.reproduce')):
         return importlib.import_module(module).make_parser()
 
@@ -60,7 +60,7 @@ def parser_of(module: str) -> argparse.ArgumentParser:
 
 
 def program_of(command: Command) -> tuple[str, list[str]]:
-    """Return the module that runs a command of this package, '' for another's, and arguments."""
+    """Return the module that runs a command of this package ('' for others), and the arguments."""
     first, *rest = command.words
     if first == 'ros2' and rest[:2] == ['run', 'cliploc_ros']:
         first, *rest = rest[1:]
@@ -79,7 +79,7 @@ def program_of(command: Command) -> tuple[str, list[str]]:
     return (f'cliploc_ros.nodes.{name}', rest) if name in NODES else ('', [])
 
 
-# runpy warns of a module that it runs and that another test has imported.
+# runpy warns if another test has imported the module that it runs.
 AS_MAIN = pytest.mark.filterwarnings('ignore:.* found in sys.modules:RuntimeWarning')
 
 
@@ -122,14 +122,14 @@ def check_node(node: str, ros_args: list[str]) -> None:
 
 @cache
 def names_of_interface() -> set[str]:
-    """Return topics and services, absolute and relative; a test holds them equal to the graph."""
+    """Return topics and services, absolute and relative; a test compares them with the graph."""
     policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
     names = {entry.text for entry in policy.iter() if entry.tag in ('topic', 'service')}
     return names | {name.removeprefix('/') for name in names} | {'image/compressed'}
 
 
 def check_ros2(words: tuple[str, ...]) -> None:
-    """Check what a command of ros2 says about this package."""
+    """Check the parts of a ros2 command that refer to this package."""
     verb, *rest = words
     if verb == 'launch':
         package, file, *_ = rest
@@ -148,7 +148,7 @@ def check_ros2(words: tuple[str, ...]) -> None:
 
 
 def check_script(script: str, *arguments: str) -> None:
-    """Check a script, and the tests that script/test is to run."""
+    """Check a script, and the tests that script/test would run."""
     assert (PROJECT / script).is_file()
     for word in arguments:
         assert not word.startswith('test/') or (PROJECT / word).exists(), word
@@ -158,7 +158,7 @@ def check_script(script: str, *arguments: str) -> None:
 @pytest.mark.parametrize('command', [one for one in inline_commands() if program_of(one)[0]],
                          ids=str)
 def test_an_option_in_a_sentence_exists(command):
-    """A sentence may leave out what is required, so only the options are looked up."""
+    """A sentence may omit required arguments, so only the options are checked."""
     module, arguments = program_of(command)
     parser = parser_of(module)
     if parser._subparsers is not None:
@@ -178,6 +178,6 @@ def test_the_example_of_the_library_runs():
 
 
 def test_pages_have_commands():
-    """Else a change of the layout of the pages would hide all of them from these tests."""
+    """Otherwise a change of the pages' layout could hide all of them from these tests."""
     pages = {command.page for command in commands()}
     assert {'README.md', 'install.md', 'nav2.md', 'your_robot.md', 'SECURITY.md'} <= pages

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""README, doc/ and config/ say what the code declares."""
+"""README, doc/ and config/ agree with the declarations in the code."""
 
 import ast
 import importlib.machinery
@@ -28,7 +28,7 @@ PROJECT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [PROJECT / 'README.md', *sorted((PROJECT / 'doc').glob('*.md'))]
 LINKING = [*DOCUMENTS, *(PROJECT / name for name in (
     'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md', 'studies/README.md'))]
-# what every node has
+# parameters of every node
 OF_ROS = re.compile('/(clock|rosout|parameter_events|transition_event|get_type_description|'
                     'change_state|get_state|get_available_.*|get_transition_graph|'
                     '.*_parameters(_atomically)?|get_parameter_types)$')
@@ -36,7 +36,7 @@ OF_ROS = re.compile('/(clock|rosout|parameter_events|transition_event|get_type_d
 
 @pytest.fixture(scope='module')
 def document():
-    """The script that writes the documents, as a module."""
+    """Return the script that writes the documents, as a module."""
     loader = importlib.machinery.SourceFileLoader('document', str(PROJECT / 'script/document'))
     module = importlib.util.module_from_spec(
         importlib.util.spec_from_loader('document', loader))
@@ -55,7 +55,7 @@ def test_the_readme_leads_to_every_page():
 
 
 def anchors(path):
-    """Return what can follow a # in a link to a page: its headings, as GitHub writes them."""
+    """Return the valid anchors of a page: its headings, as GitHub writes them."""
     headings = re.findall('^#+ (.+)$', path.read_text(), re.MULTILINE)
     return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
 
@@ -71,7 +71,7 @@ def test_links_lead_somewhere(path):
 
 @pytest.mark.parametrize('path', LINKING, ids=lambda path: str(path.relative_to(PROJECT)))
 def test_commands_run_what_there_is(path):
-    """Programs of this package, and the tests that a figure comes from."""
+    """Programs of this package, and the tests that a number comes from."""
     text = path.read_text()
     for module in re.findall(r'python -m ((?:cliploc_ros|demo|studies)[\w.]*)', text):
         path = PROJECT / module.replace('.', '/')
@@ -83,7 +83,7 @@ def test_commands_run_what_there_is(path):
 
 
 def test_what_draws_the_figures_starts():
-    """No other test imports it, so a name that moves would break it unseen."""
+    """No other test imports it, so a renamed function would break it unnoticed."""
     done = subprocess.run([sys.executable, PROJECT / 'script/draw_figures', '--help'],
                           capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stderr
@@ -97,7 +97,7 @@ def test_the_tests_of_the_capabilities_exist():
 
 
 def texts(node):
-    """Return the strings of a syntax tree; what they insert is an ellipsis."""
+    """Yield the strings of a syntax tree, with an ellipsis for inserted values."""
     if isinstance(node, ast.JoinedStr):
         yield ''.join(value.value if isinstance(value, ast.Constant) else '...'
                       for value in node.values)
@@ -122,7 +122,7 @@ def test_the_messages_that_are_looked_up_exist():
 
 @pytest.mark.parametrize('node', ['detector', 'relocalizer'])
 def test_the_interface_has_every_topic_and_service_and_no_other(node):
-    """The policy has them all; a test holds that equal to the graph."""
+    """The policy has them all; a test compares it with the graph."""
     policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
     profile = policy.find(f'.//profile[@node="{node}"]')
     used = {entry.text for group in profile for entry in group if not OF_ROS.search(entry.text)}

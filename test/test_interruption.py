@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A flag that signals set, at any moment."""
+"""A flag that signals can set at any time."""
 
 import os
 import resource
@@ -18,7 +18,7 @@ OPEN = Path('/proc/self/fd')
 
 @pytest.fixture
 def alarm():
-    """The process's timer, and its handler as it was."""
+    """Restore the process's timer and its signal handler."""
     handler = signal.getsignal(signal.SIGALRM)
     yield lambda after_s: signal.setitimer(signal.ITIMER_REAL, after_s)
     signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -26,7 +26,7 @@ def alarm():
 
 
 def test_a_signal_may_come_at_any_moment_of_a_wait(alarm):
-    """With threading.Event one of these signals comes while the event's lock is held."""
+    """With threading.Event, one of these signals arrives while the event's lock is held."""
     for number in range(ALARMS):
         interruption = Interruption()
         interruption.catch(signal.SIGALRM)

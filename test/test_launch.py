@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Launch files pass on only what exists, and make their descriptions."""
+"""Launch files pass on only existing arguments, and produce their descriptions."""
 
 import ast
 import re
@@ -19,7 +19,7 @@ LAUNCH = Path(__file__).resolve().parents[1] / 'launch'
 POLICY = LAUNCH.parent / 'config/security_policy.xml'
 DOCUMENTS = [LAUNCH.parent / 'README.md', *sorted((LAUNCH.parent / 'doc').glob('*.md'))]
 TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
-# what both nodes have in their own names' namespaces, and what ROS has at its root
+# names in the private namespaces of both nodes, and ROS's names at the root
 OWN = re.compile('/(detector|relocalizer|wake_up|diagnostics|clock|parameter_events|rosout|'
                  'tf(_static)?)(/.*)?$')
 
@@ -30,7 +30,7 @@ def relocalization_launch() -> list[ast.stmt]:
 
 
 def literals(statements: list[ast.stmt]) -> dict:
-    """Return the values that are assigned to names, where these are literals."""
+    """Return the literal values that are assigned to names."""
     return {statement.targets[0].id: ast.literal_eval(statement.value)
             for statement in statements if isinstance(statement, ast.Assign)}
 
@@ -42,13 +42,13 @@ def constants():
 
 @pytest.fixture
 def of_wake_up():
-    """The arguments of the launch file that wakes up: their defaults and descriptions."""
+    """Return the arguments of wake_up.launch.py: defaults and descriptions."""
     return literals(ast.parse((LAUNCH / 'wake_up.launch.py').read_text()).body)['ARGUMENTS']
 
 
 @pytest.fixture
 def arguments(constants):
-    """The names of all launch arguments."""
+    """Return the names of all launch arguments."""
     return set().union(*(constants[group] for group in (
         'NAMES', 'OTHERS', 'DETECTOR_PARAMETERS', 'RELOCALIZER_PARAMETERS')))
 
@@ -62,7 +62,7 @@ def test_arguments_are_parameters(constants, node):
 
 
 def test_every_topic_and_service_can_be_remapped(constants):
-    """The policy names them all; a test holds it equal to the graph."""
+    """The policy names them all; a test compares it with the graph."""
     names = {entry.text for entry in ElementTree.parse(POLICY).iter()
              if entry.tag in ('topic', 'service')}
     relative = {name[1:] for name in names if not OWN.match(name)}

@@ -90,13 +90,14 @@ def test_imports_point_downwards():
 
 
 def test_each_folder_stands_in_one_layer():
-    """Only core, ros and offline have layers of their own."""
+    """Only core, ros and offline have separate layers."""
     folders = [prefix.partition('.')[0] for prefixes in LAYERS for prefix in prefixes]
     twice = {name for name in folders if folders.count(name) > 1}
     assert twice == {'core', 'ros', 'offline'}
 
 
-#: Modules of the package that the import of a node loads, at most: a reader meets no others.
+#: Greatest number of the package's modules that the import of a node loads, which limits what a
+#: reader needs.
 MOST_LOADED = 99
 
 
@@ -109,7 +110,7 @@ def test_a_node_loads_few_modules(node):
     assert int(loaded) <= MOST_LOADED
 
 
-#: Names of several classes that are still to be told apart.
+#: Names that several classes still share.
 SHARED_NAMES = {
     'Camera', 'Evidence', 'Fit', 'Groups', 'Keyframes', 'Known', 'Look', 'Overlaps', 'Place',
     'Poses', 'Record', 'Sample', 'State', 'Turn', 'Views'}

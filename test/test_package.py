@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The package as a whole: versions, imports, licence lines, executables and interfaces."""
+"""The package: versions, imports, licence lines, executables and interfaces."""
 
 import ast
 import importlib
@@ -24,7 +24,7 @@ SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_fi
 INTERFACES = sorted((PROJECT / 'cliploc_ros/offline/datasets/vision_msgs/msg').glob('*.msg'))
 EXECUTABLES = ['build_map', 'check_map', 'detector', 'import_map', 'prepare',
                'relocalizer', 'replay', 'studio', 'tum_to_bag', 'wake_up']
-# As vision_msgs 4.1.1 of Jazzy has it. The hash covers the other six messages as well.
+# As in vision_msgs 4.1.1 of Jazzy. The hash covers the other six messages as well.
 DETECTIONS_TYPE_HASH = 'RIHS01_214274120007f4a683866481336b70310268cfa107aebe9d594a6acf75bda968'
 
 
@@ -64,7 +64,7 @@ def test_every_ros_package_that_is_imported_is_declared():
             if re.search('^(launch|rclpy|tf2)|_(msgs|srvs|interfaces)$', name)}
     manifest = ElementTree.parse(PROJECT / 'package.xml')
     declared = {entry.text for entry in manifest.findall('exec_depend')}
-    # on Jazzy the Python half of tf2_ros is a package of its own
+    # on Jazzy the Python part of tf2_ros is a separate package
     assert {{'tf2_ros': 'tf2_ros_py'}.get(name, name) for name in used} <= declared
 
 
@@ -83,8 +83,8 @@ def test_executable_is_installed(name, executables):
 
 
 def test_installed_package_is_complete(tmp_path):
-    """Every module and interface definition of the source lies in the installed copy."""
-    # Outside of the source tree, whose modules would come first.
+    """Every module and interface definition of the source is in the installed copy."""
+    # Run outside the source tree, whose modules would come first.
     code = 'import cliploc_ros; print(cliploc_ros.__path__[0])'
     installed = Path(run_python(code, cwd=tmp_path).strip())
     for path in [*MODULES, *INTERFACES]:

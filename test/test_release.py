@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a release consists of agrees: versions, dates, dependencies, container and workflows."""
+"""The parts of a release agree: versions, dates, dependencies, container and workflows."""
 
 import re
 import runpy
@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 PROJECT = Path(__file__).resolve().parents[1]
-# Keys of rosdep that name a package of apt on Ubuntu 24.04. The build farm takes no others.
+# Rosdep keys that name an apt package on Ubuntu 24.04. The build farm accepts no others.
 OF_UBUNTU = {'python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-opencv',
              'python3-pytest', 'python3-scipy', 'python3-tqdm', 'python3-yaml'}
 
@@ -39,7 +39,7 @@ def test_rosdep_can_resolve_every_key():
 
 @pytest.fixture(scope='module')
 def extras() -> dict[str, list[str]]:
-    """The extras that setup.py declares."""
+    """Return the extras that setup.py declares."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr('setuptools.setup', lambda **options: None)
         patch.chdir(PROJECT)
@@ -47,11 +47,11 @@ def extras() -> dict[str, list[str]]:
 
 
 def test_extras_are_what_the_tests_run_with(extras):
-    """Each has the versions of script/requirements*.txt, with an upper bound."""
+    """Each extra has the versions of script/requirements*.txt, with an upper bound."""
     required = ''.join(read(f'script/requirements{part}.txt')
                        for part in ('', '-models', '-test', '-all'))
-    assert {one for extra in extras.values() for one in extra} <= set(required.splitlines())
-    assert all('<' in one or '==' in one for one in extras['all'])
+    assert {name for extra in extras.values() for name in extra} <= set(required.splitlines())
+    assert all('<' in pin or '==' in pin for pin in extras['all'])
 
 
 @pytest.mark.parametrize(('lock', 'files'), [
@@ -78,5 +78,6 @@ def test_container_and_setup_install_the_locks():
     assert 'pip install --no-cache-dir --require-hashes' in read('docker/Dockerfile')
     assert '"$root/script/lock/$kind.txt" --require-hashes' in read('script/common.bash')
     workflow = yaml.safe_load(read('.github/workflows/release.yml'))
-    steps = ' '.join(one.get('run', '') for one in workflow['jobs']['bill-of-materials']['steps'])
+    steps = ' '.join(step.get('run', '')
+                     for step in workflow['jobs']['bill-of-materials']['steps'])
     assert 'cyclonedx-py" requirements' in steps and 'script/lock' in steps

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The documentation site is built without a warning, and can be read in a browser."""
+"""The documentation site is built without warnings, and is readable in a browser."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ from browser import running_chromium
 
 PROJECT = Path(__file__).resolve().parents[1]
 PAGES = ['library', *sorted(path.stem for path in (PROJECT / 'doc').glob('*.md'))]
-# Of the window [px]: a laptop, a phone.
+# Sizes of the window [px]: a laptop, a phone.
 WIDTHS = (1280, 400)
 
 pytestmark = [pytest.mark.full, pytest.mark.needs('sphinx')]
@@ -19,7 +19,7 @@ pytestmark = [pytest.mark.full, pytest.mark.needs('sphinx')]
 
 @pytest.fixture(scope='module')
 def site(tmp_path_factory):
-    """Build it as script/site does, where warnings are errors."""
+    """Build the site as script/site does, with warnings as errors."""
     folder = tmp_path_factory.mktemp('site')
     done = subprocess.run([PROJECT / 'script/site', folder], text=True, capture_output=True,
                           timeout=300, env={'PATH': '/usr/bin:/bin', 'PYTHON': sys.executable})

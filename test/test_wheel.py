@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``pip install .`` without ROS: what the wheel holds, and that its commands run."""
+"""``pip install .`` without ROS: the content of the wheel, and its commands."""
 
 import os
 import re
@@ -23,8 +23,8 @@ ROOM = PROJECT / 'test/mapping/changed_room'
 SOURCES = ('cliploc_ros', 'config', 'demo', 'launch', 'resource', 'LICENSE', 'README.md',
            'package.xml', 'setup.cfg', 'setup.py')
 MAX_MB = 1.2
-#: What a computer without ROS and without the extra "models" lacks. ROS's .pth file starts the
-#: interpreter again with its libraries.
+#: Packages missing on a computer without ROS and the extra "models". ROS's .pth file restarts the
+#: interpreter with its libraries.
 LEFT_OUT = re.compile(r'(?!rosbags)(rclpy|rpyutils|ament|ros|\w+_(msgs|srvs|interfaces)|launch|'
                       r'tf2|torch|ultralytics|open_clip|openvino|cliploc)|.*\.pth$')
 COMMANDS = {'build_map', 'check_map', 'evaluate', 'export_network', 'import_map', 'studio',
@@ -33,7 +33,7 @@ COMMANDS = {'build_map', 'check_map', 'evaluate', 'export_network', 'import_map'
 
 @pytest.fixture(scope='module')
 def wheel(tmp_path_factory):
-    """Build from a copy: build/ of the source tree may hold modules that were deleted."""
+    """Build from a copy: build/ of the source tree may contain deleted modules."""
     source, out = tmp_path_factory.mktemp('source'), tmp_path_factory.mktemp('wheel')
     for name in SOURCES:
         path = PROJECT / name
@@ -48,7 +48,7 @@ def wheel(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def programs(wheel, tmp_path_factory):
-    """The commands, installed where neither ROS nor PyTorch is."""
+    """Install the commands in an environment without ROS and PyTorch."""
     folder = tmp_path_factory.mktemp('fresh')
     subprocess.run([sys.executable, '-m', 'venv', '--without-pip', folder], check=True,
                    timeout=300)
@@ -61,7 +61,7 @@ def programs(wheel, tmp_path_factory):
 
 
 def link_libraries(packages, site):
-    """Link what is installed here to a new environment, except for what that is to lack."""
+    """Link the installed packages to a new environment, except for the missing ones."""
     if packages.is_relative_to('/opt/ros'):
         return
     for path in packages.iterdir():
@@ -70,13 +70,13 @@ def link_libraries(packages, site):
 
 
 def pip(*arguments):
-    """Run it without PYTHONPATH, where it would find the package of this workspace installed."""
+    """Run it without PYTHONPATH, which would contain this workspace's installed package."""
     subprocess.run([sys.executable, '-m', 'pip', '--quiet', '--disable-pip-version-check',
                     *map(str, arguments)], check=True, timeout=300, env=environment())
 
 
 def environment():
-    """Return an environment without ROS, with the kernels that are compiled already."""
+    """Return an environment without ROS, with the kernels that are already compiled."""
     hidden = {'PYTHONPATH', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH', 'PYTHONHOME'}
     kept = {name: value for name, value in os.environ.items() if name not in hidden}
     return {'NUMBA_CACHE_DIR': str(PROJECT / 'cliploc_ros/__pycache__/kernels')} | kept

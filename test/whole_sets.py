@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A small map with all that lies next to it: embeddings, keyframes, what it was built from."""
+"""A small map with all files next to it: embeddings, keyframes, and a record of its origin."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ ROOM = make_room()
 
 
 def made_map(number):
-    """A map whose files all tell its number: the room a little further on."""
+    """Return a map whose files all contain its number, by which the room is also moved."""
     landmark_map = replace(ROOM, centers=ROOM.centers + np.array([0.01, 0.0, 0.0]) * number)
     count = len(ROOM)
     row = np.zeros((1, 8), dtype=np.float16)
@@ -32,6 +32,6 @@ def made_map(number):
 
 
 def write_set(path, number):
-    """Write a map of a number, and all that lies next to it."""
+    """Write the map of a number, and all files next to it."""
     return write_made_map(path, made_map(number), ['a test'],
                           MapRecording(path.with_name('seen.npz'), scale=1.0 + number))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A machine without PyTorch, for processes of tests."""
+"""An environment without PyTorch, for processes of tests."""
 
 import os
 from pathlib import Path

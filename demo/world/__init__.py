@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What built the demo's room, trained its networks and measured them.
+"""Programs that build the demo's room, and train and measure its networks.
 
 Run the programs from the root of the repository, as ``python -m demo.world.PROGRAM``:
 
@@ -13,5 +13,5 @@ train_clip, train_detector
 compare
     Compare the paper's methods in the demo's room.
 class_growth
-    Measure how each method copes with many objects of one class.
+    Measure how the number of objects of one class affects each method.
 """

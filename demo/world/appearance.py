@@ -86,7 +86,7 @@ def draw_appearance(class_id: str, rng: np.random.Generator) -> Appearance:
 
 
 def draw_lookalike(original: Appearance, rng: np.random.Generator) -> Appearance:
-    """Draw a nearly identical look, which differs in the second colour only."""
+    """Draw a nearly identical look, which differs only in the second colour."""
     others = [c for c in COLORS if c not in (original.color, original.second_color)]
     pattern = 'dots' if original.pattern == 'plain' else original.pattern
     return Appearance(original.class_id, original.color, pattern, str(rng.choice(others)),

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure growing classes with real networks: ``python -m demo.world.class_growth --out DIR``.
 
-Each room holds 48 objects: of eight classes, then of four, of two, of one. The camera sees as many
-objects in each, but more of them share a class. Matching by class then has more candidates and
-finds the right ones less often. Labels still distinguish the objects.
+Each room holds 48 objects, of eight, four, two or one class. The camera sees the same number of
+objects in each room, but more of them share a class. Matching by class then has more candidates
+and finds the correct ones less often. Labels still distinguish the objects.
 """
 
 import argparse
@@ -61,14 +61,14 @@ def _make_work(folder: Path, images: int, seed: int) -> Callable[[int], bool]:
     return work
 
 
-def _whole_search_s(one: Summary) -> float:
-    """Return the mean time of a search [s], extrapolated to the whole search for bf."""
-    share = np.maximum(one.coverage, 1e-9) if one.method.endswith('_bf') else 1.0
-    return float((one.search_ms / share).mean()) / 1e3
+def _whole_search_s(summary: Summary) -> float:
+    """Return the mean time of a search [s], extrapolated to the complete search for bf."""
+    share = np.maximum(summary.coverage, 1e-9) if summary.method.endswith('_bf') else 1.0
+    return float((summary.search_ms / share).mean()) / 1e3
 
 
 def plot(summaries: Mapping[int, Sequence[Summary]], path: Path) -> None:
-    """Draw success and time over the objects of each class, the key of the summaries."""
+    """Plot success and time over the number of objects of each class, the summaries' key."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -79,9 +79,11 @@ def plot(summaries: Mapping[int, Sequence[Summary]], path: Path) -> None:
     styles = dict(zip(METHODS, (('#D55E00', 'o-'), ('#E69F00', 's--'), ('#56B4E9', '^-.'),
                                 ('#0072B2', 'D-'), ('#000000', 'v-')), strict=True))
     for method, (color, style) in styles.items():
-        own = [one for same in summaries.values() for one in same if one.method == method]
-        left.plot([*summaries], [one.success(_SUCCESS_M) for one in own], style, color=color)
-        right.plot([*summaries], [_whole_search_s(one) for one in own], style, color=color,
+        own = [summary for of_room in summaries.values() for summary in of_room
+               if summary.method == method]
+        left.plot([*summaries], [summary.success(_SUCCESS_M) for summary in own], style,
+                  color=color)
+        right.plot([*summaries], [_whole_search_s(summary) for summary in own], style, color=color,
                    label=method)
     for axes in (left, right):
         axes.set_xscale('log', base=2)
@@ -97,22 +99,22 @@ def plot(summaries: Mapping[int, Sequence[Summary]], path: Path) -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Render, observe, measure, draw."""
+    """Render the rooms, record queries, measure the methods, and plot the results."""
     parser = argparse.ArgumentParser(prog='class_growth', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--out', type=Path, default=Path('class_growth'), metavar='DIR')
-    parser.add_argument('--images', type=int, default=24, help='of each room (%(default)s)')
+    parser.add_argument('--images', type=int, default=24, help='images of each room (%(default)s)')
     parser.add_argument('--seed', type=int, default=70)
     options = parser.parse_args(arguments)
     make_folder(options.out)
     summaries: dict[int, list[Summary]] = {}
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_growth_') as name:
-        # In other processes: Mesa and PyTorch each load an LLVM, and the two conflict.
+        # Render in other processes: Mesa and PyTorch each load an LLVM, and these conflict.
         for count, is_made in tqdm(run_tasks(
                 partial(_make_work, Path(name), options.images, options.seed), COUNTS, workers=2),
                 'rendering', len(COUNTS), unit='room'):
             if not is_made:
-                raise WorkersError(f'workers died again and again at the room with {count} '
+                raise WorkersError(f'workers died repeatedly at the room with {count} '
                                    'objects of each class')
         for count in COUNTS:
             folder = Path(name, str(count))

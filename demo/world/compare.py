@@ -41,7 +41,7 @@ from demo.world import train_detector
 
 
 def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Queries:
-    """Run the shipped detector and CLIP on the images of a world, against a map."""
+    """Run the shipped detector and CLIP on the images of a world; return queries for a map."""
     detector = load_detector(DetectorOptions(model=str(ASSETS / 'yolo.pt')))
     clip = ClipOptions(model=str(ASSETS / 'clip.json'), cache_dir=str(cache_dir),
                        pretrained=str(ASSETS / 'clip.safetensors'))
@@ -80,7 +80,7 @@ def score_clip(frames: Sequence[QueryFrame], truth: Sequence[TrueFrame],
 
 
 def run(arguments: list[str]) -> int:
-    """Score the networks, record, compare."""
+    """Score the networks, record their output, and compare the methods on it."""
     parser = argparse.ArgumentParser(prog='compare', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--out', type=Path, default=Path('demo_compare'), metavar='DIR')

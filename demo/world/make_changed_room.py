@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make a room before and after changes: ``python -m demo.world.make_changed_room DIR``.
 
-The room is the demo's, without the objects that its map lacks. The folder gets two walks, before/
-and after/, the exact maps of both, and what changed, changes.json: four objects exchange their
-places in pairs, two are taken away, three appear, and the light is another one. With
-``--free-places`` the four move to places that were empty.
+The room is the demo's, without the objects that its map lacks. The program writes two walks,
+before/ and after/, the exact maps of both, and the changes, changes.json: four objects swap their
+places in pairs, two are removed, three are added, and the light changes. With ``--free-places``
+the four objects move to empty places instead.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from demo.world.trajectories import CAMERA, walk
 
 _COUNTS = dict.fromkeys(CLASSES, 8)
 _MOVED, _REMOVED, _NEW = 4, 2, 3
-# Objects stand this near to their places.
+# Greatest distance of an object from its place.
 _JITTER_M = 0.05
 
 
@@ -48,7 +48,7 @@ def change_room(seed: int, free_places: bool = False) -> tuple[Room, Room, dict[
 
 
 def _move_to_free_places(room: Room, moved: list[str], seed: int) -> Room:
-    """Move objects to places of the room that are free."""
+    """Move objects to free places of the room."""
     rng = np.random.default_rng(seed)
     taken = np.array([o.slot.position for o in make_room(SEED, _COUNTS).objects])
     free = [slot for slot in find_places(SEED)
@@ -60,16 +60,16 @@ def _move_to_free_places(room: Room, moved: list[str], seed: int) -> Room:
 
 
 def round_walk(count: int, start: float, height_m: float) -> npt.NDArray[np.float64]:
-    """Return a walk around the room and back that looks ahead, so that each object has two sides.
+    """Return a walk around the room and back, which looks ahead and sees two sides of each object.
 
     Parameters
     ----------
     count : int
         Number of poses.
     start : float
-        Where it starts on the round [rad].
+        Angle at which the walk starts [rad].
     height_m : float
-        Of the camera [m].
+        Height of the camera [m].
     """
     loops = []
     for sign, poses in ((1.0, count // 2), (-1.0, count - count // 2)):
@@ -103,9 +103,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog='make_changed_room', description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('folder', type=Path, metavar='DIR')
-    parser.add_argument('--images', type=int, default=80, help='of each walk (%(default)s)')
+    parser.add_argument('--images', type=int, default=80, help='images of each walk (%(default)s)')
     parser.add_argument('--seed', type=int, default=SEED + 1, help='(%(default)s)')
-    parser.add_argument('--free-places', action='store_true', help='see above')
+    parser.add_argument('--free-places', action='store_true',
+                        help='move objects to empty places instead of swapping them')
     options = parser.parse_args()
     make_changed_room(options.folder, options.images, options.seed, options.free_places)
 

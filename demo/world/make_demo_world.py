@@ -3,8 +3,8 @@
 """Make the world of the demo: ``python -m demo.world.make_demo_world DIR``.
 
 No model was trained on this room. The true map comes from the true boxes of a walk around its
-centre. The mapping walk yields the images to build a map from. Then some objects move and the
-light changes, and other walks yield the images of the wake-ups: of one camera, and of four.
+centre. The mapping walk provides the images to build a map from. Then some objects move, the light
+changes, and other walks provide the images of the wake-ups, for one camera and for four.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from demo.world.trajectories import (
     true_map_walk,
 )
 
-#: Not among the seeds of the training worlds, which start at 1000.
+#: Seed of the demo's room; the seeds of the training worlds start at 1000.
 SEED = 7
 
 
@@ -44,7 +44,7 @@ def make_demo_world(folder: Path, images: int, mapping_images: int, seed: int = 
 
 
 def make_rig(folder: Path, room: Room, seed: int) -> None:
-    """Write what the cameras of a rig see (NAME/), and how they are mounted (mounts.json)."""
+    """Write a walk for each camera of a rig (NAME/), and the cameras' mounts (mounts.json)."""
     mounts, poses = rig_mounts(), rig_walk()
     renderer = Renderer(room, CAMERA, LATER_LIGHT)
     for number, (name, mount) in enumerate(mounts.items()):

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make rooms to judge keyframes in: ``python -m demo.world.make_keyframe_rooms DIR SEED ...``.
 
-Each room DIR/room_SEED has the exact map and folders of images. Layers are made of two:
+Each room DIR/room_SEED has the exact map and folders of images. Two folders are for making layers:
 ``mapping``, the demo's mapping walk, and ``one_side``, a walk around the room that looks ahead.
-The others are queries: ``viewpoints`` and ``other_light`` are the demo's wake-ups, once as the
-room was mapped and once in another light after four objects moved; ``other_side`` walks around the
-room the other way. ``viewpoints_aside`` and ``other_light_aside`` are second looks, 20 cm
-aside.
+The others are queries. ``viewpoints`` shows the demo's wake-ups in the room as it was mapped,
+``other_light`` shows them in another light after four objects moved, and ``other_side`` is a walk
+around the room in the opposite direction. ``viewpoints_aside`` and ``other_light_aside`` are
+second looks from 20 cm to the side.
 """
 
 import argparse
@@ -54,7 +54,8 @@ def main() -> None:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('folder', type=Path, metavar='DIR')
     parser.add_argument('seeds', type=int, nargs='+', metavar='SEED')
-    parser.add_argument('--queries', type=int, default=24, help='of each walk (%(default)s)')
+    parser.add_argument('--queries', type=int, default=24,
+                        help='images of each walk of queries (%(default)s)')
     options = parser.parse_args()
     for seed in options.seeds:
         make_keyframe_room(options.folder / f'room_{seed}', seed, options.queries)

@@ -30,12 +30,14 @@ def make_world(folder: Path, seed: int, frames: int) -> None:
 
 
 def main() -> None:
-    """Make worlds in parallel, each from its own seed."""
+    """Make worlds in parallel, each with a different seed."""
     parser = argparse.ArgumentParser(prog='make_worlds', description=__doc__)
     parser.add_argument('folder', type=Path, metavar='DIR')
     parser.add_argument('--count', type=int, default=90, help='number of worlds (%(default)s)')
-    parser.add_argument('--frames', type=int, default=10, help='images each (%(default)s)')
-    parser.add_argument('--seed', type=int, default=1000, help='seed of the first (%(default)s)')
+    parser.add_argument('--frames', type=int, default=10,
+                        help='images of each world (%(default)s)')
+    parser.add_argument('--seed', type=int, default=1000,
+                        help='seed of the first world (%(default)s)')
     parser.add_argument('--jobs', type=int, default=os.cpu_count(),
                         help='parallel processes (%(default)s)')
     options = parser.parse_args()
@@ -43,7 +45,7 @@ def main() -> None:
             partial(_make_work, options.folder, options.seed, options.frames),
             range(options.count), workers=options.jobs), total=options.count, unit='world'):
         if not is_made:
-            raise WorkersError(f'workers died again and again at world {number}; use fewer --jobs')
+            raise WorkersError(f'workers died repeatedly at world {number}; use fewer --jobs')
 
 
 def _make_work(folder: Path, seed: int, frames: int) -> Callable[[int], bool]:

@@ -16,7 +16,7 @@ def expose(image: npt.NDArray[np.uint8], rng: np.random.Generator,
     image : (h, w, 3) array of uint8
         RGB.
     rng : numpy.random.Generator
-        For exposure, the direction of the motion and the noise.
+        Draws the exposure, the motion and the noise.
     blur_px : float
         Typical length of the motion during the exposure [px].
 

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Make the test's files of a changed room: ``python -m demo.world.record_changed_room ROOM OUT``.
+"""Make the test files of a changed room: ``python -m demo.world.record_changed_room ROOM OUT``.
 
-ROOM comes from demo.world.make_changed_room. The demo's networks look at both walks, once: what
-they say lies next to the walks. OUT gets what an update reads: the exact map of the room before
-the changes, its image embeddings from the first walk, what the networks say of the second walk,
-and the changes. Embeddings are rounded to 1/128, so that the files are small.
+ROOM comes from demo.world.make_changed_room. The demo's networks process both walks once; their
+output is stored next to the walks. The program writes the input of an update to OUT: the exact map
+of the room before the changes, its image embeddings from the first walk, the output of the
+networks for the second walk, and the changes. Embeddings are rounded to 1/128 to keep the files
+small.
 """
 
 import argparse
@@ -56,7 +57,7 @@ def record_changed_room(room: Path, out: Path) -> None:
 
 
 def _look(walk: Path) -> PosedDetections:
-    """Return what the demo's networks say of each image of a walk."""
+    """Return the output of the demo's networks for each image of a walk."""
     clip = ClipOptions(pretrained=str(ASSETS / 'clip'))
     networks = RecordingOptions(DetectorOptions(model=str(ASSETS / 'yolo.onnx')), clip,
                                 KeyframeOptions(0.0, 0.0), '')

@@ -78,7 +78,7 @@ def record(folder: Path, room: Room, renderer: Renderer, poses: npt.NDArray[np.f
 
 
 def _with_progress(poses: npt.NDArray[np.float64], what: str) -> Iterable[Any]:
-    """Return poses with a progress bar, unless this is one of several processes."""
+    """Return poses with a progress bar, except in a worker process."""
     is_worker = multiprocessing.parent_process() is not None
     return tqdm(poses, what, unit='image', disable=is_worker or None)
 
@@ -103,7 +103,7 @@ def find_boxes(room: Room, renderer: Renderer, map_from_camera: npt.NDArray[np.f
 def _outline_px(item: WorldObject, map_from_camera: npt.NDArray[np.float64]) -> int:
     """Count the pixels that an object would cover alone in an unbounded image.
 
-    The result is 0 for an object that reaches the camera or is too near to be seen whole.
+    The result is 0 for an object that reaches the camera or is too near to be completely visible.
     """
     camera_from_object = invert_transform(map_from_camera) @ item.map_from_object
     hulls = []
@@ -130,10 +130,11 @@ def write_true_map(path: Path, room: Room) -> None:
 
 def write_fitted_map(path: Path, room: Room, renderer: Renderer,
                      poses: npt.NDArray[np.float64], *, seed: int) -> None:
-    """Write a map as a mapping run makes it: ellipsoids fitted to the boxes of many views.
+    """Write a map with ellipsoids fitted to the boxes of many views, as in a mapping run.
 
-    The fit uses views that show an object whole and hardly covered, with boxes perturbed by a
-    pixel like a detector's. An object with fewer than three such views keeps its exact ellipsoid.
+    The fit uses views that show an object completely and almost unoccluded. Boxes are perturbed by
+    a pixel, like those of a detector. An object with fewer than three such views keeps its exact
+    ellipsoid.
     """
     rng = np.random.default_rng(seed)
     views: dict[str, list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]] = {}
@@ -163,7 +164,7 @@ def _fit(entry: dict[str, Any], views: Sequence[tuple[npt.NDArray[np.float64], .
         conics = np.concatenate([project_ellipsoids(pose, x[None, :3], shape) for pose in poses])
         # An ellipsoid that reaches the camera has no outline: a large finite residual.
         outlines = np.nan_to_num(ellipse_bboxes(ellipses_in_pixels(conics, CAMERA)), nan=1e4)
-        # Views from one side leave the depth undetermined: then the prior decides.
+        # Views from one side leave the depth undetermined; the prior then determines it.
         return np.concatenate([(outlines - bboxes).ravel(), (x - start) / _USUAL_SPREAD])
 
     found = least_squares(residuals, start, loss='soft_l1', f_scale=3.0).x

@@ -37,7 +37,7 @@ class Light:
                      rng.uniform(-0.06, 0.12))
 
 
-#: While a room is mapped, and after some of it has changed.
+#: The light while a room is mapped, and after some of its objects moved.
 FIRST_LIGHT = Light()
 LATER_LIGHT = Light(lamp=0.5, ambient=0.5, position=(4.2, 1.8), warmth=0.08)
 
@@ -52,7 +52,7 @@ class Renderer:
     camera : Camera
         Pinhole, without distortion.
     light : Light
-        Its light.
+        Light of the room.
 
     Raises
     ------

@@ -15,7 +15,7 @@ from demo.world.meshes import Mesh, box, join, make_object
 
 LENGTH_M, WIDTH_M, HEIGHT_M = 6.0, 5.0, 2.7
 _SLOT_M = 0.31
-#: An ellipsoid inscribed in the object's box looks too small from the corners.
+#: Scale of an ellipsoid inscribed in an object's box, which looks too small from the corners.
 _ELLIPSOID_SCALE = 1.1
 
 
@@ -126,7 +126,7 @@ def move_objects(room: Room, count: int, seed: int) -> Room:
 
 
 def _draw_looks(class_id: str, count: int, rng: np.random.Generator) -> list[Appearance]:
-    """Draw different looks; one in six nearly equals another."""
+    """Draw distinct looks; one in six is nearly equal to another."""
     looks: list[Appearance] = []
     while len(looks) < count:
         similar = looks and len(looks) % 6 == 5

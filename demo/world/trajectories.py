@@ -44,14 +44,14 @@ def draw_views(room: Room, count: int, rng: np.random.Generator) -> npt.NDArray[
 
 def walk(count: int, way_points: npt.ArrayLike, targets: npt.ArrayLike) -> \
         npt.NDArray[np.float64]:
-    """Return poses (count, 4, 4) of a smooth walk through points, looking at others.
+    """Return poses (count, 4, 4) of a smooth walk through way points that looks at targets.
 
     Parameters
     ----------
     count : int
         Number of poses, spread evenly over the walk.
     way_points, targets : (n, 3) array_like
-        Points that the camera passes, and at which it looks there [m].
+        Points that the camera passes, and the points that it looks at there [m].
     """
     way_points = np.asarray(way_points, dtype=float)
     knots = np.linspace(0, 1, len(way_points))
@@ -76,7 +76,7 @@ def true_map_walk(count: int) -> npt.NDArray[np.float64]:
 def mapping_walk(count: int) -> npt.NDArray[np.float64]:
     """Return the mapping walk: sideways past each shelf and table, two metres away.
 
-    So each object is seen from directions 20 degrees apart and more.
+    Each object is seen from directions that are at least 20 degrees apart.
     """
     eyes = [(0.9, 2.1, 1.4), (1.5, 2.3, 1.5), (2.2, 2.2, 1.4), (2.8, 1.9, 1.5),  # shelf
             (3.6, 2.0, 1.5), (4.3, 2.3, 1.4), (5.1, 2.1, 1.4),  # table
@@ -91,7 +91,7 @@ def mapping_walk(count: int) -> npt.NDArray[np.float64]:
     return walk(count, eyes, gazes)
 
 
-#: The cameras of a robot that does not turn: how far each looks to the right of the first [deg].
+#: The cameras of a robot that does not turn, each with its angle to the right of the first [deg].
 RIG_DEG = {'front': 0.0, 'left': -90.0, 'back': 180.0, 'right': 90.0}
 
 
@@ -105,14 +105,14 @@ def rig_mounts() -> dict[str, npt.NDArray[np.float64]]:
 
 
 def rig_walk() -> npt.NDArray[np.float64]:
-    """Return poses (n, 4, 4) of a rig's front camera, which looks in one direction all the way."""
+    """Return poses (n, 4, 4) of a rig's front camera, which keeps its viewing direction."""
     eyes = np.array([(1.6, 2.0, 1.2), (2.2, 2.6, 1.2), (2.9, 3.1, 1.2), (3.5, 2.4, 1.2),
                      (4.1, 1.9, 1.2), (4.4, 2.9, 1.2)])
     return np.array([look_at(eye, eye + np.array([0.9, 0.4, 0.0])) for eye in eyes])
 
 
 def query_walk(count: int) -> npt.NDArray[np.float64]:
-    """Return the walk of the wake-ups: lower, tilted, past a nearly empty wall."""
+    """Return the walk of the wake-ups (count, 4, 4): lower, tilted, past a nearly empty wall."""
     eyes = [(4.2, 3.6, 1.3), (3.6, 3.6, 1.35), (3.0, 3.0, 1.2), (2.8, 2.2, 1.1), (3.2, 2.0, 1.3),
             (3.0, 2.2, 1.25), (2.8, 1.8, 1.3), (2.6, 1.6, 1.3), (2.6, 1.5, 1.3), (2.4, 1.8, 1.3),
             (2.6, 2.0, 1.3), (3.0, 2.6, 1.3), (3.2, 3.2, 1.25)]

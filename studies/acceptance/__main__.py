@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How often poses are accepted, rightly and wrongly: ``python -m studies.acceptance``.
+"""Measure correct and false accepts: ``python -m studies.acceptance``.
 
-``judge`` localizes as robots do, ``recorded`` compares values of min_confidence, in the mapped
-place and in one whose objects have all exchanged places, where every pose is wrong. ``stress`` and
-``families`` change map, boxes or sensors, and the robot does not know. ``priors`` tells the robot
-where it is. In ``retries`` it looks up to 20 times. ``fit`` fits the confidence.
+``judge`` localizes as robots do. ``recorded`` compares values of min_confidence in the mapped
+place, and in a place whose objects have all exchanged places, where every pose is wrong.
+``stress`` and ``families`` change map, boxes or sensors without the robot's knowledge. ``priors``
+gives the robot a prior of its pose. In ``retries`` the robot looks up to 20 times. ``fit`` fits
+the confidence.
 """
 
 import argparse
@@ -44,8 +45,8 @@ from studies.reports import (
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 
-# So low that only what has nothing to do with the confidence refuses a pose. All crops are
-# compared: on demand, such a pose would be taken from the first of them.
+# So low that a pose is refused only for reasons other than its confidence. All crops are compared,
+# because a search on demand would accept such a pose from the first few crops.
 _LOWEST = 1e-6
 _QUERIES = 4  # of a simulated world
 _EXCHANGED = 'share of the landmarks that have exchanged places'
@@ -53,7 +54,7 @@ _EXCHANGED = 'share of the landmarks that have exchanged places'
 
 def _searched(options: argparse.Namespace, tasks: Sequence[searches.Task], *tables: Sequence[str]
               ) -> list[searches.Outcome]:
-    """Return the outcomes of tasks; print a table of them by each of some fields."""
+    """Return the outcomes of tasks; print a table of them for each tuple of fields."""
     found: list[searches.Outcome] = run_all(searches.make_search, tasks, 'searches',
                                             options.workers)
     for by in tables:
@@ -64,7 +65,7 @@ def _searched(options: argparse.Namespace, tasks: Sequence[searches.Task], *tabl
 def _named(names: Iterable[str], options: argparse.Namespace) -> list[str]:
     chosen = [name for name in names if any(text in name for text in options.only)]
     if not chosen:
-        raise OptionsError('nothing to test: --only must be a part of a name')
+        raise OptionsError(f'nothing to test: no name contains --only {" ".join(options.only)}')
     return chosen
 
 
@@ -81,19 +82,20 @@ def _judge(options: argparse.Namespace) -> None:
 
 
 def _recorded(options: argparse.Namespace) -> None:
-    if not all(0.0 <= one <= 1.0 for one in options.min_confidence):
+    if not all(0.0 <= threshold <= 1.0 for threshold in options.min_confidence):
         raise OptionsError('--min-confidence must be from 0 to 1')
     found: list[searches.Outcome] = run_all(searches.make_search, [
         searches.Task(place, mode, RelocalizerOptions(matching=matching, min_confidence=_LOWEST,
                                              crops='all'), *trouble)
         for place in chosen_places(options) for matching in fit.MATCHINGS for mode in MODES
         for trouble in (('none', 0.0), (_EXCHANGED, 1.0))], 'searches', options.workers)
-    # another rule than that of the confidence refuses a pose for certain
-    found = [replace(one, confidence=one.confidence * one.accepted) for one in found]
-    here = [one for one in found if one.trouble == 'none']
-    # in another place no pose is right
-    there = [replace(one, error_m=inf, nees=inf, trouble='all objects exchanged')
-             for one in found if one.trouble != 'none']
+    # a pose that is refused for another reason than its confidence counts as confidence 0
+    found = [replace(outcome, confidence=outcome.confidence * outcome.accepted)
+             for outcome in found]
+    here = [outcome for outcome in found if outcome.trouble == 'none']
+    # in another place no pose is correct
+    there = [replace(outcome, error_m=inf, nees=inf, trouble='all objects exchanged')
+             for outcome in found if outcome.trouble != 'none']
     for some, by in ((here, ('place', 'matching', 'mode')), (here, ('matching', 'mode')),
                      (there, ('trouble', 'place')), (there, ('trouble', 'matching', 'mode')),
                      (there, ('trouble',))):
@@ -104,7 +106,7 @@ def _recorded(options: argparse.Namespace) -> None:
     if options.out is not None:
         make_folder(options.out)
         (options.out / 'outcomes.json').write_text(
-            json.dumps([asdict(one) for one in (*here, *there)]))
+            json.dumps([asdict(outcome) for outcome in (*here, *there)]))
         draw_judged(options.out / 'reliability.png', 'poses that at least three objects support',
                     judged_by(here, 'mode'))
 
@@ -179,11 +181,11 @@ def _fit(options: argparse.Namespace) -> None:
     calibrations = fit.cross_fitted(searched)
     fit.print_report(searched, calibrations)
     if options.out is not None:
-        plain = [one for one in searched if one.kind in fit.FITTED_KINDS
-                 and not one.case.is_elsewhere]
+        plain = [result for result in searched if result.kind in fit.FITTED_KINDS
+                 and not result.case.is_elsewhere]
         draw_judged(options.out / 'reliability.png', 'worlds, each kind left out of the fit',
                     judged_by(fit.answers(plain, calibrations), 'mode'))
-    fitted = fit.fit([one.case for one in searched if one.kind in fit.FITTED_KINDS],
+    fitted = fit.fit([result.case for result in searched if result.kind in fit.FITTED_KINDS],
                      'depth' if options.depth else '')
     print('\nfitted on all of them, for calibration.yaml, objects:\n' + ', '.join(
         f'{name}: {value:.3g}' for name, value in fitted.objects.items()))
@@ -210,32 +212,33 @@ def run(arguments: Sequence[str] | None = None) -> int:
     recorded.add_argument('--min-confidence', type=float, nargs='+',
                           default=(0.99, 0.97, 0.95, 0.9))
     ordinary = ('room', 'office', 'shop')
-    stress = add('stress', _stress, 'false accepts in a list of troubles', kinds=ordinary,
+    stress = add('stress', _stress, 'false accepts under a list of troubles', kinds=ordinary,
                  first_seed=1000)
     families = add('families', _families, 'false accepts where many objects share an error',
                    first_seed=2000)
     families.add_argument('--requests', type=positive_int, default=200, metavar='N',
-                          help='at each level of a family, in each mode, about (%(default)s)')
+                          help='approximate requests of each level and mode (%(default)s)')
     families.add_argument('--quick', dest='requests', action='store_const', const=24,
                           help='few requests')
     families.add_argument('--matching', choices=fit.MATCHINGS,
-                          help='(by labels for changed maps, else by classes)')
-    priors = add('priors', _priors, 'what regions known before add, right and wrong', worlds=20,
+                          help='default: by labels for changed maps, by classes otherwise')
+    priors = add('priors', _priors, 'the effect of a known region, correct or wrong', worlds=20,
                  first_seed=1100)
     retries = add('retries', _retries, f'{searches.LOOKS} looks of a robot that does not move',
                   kinds=ordinary, first_seed=1000)
     retries.set_defaults(frames='main')
-    retries.add_argument('--seed', type=int, default=0, help='of the changes (%(default)s)')
+    retries.add_argument('--seed', type=int, default=0, help='seed of the changes (%(default)s)')
     fits = add('fit', _fit, 'the fit of the confidence to simulated worlds')
-    fits.add_argument('--worlds', type=positive_int, default=24, metavar='N', help='of each kind')
+    fits.add_argument('--worlds', type=positive_int, default=24, metavar='N',
+                      help='worlds of each kind (%(default)s)')
     fits.add_argument('--depth', action='store_true', help='fit the coefficient of depth alone')
     fits.add_argument('--workers', type=positive_int, default=1, metavar='N')
     for own in (stress, families):
         own.add_argument('--only', nargs='+', default=[''], metavar='TEXT',
-                         help='what has one of these in its name')
+                         help='run only troubles whose name contains one of these')
     for own in (judge, recorded, fits):
         own.add_argument('--out', type=Path, metavar='DIR',
-                         help='draw a reliability diagram there; recorded: outcomes.json, too')
+                         help='folder for a reliability diagram, with recorded also outcomes.json')
     for own in (judge, stress, priors, retries):
         own.add_argument('--matching', choices=fit.MATCHINGS, default='hybrid')
     options = parser.parse_args(arguments)

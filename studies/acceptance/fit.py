@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of the confidence to simulated worlds.
+"""Fit the confidence to simulated worlds.
 
 Each group of images is localized in all modes, by labels and by classes, and in the same map with
 all objects exchanged, where every pose is wrong. Half of the worlds have an error that all objects
 share: of the focal length, of the map's size or shape, or of names. For the report, each kind of
-world is judged by coefficients that the other kinds fitted. The coefficients printed in the end
-are fitted on rooms, offices, shops and bare rooms; corridors, halls and twin rooms only judge,
-since their mistaken places are the task of cliploc_ros.core.acceptance.look_alikes.
+world is judged with coefficients that were fitted to the other kinds. The coefficients printed at
+the end are fitted to rooms, offices, shops and bare rooms. Corridors, halls and twin rooms are
+only judged: cliploc_ros.core.acceptance.look_alikes handles their mistaken places.
 """
 
 import math
@@ -35,12 +35,12 @@ from studies.acceptance.places import ALL, MODES, ONE, Simulated
 from studies.acceptance.troubles import FAMILIES, exchange_landmarks
 from studies.reports import Answer, Judged, confidence_table
 
-#: The kinds that fit; the others have places that look alike.
+#: The kinds of worlds in the fit; the other kinds have places that look alike.
 FITTED_KINDS = ('room', 'office', 'shop', 'bare room')
 MATCHINGS = ('hybrid', 'class')
-# Deviations of the known vertical [deg], drawn for each world.
+# Deviations of the known vertical [deg]; one is drawn for each world.
 _VERTICALS_DEG = (0.5, 1.0, 2.0, 4.0)
-# So low that evidence which is computed for likely poses only is there for those in doubt, too.
+# So low that evidence computed only for likely poses also exists for doubtful ones.
 _IN_DOUBT = 0.3
 # Errors that objects share, with their deviations or levels; half of the worlds have one.
 _SHARED = {'B focal length off by a factor': 0.03, 'C map scaled by': 0.05,
@@ -48,35 +48,35 @@ _SHARED = {'B focal length off by a factor': 0.03, 'C map scaled by': 0.05,
 _THRESHOLDS = (0.9, 0.95, 0.97, 0.98, 0.99, 0.995)
 _FIELDS = ('score', 'misfit', 'likeness', 'rarity', 'unlabelled', 'unexplained', 'depth')
 _TERMS = (*_FIELDS, 'none_right', 'map_size', 'vertical')
-# Support must not count against a pose, whatever a small data set says. A larger map has more
-# wrong poses, a vertical leaves fewer.
+# Bounds of the coefficients. Support must never lower the confidence of a pose, even if a small
+# data set suggests it. A larger map has more wrong poses; a vertical excludes some of them.
 _SIGNS = ((0, None), (None, 0), (0, None), (0, None), (0, None), (None, 0), (0, None),
           (None, None), (0, None), (None, 0))
 _KNEES = (0.0, 0.5, 1.0, 1.5, 2.0)
 _MOST_SLOPE = 3.0
 _RIDGE = 1e-4
-# Poses at a place that the map does not show count in full for the coefficients of the support:
-# they say best what a wrong pose looks like. Robots rarely start there, so they count by this
-# share for the level of the confidence. A guess.
+# Poses at a place outside the map have full weight for the coefficients of the support: they are
+# the best examples of wrong poses. Robots rarely start there, so they have this weight for the
+# level of the confidence. A guess.
 _ELSEWHERE = 0.1
 
 
 @dataclass(frozen=True)
 class Case:
-    """The m hypotheses of a search, and which of them are right."""
+    """The m hypotheses of a search, and which of them are correct."""
 
     supports: tuple[Support, ...]
     poses: NDArray[np.float64]
     right: NDArray[np.bool_]
     handicaps: NDArray[np.float64]  # see confidences
     setting: Setting
-    is_elsewhere: bool = False  # the map shows another place, so that every pose is wrong
-    certainty: float = 1.0  # that nothing but the poses found makes the best one wrong
+    is_elsewhere: bool = False  # the map shows another place, so every pose is wrong
+    certainty: float = 1.0  # factor of the confidence for causes of error beyond the hypotheses
 
 
 def judge(found: Relocalization, map_from_camera: NDArray[np.float64], setting: Setting,
           is_elsewhere: bool = False) -> Case:
-    """Return the hypotheses of a search, compared with the true pose (4, 4)."""
+    """Compare the hypotheses of a search with the true pose (4, 4)."""
     poses = np.array([hypothesis.map_from_camera for hypothesis in found.hypotheses])
     errors = np.array([pose_error(pose, map_from_camera)[0] for pose in poses])
     return Case(tuple(hypothesis.support for hypothesis in found.hypotheses), poses,
@@ -87,7 +87,7 @@ def judge(found: Relocalization, map_from_camera: NDArray[np.float64], setting: 
 
 
 class Searched(NamedTuple):
-    """The case of one search, and what it was."""
+    """The case of one search, with the kind of world, the mode and the matching."""
 
     kind: str
     mode: str
@@ -134,7 +134,7 @@ def search_world(world: Simulated) -> list[Searched]:
 
 
 def _level(shared: str, rng: np.random.Generator) -> float:
-    """Return by how much a world is wrong: a factor near 1, a distance, or a number of copies."""
+    """Draw the size of a world's error: a factor near 1, a distance, or a number of copies."""
     deviation = _SHARED[shared]
     if isinstance(deviation, int):
         return deviation
@@ -142,21 +142,21 @@ def _level(shared: str, rng: np.random.Generator) -> float:
 
 
 def fit(cases: Sequence[Case], only: str = '') -> Calibration:
-    """Return the coefficients of maximum likelihood, or only one of those of a support.
+    """Return the maximum-likelihood coefficients; with ``only``, fit one of the support's terms.
 
-    First the utilities. Then the level of the confidence: the utility of the case that none is
-    right, and slope and knee. What all cases have in common, such as the size of a single map,
-    keeps its installed coefficient.
+    The utilities are fitted first, then the level of the confidence: the utility of the case that
+    no hypothesis is correct, slope and knee. Terms with the same value in all cases, such as the
+    size of a single map, keep their installed coefficient.
 
     Raises
     ------
     OptionsError
-        All poses are right, or all are wrong.
+        All poses are correct, or all are wrong.
     """
     first = np.array([case.right[0] for case in cases], dtype=bool)
     if first.all() or not first.any():
-        raise OptionsError(f'{first.sum()} of {len(first)} poses are right; a fit needs right and '
-                           'wrong ones')
+        raise OptionsError(f'{first.sum()} of {len(first)} poses are correct; a fit needs both '
+                           'correct and wrong poses')
     data = _arrays(cases)
     scale = np.append(data.supports[data.given].std(axis=0) + 1e-9, np.ones(3))
     bounds = list(_SIGNS)
@@ -202,7 +202,7 @@ def _arrays(cases: Sequence[Case]) -> _Arrays:
 
 def _loss(coefficients: NDArray[np.float64], data: _Arrays, scale: NDArray[np.float64]
           ) -> tuple[float, NDArray[np.float64]]:
-    """Return the negative log likelihood and its derivatives (10,) by the coefficients."""
+    """Return the negative log likelihood and its gradient (10,)."""
     supports, settings = data.supports / scale[:-3], data.settings / scale[-3:]
     utility = np.where(data.given, supports @ coefficients[:-3] - data.handicaps, -1e9)
     utility = np.column_stack([utility, settings @ coefficients[-3:]])
@@ -221,11 +221,11 @@ def _loss(coefficients: NDArray[np.float64], data: _Arrays, scale: NDArray[np.fl
 
 
 def _levelled(cases: Sequence[Case], raw: Calibration) -> Calibration:
-    """Return coefficients with the level, knee and slope of maximum likelihood."""
+    """Return coefficients with the maximum-likelihood level, knee and slope."""
     weights = np.array([_ELSEWHERE if case.is_elsewhere else 1.0 for case in cases])
     certainty = np.array([case.certainty for case in cases])
     right = np.empty(len(cases), dtype=bool)
-    # utilities of the leading place, of the other hypotheses, and of none being right
+    # utilities of the leading place, of the other hypotheses, and of no correct hypothesis
     own, others, none = np.empty((3, len(cases)))
     for row, case in enumerate(cases):
         lead, odds = _lead(case, raw)
@@ -251,9 +251,9 @@ def _levelled(cases: Sequence[Case], raw: Calibration) -> Calibration:
 
 
 def _lead(case: Case, calibration: Calibration) -> tuple[int, NDArray[np.float64]]:
-    """Return which hypothesis leads, and the utility of each.
+    """Return the row of the leading hypothesis, and the utility of each hypothesis.
 
-    A hypothesis that contradicts a known vertical never leads.
+    A hypothesis that contradicts a known vertical cannot lead.
     """
     odds = utilities(case.supports, calibration) - case.handicaps
     is_level = case.handicaps < CALIBRATION.attitude.wrong_mount
@@ -262,7 +262,7 @@ def _lead(case: Case, calibration: Calibration) -> tuple[int, NDArray[np.float64
 
 
 def outcomes(cases: Sequence[Case], calibration: Calibration = CALIBRATION) -> Judged:
-    """Return the confidence (n,) in the likeliest pose of each case, and whether it is right."""
+    """Return the confidence (n,) in the leading pose of each case, and whether it is correct."""
     likely, right = [], []
     for case in cases:
         lead, odds = _lead(case, calibration)
@@ -273,15 +273,15 @@ def outcomes(cases: Sequence[Case], calibration: Calibration = CALIBRATION) -> J
 
 
 def cross_fitted(searched: Sequence[Searched]) -> dict[str, Calibration]:
-    """Return the coefficients for each kind, fitted on the other kinds."""
-    kinds = dict.fromkeys(one.kind for one in searched)
-    return {kind: fit([one.case for one in searched
-                       if one.kind in FITTED_KINDS and one.kind != kind]) for kind in kinds}
+    """Return the coefficients for each kind, fitted to the other kinds."""
+    kinds = dict.fromkeys(result.kind for result in searched)
+    return {kind: fit([result.case for result in searched
+                       if result.kind in FITTED_KINDS and result.kind != kind]) for kind in kinds}
 
 
 @dataclass(frozen=True, kw_only=True)
 class FittedAnswer(Answer):
-    """The leading hypothesis of a case, with its confidence by some coefficients."""
+    """The leading hypothesis of a case, with its confidence under given coefficients."""
 
     kind: str
     mode: str
@@ -290,21 +290,21 @@ class FittedAnswer(Answer):
 
 def answers(searched: Sequence[Searched], calibrations: Mapping[str, Calibration]
             ) -> list[FittedAnswer]:
-    """Return the answers of searches, by the coefficients for each kind."""
+    """Return the answers of searches, with the coefficients of each kind."""
     found = []
-    for one in searched:
-        (likely,), (right,) = outcomes([one.case], calibrations[one.kind])
+    for result in searched:
+        (likely,), (right,) = outcomes([result.case], calibrations[result.kind])
         found.append(FittedAnswer(
-            kind=one.kind, mode=one.mode, matching=one.matching, accepted=False,
+            kind=result.kind, mode=result.mode, matching=result.matching, accepted=False,
             confidence=float(likely), **({'error_m': 0.0, 'error_deg': 0.0} if right else {})))
     return found
 
 
 def print_report(searched: Sequence[Searched], calibrations: Mapping[str, Calibration]) -> None:
     """Print precision and recall of each kind, mode and matching, and elsewhere."""
-    here = answers([one for one in searched if not one.case.is_elsewhere], calibrations)
-    plain = [one for one in here if one.kind in FITTED_KINDS]
-    there = answers([one for one in searched if one.case.is_elsewhere], calibrations)
+    here = answers([result for result in searched if not result.case.is_elsewhere], calibrations)
+    plain = [result for result in here if result.kind in FITTED_KINDS]
+    there = answers([result for result in searched if result.case.is_elsewhere], calibrations)
     for name, some, by in (('each kind left out of the fit', here, ['kind']),
                            ('kinds that fit, each left out', plain, ['mode', 'matching']),
                            ('kinds that fit, each left out', plain, []),

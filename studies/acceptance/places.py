@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Places that are recorded or simulated, what a robot knows there, and options to choose both."""
+"""Recorded and simulated places, the modes of localizing there, and options to choose places."""
 
 import argparse
 from collections.abc import Sequence
@@ -30,23 +30,23 @@ from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
 
-#: What is known besides one image.
+#: Input of a request: one or five images, with or without a known vertical and height.
 MODES = ('one image', 'vertical', 'vertical, height', 'five images', 'five, vertical, height')
 ONE, VERTICAL, LEVEL, FIVE, ALL = MODES
-#: Errors of the sensors, other than of simulated worlds that have a seed of their own.
+#: Seed of the sensor errors. Simulated worlds have separate seeds.
 SEED = 7
 #: Deviations of a vertical and of a step of odometry.
 VERTICAL_DEG, STEP_M, STEP_DEG = 1.0, 0.01, 0.5
-# By how much the height range exceeds the true heights.
+# Margin of the height range beyond the true heights [m].
 _HEIGHT_M = 0.2
-# A recording is halved this often, and each half maps once.
+# Number of random halvings of a recording; each half serves as the map once.
 _HALVINGS = 3
 
 
 class Place(NamedTuple):
     """A map, all frames with the group of each, and which frames are queries.
 
-    With every_frame, each frame is a query where one image is localized.
+    With every_frame, each frame is a query in the modes of one image.
     """
 
     landmark_map: LandmarkMap
@@ -63,11 +63,11 @@ class Place(NamedTuple):
 
     def ask(self, mode: str, seed: int = SEED, vertical_deg: float = VERTICAL_DEG
             ) -> list[PosedQuery]:
-        """Return the queries with what is known in a mode."""
+        """Return the queries with the input of a mode."""
         is_fused = mode in (FIVE, ALL)
         queries: Sequence[PosedQuery] = self.frames
         if is_fused and any(query.neighbours for query in queries):
-            return []  # of several cameras, one instant
+            return []  # the neighbours are the robot's other cameras at one instant
         if mode in (VERTICAL, LEVEL, ALL):
             queries = with_vertical(queries, vertical_deg, seed)
         if is_fused:
@@ -92,7 +92,7 @@ class Recording(NamedTuple):
     landmark_map: Path
     every_frame: bool = True
     seed: int = 0
-    has_depth: bool = False  #: Depth is that of the file, or simulated with the map's ellipsoids
+    has_depth: bool = False  #: Use the depth of the file, or simulate it from the map's ellipsoids
 
     @property
     def name(self) -> str:
@@ -109,8 +109,8 @@ class Recording(NamedTuple):
         elif all(frame.depths is None for frame in found.frames):
             queries = _with_simulated_depth(queries, found, landmark_map)
         return Place(landmark_map, queries,
-                     [one.group for one in found.frames], [one.is_main for one in found.frames],
-                     self.every_frame)
+                     [frame.group for frame in found.frames],
+                     [frame.is_main for frame in found.frames], self.every_frame)
 
 
 class Simulated(NamedTuple):
@@ -134,11 +134,11 @@ class Simulated(NamedTuple):
 
 
 class Halved(NamedTuple):
-    """The map that one half of a recording's frames makes, chosen at random; the other queries."""
+    """A map from a random half of a recording's frames, with the other half as queries."""
 
     observations: Path
     seed: int
-    is_swapped: bool = False  #: The other half makes the map
+    is_swapped: bool = False  #: Whether the halves are swapped
     has_depth: bool = False
 
     @property
@@ -147,7 +147,7 @@ class Halved(NamedTuple):
         return self.observations.stem
 
     def load(self) -> Place:
-        """Return the place. Boxes of the queries have no similarities."""
+        """Return the place. The boxes of its queries have no similarities."""
         recorded = load_observations(self.observations)
         order = np.random.default_rng(self.seed).permutation(len(recorded))
         halves = [np.sort(half) for half in np.array_split(order, 2)]
@@ -164,15 +164,17 @@ class Halved(NamedTuple):
 
 
 def _without_depth(queries: Sequence[PosedQuery]) -> list[PosedQuery]:
-    return [replace(one, observation=replace(one.observation, depths=None)) for one in queries]
+    return [replace(query, observation=replace(query.observation, depths=None))
+            for query in queries]
 
 
 def _with_simulated_depth(queries: Sequence[PosedQuery], recorded: Queries,
                           landmark_map: LandmarkMap
                           ) -> tuple[PosedQuery, ...]:
-    """Return queries with depth of the landmarks that their boxes show."""
-    rows = np.array([landmark_map.landmark_ids.index(one) if one in landmark_map.landmark_ids
-                     else -1 for one in recorded.landmark_ids] + [-1])
+    """Return queries with simulated depths of the landmarks that their boxes show."""
+    ids = landmark_map.landmark_ids
+    rows = np.array([ids.index(landmark_id) if landmark_id in ids else -1
+                     for landmark_id in recorded.landmark_ids] + [-1])
     found = []
     for query, frame in zip(queries, recorded.frames, strict=True):
         shown = rows[frame.true_landmark]
@@ -188,43 +190,44 @@ AnyPlace = Recording | Simulated | Halved
 
 def add_arguments(parser: argparse.ArgumentParser, kinds: Sequence[str] = tuple(KINDS),
                   worlds: int = 0, first_seed: int = 0) -> None:
-    """Add the options that choose places, with defaults of a study; chosen_places reads them."""
+    """Add the options that choose places, with a study's defaults; chosen_places reads them."""
     parser.add_argument('--queries', type=Path, default=[], nargs='*', metavar='NPZ',
-                        help='recordings, in place of the worlds unless --worlds is given, too')
+                        help='recordings; they replace the worlds unless --worlds is given')
     parser.add_argument('--map', type=Path, default=[], nargs='*', metavar='YAML',
-                        help='one for all query files, or one for each')
+                        help='one map for all query files, or one for each')
     parser.add_argument('--observations', type=Path, default=[], nargs='*', metavar='NPZ',
-                        help='recordings without a map: random halves map, the others are '
-                        'queries, by classes')
+                        help='recordings without a map: random halves are mapped, the other '
+                        'halves are queries, by classes')
     parser.add_argument('--depth', action='store_true',
-                        help='of each box: that of the files, or else simulated')
+                        help='use the depth of the files, or simulate it')
     parser.add_argument('--cameras', type=positive_int, default=1, metavar='N',
-                        help='of the robot in worlds, in modes of one image (%(default)s)')
+                        help='cameras of the robot in worlds, in modes of one image (%(default)s)')
     parser.add_argument('--frames', choices=('main', 'all'), default='all')
     parser.add_argument('--worlds', type=int, metavar='N',
                         help=f'simulated worlds of each kind ({worlds})')
     parser.add_argument('--kinds', nargs='+', choices=KINDS, default=list(kinds), metavar='KIND',
-                        help=f'of worlds: {", ".join(KINDS)}')
+                        help=f'kinds of worlds: {", ".join(KINDS)}')
     parser.add_argument('--first-seed', type=int, default=first_seed, metavar='N',
-                        help='(%(default)s)')
+                        help='seed of the first world of a kind (%(default)s)')
     parser.add_argument('--workers', type=positive_int, default=1, metavar='N',
                         help='processes (%(default)s)')
     parser.set_defaults(default_worlds=worlds)
 
 
 def chosen_places(options: argparse.Namespace) -> list[AnyPlace]:
-    """Return the places that the command line chooses.
+    """Return the places that the options choose.
 
     Raises
     ------
     OptionsError
-        There are none, maps do not fit query files, or a number is below 0.
+        No place is chosen, the number of maps does not fit the query files, or a number is
+        negative.
     """
     worlds = options.worlds
     if worlds is None:
         worlds = 0 if options.queries or options.observations else options.default_worlds
     if worlds < 0 or options.first_seed < 0:
-        raise OptionsError('--worlds and --first-seed must not be below 0')
+        raise OptionsError('--worlds and --first-seed must not be negative')
     maps = options.map * len(options.queries) if len(options.map) == 1 else options.map
     if len(maps) != len(options.queries):
         raise OptionsError('give one map, or as many maps as query files in the same order')
@@ -242,7 +245,7 @@ def chosen_places(options: argparse.Namespace) -> list[AnyPlace]:
 
 
 def observation_of(recorded: PosedDetections, row: int, stamp_ns: int) -> Observation:
-    """Return a frame of a recording as an observation by class."""
+    """Return a frame of a recording as an observation without similarities."""
     boxes = slice(recorded.frame_offsets[row], recorded.frame_offsets[row + 1])
     odom = None if recorded.odom_from_camera is None else recorded.odom_from_camera[row]
     return Observation(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Searches over places, modes, matchings and troubles; robots that look again and again."""
+"""Searches over places, modes, matchings and troubles, and retries of a standing robot."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -27,12 +27,12 @@ from studies.reports import Answer, interval, judged
 
 #: More queries than any place has.
 MANY = 1_000_000
-#: Looks of one localizer before it can tell that its camera is wrong.
+#: Looks of one localizer before it can detect a wrong camera.
 EARLY_LOOKS = 5
 #: Looks of a robot that does not move.
 LOOKS = 20
 _PERIOD_NS = 100_000_000
-# What a detector does to the same view another time. Guesses.
+# Differences between two runs of a detector on images of the same view. Guesses.
 _MISSED_SHARE = 0.2
 _SHIFT_SHARE = 0.02  # of the box's sides, standard deviation
 _CHANGES = TROUBLES | PRIORS | FAMILIES
@@ -47,8 +47,8 @@ class Task(NamedTuple):
     trouble: str = 'none'
     level: float = 0.0
     seed: int = SEED  # of the sensors and of the trouble
-    most: int = MANY  # queries, evenly spread
-    in_order: bool = False  # all frames, by one localizer
+    most: int = MANY  # greatest number of queries, evenly spread
+    in_order: bool = False  # one localizer gets all frames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class Outcome(Answer):
     matching: str
     trouble: str
     level: float
-    looks: str = 'alone'  # or which of the looks of one localizer this is
+    looks: str = 'alone'  # or the part of one localizer's looks: 'first five' or 'later'
 
 
 def make_search() -> Callable[[Task], list[Outcome]]:
@@ -69,7 +69,7 @@ def make_search() -> Callable[[Task], list[Outcome]]:
 
 
 def search(task: Task) -> list[Outcome]:
-    """Return the outcomes of all queries of a place; none where its mode is impossible."""
+    """Return the outcomes of all queries of a place; none if it does not support the mode."""
     place = _loaded(task.place)
     if task.mode not in place.modes:
         return []
@@ -87,18 +87,18 @@ def search(task: Task) -> list[Outcome]:
         return [outcome(looks='first five' if number < EARLY_LOOKS else 'later', **fields)
                 for number, (fields, _) in enumerate(look_on(
                     Relocalizer(landmark_map, options), changed))]
-    return [outcome(accepted=one.accepted, confidence=one.confidence,
-                    error_m=inf if one.error_m is None else one.error_m,
-                    error_deg=inf if one.error_deg is None else one.error_deg,
-                    nees=inf if one.nees is None else one.nees)
-            for one in run_trial(landmark_map, Method(AUTO, options), 0, changed)]
+    return [outcome(accepted=result.accepted, confidence=result.confidence,
+                    error_m=inf if result.error_m is None else result.error_m,
+                    error_deg=inf if result.error_deg is None else result.error_deg,
+                    nees=inf if result.nees is None else result.nees)
+            for result in run_trial(landmark_map, Method(AUTO, options), 0, changed)]
 
 
 def look_on(relocalizer: Relocalizer, queries: Iterable[PosedQuery], is_one: bool = True
             ) -> Iterator[tuple[dict[str, Any], bool]]:
-    """Yield the fields of each answer, and whether the camera is called wrong by then.
+    """Yield the fields of each answer, and whether the localizer reports the camera as wrong.
 
-    One localizer gets all queries in order, without odometry; or each query gets a new one.
+    One localizer gets all queries in order, without odometry, or each query a new localizer.
     """
     localizer = Localizer(relocalizer)
     for query in queries:
@@ -115,7 +115,7 @@ def _loaded(place: AnyPlace) -> Place:
 
 def tasks_of(places: Sequence[AnyPlace], options: RelocalizerOptions,
              names: Sequence[str], seed: int = SEED) -> list[Task]:
-    """Return a task for each level of some troubles in each of their modes, at each place."""
+    """Return a task for each level, mode and place of the named troubles."""
     return [Task(place, mode, options, name, level, seed) for name in names
             for level in _CHANGES[name].levels for place in places
             for mode in _CHANGES[name].modes]
@@ -123,7 +123,7 @@ def tasks_of(places: Sequence[AnyPlace], options: RelocalizerOptions,
 
 @dataclass(frozen=True)
 class Retries:
-    """The looks of one robot, as arrays (LOOKS,): accepted without the others or after them."""
+    """The looks of one robot, as arrays (LOOKS,): accepted alone, or with the earlier looks."""
 
     alone: NDArray[np.bool_]
     accepted: NDArray[np.bool_]
@@ -131,7 +131,7 @@ class Retries:
 
     @property
     def first_error_m(self) -> float:
-        """Return the error of the first accepted pose, which ends the retries; NaN without."""
+        """Return the error of the first accepted pose, which ends the retries; NaN if none."""
         return float(self.errors_m[np.argmax(self.accepted)]) if self.accepted.any() else np.nan
 
 
@@ -154,7 +154,7 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], options: Rel
 
 
 def _flickering(observation: Observation, rng: np.random.Generator) -> Observation:
-    """Return an observation without some of its boxes; the others are shifted."""
+    """Return an observation with some boxes missing and the others shifted."""
     detections = observation.detections
     rows = np.nonzero(rng.random(len(detections)) > _MISSED_SHARE)[0]
     sides = np.tile(np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1)[:, 0], 2)

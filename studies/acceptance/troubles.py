@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated errors of map, detector, sensors, and of what a robot is told, applied to queries."""
+"""Simulated errors of map, detector, sensors and priors, applied to queries."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -24,18 +24,19 @@ from studies.worlds.world import make_world
 
 _BOX_SIDE_PX = (20.0, 200.0)
 _MOVED_M = (0.3, 3.0)
-# Of one thing under two classes: the share of its boxes that are doubled, by how much the edges of
-# both differ as a share of the sides, and how far apart its landmarks are [m].
+# For an object under two classes: the share of its boxes that are doubled, the difference between
+# the edges of both boxes as a share of the sides, and the distance between its landmarks [m].
 _SEEN_TWICE, _JITTER, _APART_M = 0.7, 0.02, 0.03
 _ELSEWHERE_M = np.array([1e3, 0.0, 0.0])
-# A wrong region is further from the truth than this, where the map is large enough [m].
+# Least distance of a wrong region from the truth if the map is large enough [m], and number of
+# draws.
 _WRONG_M, _TRIES = 2.5, 50
-# Of a region that the robot is told; deviations of x and y [m] and of the yaw [rad].
+# Probability of a given region; deviations of its x and y [m] and of its yaw [rad].
 _PROBABILITY = 0.9
 _REGION, _POSE = (1.0, 1.0, 10.0), (0.3, 0.3, np.radians(15.0))
 
 World = tuple[LandmarkMap, Sequence[PosedQuery]]
-#: A change of map and queries by a level, with a generator.
+#: A function that changes map and queries by a level, with a random generator.
 Change = Callable[[LandmarkMap, Sequence[PosedQuery], float, np.random.Generator], World]
 
 
@@ -47,7 +48,7 @@ def unchanged(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: f
 
 def exchange_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                        rng: np.random.Generator) -> World:
-    """Exchange the places of a share of the landmarks; all of them make another place."""
+    """Exchange the places of a share of the landmarks; a share of 1 makes another place."""
     count = len(landmark_map)
     chosen = rng.permutation(count)[:round(share * count)]
     centers = landmark_map.centers.copy()
@@ -76,17 +77,17 @@ def double_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], d
 
 def add_equal_room(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], gap_m: float,
                    rng: np.random.Generator) -> World:
-    """Add a room that equals the mapped one, beside it."""
+    """Add a copy of the mapped room beside it."""
     width = float(np.ptp(landmark_map.centers[:, 0]))
     return _with_copies(landmark_map, queries, np.array([width + gap_m, 0.0, 0.0]))
 
 
 def age_half(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
              rng: np.random.Generator) -> World:
-    """Let the map of one of two rooms side by side be out of date, for the queries in it.
+    """Make the map of one of two adjacent rooms out of date; keep the queries in one room.
 
-    Half of a share of its landmarks are elsewhere, the others are missing. A share below 0 is of
-    the other room's map.
+    Half of a share of the landmarks in the queries' room are elsewhere, the other half are
+    missing. A negative share applies to the other room.
     """
     middle = 0.5 * (landmark_map.centers[:, 0].min() + landmark_map.centers[:, 0].max())
     is_right = queries[int(rng.integers(len(queries)))].map_from_camera[0, 3] > middle
@@ -102,7 +103,7 @@ def age_half(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: fl
 
 def add_aged_twin(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], share: float,
                   rng: np.random.Generator) -> World:
-    """Add an equal room; then one of both changes, see age_half."""
+    """Add an equal room, then change one of the two, see age_half."""
     return age_half(*add_equal_room(landmark_map, queries, 2.0, rng), share, rng)
 
 
@@ -110,7 +111,7 @@ def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], 
                       rng: np.random.Generator) -> World:
     """Add landmarks of other classes at each landmark, and boxes of these classes at most boxes.
 
-    A detector that takes the same things for the same other classes makes such a map.
+    A detector that consistently confuses the same classes produces such a map.
     """
     names: list[str] = rng.permutation(sorted(set(landmark_map.class_ids))).tolist()
     steps = np.arange(1 + int(copies))
@@ -144,19 +145,19 @@ def confuse_landmarks(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], 
 
 def unmapped_desk(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: float,
                   rng: np.random.Generator) -> World:
-    """Let the robot stand at a desk that the map lacks: every pose is wrong. By classes."""
+    """Place the robot at a desk that the map lacks, so every pose is wrong. Matches by class."""
     desk = make_world('one desk', int(rng.integers(1 << 30)), groups=len(queries)).queries
-    shifted = [replace(one, map_from_camera=make_transform(
-        one.map_from_camera[:3, :3], one.map_from_camera[:3, 3] + _ELSEWHERE_M),
-        observation=by_classes(one.observation, len(landmark_map)))
-        for one in desk[::GROUP_SIZE]]
+    shifted = [replace(query, map_from_camera=make_transform(
+        query.map_from_camera[:3, :3], query.map_from_camera[:3, 3] + _ELSEWHERE_M),
+        observation=by_classes(query.observation, len(landmark_map)))
+        for query in desk[::GROUP_SIZE]]
     has_vertical = queries[0].observation.up_in_camera is not None
     return landmark_map, with_vertical(shifted, VERTICAL_DEG) if has_vertical else shifted
 
 
 def _distorted(change: Callable[[NDArray[np.float64], float, np.random.Generator],
                                 NDArray[np.float64]]) -> Change:
-    """Return a change of the landmarks' places (L, 3), relative to their mean, by a level."""
+    """Return a change of the landmarks' positions (L, 3), relative to their mean, by a level."""
     def changed(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], level: float,
                 rng: np.random.Generator) -> World:
         middle = landmark_map.centers.mean(axis=0)
@@ -183,7 +184,7 @@ def _half_turned(offsets: NDArray[np.float64], angle_deg: float, rng: np.random.
 
 def random_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], count: float,
                       rng: np.random.Generator) -> World:
-    """Replace the boxes of each query by random ones, each like a random landmark."""
+    """Replace the boxes of each query by random boxes, each of a random landmark's class."""
     def drawn(observation: Observation) -> Observation:
         corners = rng.uniform(0, (observation.camera.width, observation.camera.height),
                               (int(count), 2))
@@ -216,7 +217,7 @@ def of_rows(observation: Observation, rows: NDArray[np.int64]) -> Observation:
 
 
 def _with_columns(queries: Sequence[PosedQuery], columns: NDArray[np.int64]) -> list[PosedQuery]:
-    """Return queries with the similarities of some landmarks."""
+    """Return queries with only the similarities of some landmarks."""
     def chosen(observation: Observation) -> Observation:
         return observation if observation.similarities is None else replace(
             observation, similarities=np.ascontiguousarray(
@@ -229,7 +230,8 @@ def _with_copies(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
                  steps: NDArray[np.float64]) -> World:
     """Return a map with a copy of each landmark, steps (L, 3) or (3,) away."""
     rows = np.tile(np.arange(len(landmark_map)), 2)
-    ids = (*landmark_map.landmark_ids, *(f'{one}_copy' for one in landmark_map.landmark_ids))
+    ids = landmark_map.landmark_ids
+    ids = (*ids, *(f'{landmark_id}_copy' for landmark_id in ids))
     centers = np.concatenate([landmark_map.centers, landmark_map.centers + steps])
     return (replace(landmark_map.select(rows.tolist()), landmark_ids=ids, centers=centers),
             _with_columns(queries, rows))
@@ -237,7 +239,7 @@ def _with_copies(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
 
 def _told(landmark_map: LandmarkMap, query: PosedQuery, spot: NDArray[np.float64],
           deviations: Sequence[float], rng: np.random.Generator) -> PosedQuery:
-    """Return a query with a region around a spot (3,): x, y and yaw, with an error like that."""
+    """Return a query with a region near a spot (3,) of x, y, yaw; deviations give its error."""
     region = Region(landmark_map.frame_id, spot + rng.normal(size=3) * deviations,
                     np.diag(deviations) ** 2, _PROBABILITY)
     return replace(query, observation=replace(query.observation, region=region))
@@ -250,7 +252,7 @@ def _spot_of(map_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def tell(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], wrong: float,
          rng: np.random.Generator, deviations: Sequence[float]) -> World:
-    """Tell each query where it is; a share of them is told another spot of the map."""
+    """Give each query a region; for a share of them the region is at a wrong spot of the map."""
     low, high = landmark_map.centers[:, :2].min(axis=0), landmark_map.centers[:, :2].max(axis=0)
     found = []
     for query in queries:
@@ -266,9 +268,9 @@ def tell(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], wrong: float,
 
 def tell_twin(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], wrong: float,
               rng: np.random.Generator, deviations: Sequence[float] = ()) -> World:
-    """Keep the queries whose place has a twin; each is told, where there are deviations, the twin.
+    """Keep the queries whose place has a twin; with ``deviations``, give each a region there.
 
-    The worst case: the map cannot tell the two, and what is told is wrong.
+    This is the worst case: the map cannot distinguish the two places, and the region is wrong.
     """
     found = []
     for query in queries:
@@ -289,19 +291,19 @@ class Trouble(NamedTuple):
     change: Change
     levels: tuple[float, ...] = (0.0,)
     modes: tuple[str, ...] = (ONE, LEVEL, ALL)
-    kinds: tuple[str, ...] = ('room', 'office', 'shop')  #: Of worlds for it, see families
-    in_order: bool = False  #: Whether it concerns a camera, so that several looks may tell
+    kinds: tuple[str, ...] = ('room', 'office', 'shop')  #: Kinds of worlds, see families
+    in_order: bool = False  #: Whether it concerns a camera, so several looks may detect it
 
 
 def _of_sensor(change: wrong_sensors.Change, levels: tuple[float, ...], modes: tuple[str, ...],
                in_order: bool = False) -> Trouble:
-    """Return the trouble of a sensor that is wrong."""
+    """Return the trouble of a wrong sensor."""
     return Trouble(lambda landmark_map, queries, level, rng: (
         landmark_map, change(queries, level)), levels, modes, in_order=in_order)
 
 
 _of_depth = partial(_of_sensor, modes=(ONE, LEVEL))
-#: What is wrong, and the robot does not know.
+#: Errors that are unknown to the robot.
 TROUBLES = {
     'none': Trouble(unchanged, modes=(ONE, LEVEL, FIVE, ALL)),
     'share of the landmarks that have exchanged places': Trouble(exchange_landmarks,
@@ -321,8 +323,8 @@ TROUBLES = {
         wrong_sensors.scaled_odometry, (1.2, 0.8), (FIVE, ALL))}
 _BOTH = (ONE, VERTICAL)
 _of_camera = partial(_of_sensor, modes=_BOTH, in_order=True)
-#: Errors that many objects share, by their kind: A in the map of one thing, B in the input, C in
-#: the whole map.
+#: Errors that many objects share. Their names begin with their kind: A is an error in the map of
+#: one thing, B in the input, C in the whole map.
 FAMILIES = {
     'plain': Trouble(unchanged, (0.0,), _BOTH, (
         'room', 'office', 'shop', 'bare room', 'corridor', 'hall', 'two rooms')),
@@ -359,9 +361,9 @@ FAMILIES = {
         offsets[:, [1]] * [1.0, 0.0, 0.0])), (0.1,), _BOTH),
     'C half of the map moved by [m]': Trouble(_distorted(_half_moved), (0.5, 0.9), _BOTH),
     'C half of the map turned by [degrees]': Trouble(_distorted(_half_turned), (10.0,), _BOTH)}
-#: Classes alone accept too little in these to tell.
+#: Families in which matching by class accepts too few poses for a result.
 BY_LABELS = [name for name in FAMILIES if name.startswith('C')]
-#: What the robot is told, and the share of queries for which that is wrong.
+#: Priors of the pose, and the shares of queries for which they are wrong.
 PRIORS = {
     'nothing told': Trouble(unchanged),
     'region of 1 m': Trouble(partial(tell, deviations=_REGION), (0.0, 0.1, 1.0)),

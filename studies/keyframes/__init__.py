@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where objects and keyframes together are wrong: ``python -m studies.keyframes``."""
+"""Find cases where objects and keyframes together are wrong: ``python -m studies.keyframes``."""

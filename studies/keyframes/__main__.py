@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where objects and keyframes together are wrong: ``python -m studies.keyframes``.
+"""Find cases where objects and keyframes together are wrong: ``python -m studies.keyframes``.
 
 ``collect`` makes maps and layers of a part of each site, changes queries, map or layer, and stores
-what objects and keyframes say about each query. A run that was stopped goes on. ``judge`` decides
-about the stored records as the package does now, and prints what each way accepts. ``fit`` fits
-the sections keyframes and genuine of core/calibration.yaml to them, and prints what
-each room would accept by what the others fit.
+the results of objects and keyframes for each query. It continues after an interruption. ``judge``
+applies the current acceptance to the stored records, and prints the accepted poses of each way.
+``fit`` fits the sections keyframes and genuine of core/calibration.yaml to the records, and prints
+the accepted poses of each room with coefficients fitted to the other rooms.
 """
 
 import argparse
@@ -34,7 +34,7 @@ def _collect(options: argparse.Namespace) -> int:
     places = tuple(place for site in options.sites
                    for place in read_places(site, options.model))
     if len({place.site for place in places}) < 2:
-        raise OptionsError('--sites: images of other sites are needed: give two or more')
+        raise OptionsError('--sites: give two or more; each needs images of another site')
     chosen = [place for place in places if any(text in place.name for text in options.places)]
     names = [name for name in cases() if name.partition(':')[0] in options.families]
     work = partial(make_collect, options.out, places, options.queries)
@@ -52,7 +52,7 @@ def _stored(options: argparse.Namespace) -> list[Path]:
              if path.stem.partition(':')[0] in options.families
              and any(text.replace('/', '.') in path.parent.name for text in options.places)]
     if not paths:
-        raise OptionsError(f'{options.out}: no such records here; collect them first')
+        raise OptionsError(f'{options.out} has no such records: run collect first')
     return sorted(paths, key=lambda path: (order.index(path.stem), path.parent.name))
 
 
@@ -61,7 +61,7 @@ def _fit(options: argparse.Namespace) -> int:
         verdicts.make_rows, _stored(options), 'cases', options.workers)
     places, signs = ([row for rows in found for row in rows[part]] for part in range(2))
     if len({place.site for place in places}) < 2:
-        raise OptionsError(f'{options.out}: records of two rooms are needed; collect them first')
+        raise OptionsError(f'{options.out} needs records of two rooms: run collect first')
     for rows in (places, signs):
         print(answer_table(verdicts.left_out(rows), ['case']), end='\n\n')
     print('\n'.join([*verdicts.paste('keyframes', verdicts.POINTS, verdicts.fit(places)),
@@ -76,7 +76,8 @@ def _judge(options: argparse.Namespace) -> int:
         print(answer_table(found, [*by, 'way', 'truth'], refused=_refused), end='\n\n')
     if options.figure:
         draw_judged(options.figure, '', judged_by(
-            (one for one in found if one.confidence > 0.0 and not one.truth), 'way'))
+            (outcome for outcome in found if outcome.confidence > 0.0 and not outcome.truth),
+            'way'))
     return 0
 
 
@@ -92,32 +93,33 @@ def main() -> int:
     commands = parser.add_subparsers(required=True)
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument('--out', type=Path, default=Path('keyframes'), metavar='DIR',
-                        help='where the records are (%(default)s)')
+                        help='folder of the records (%(default)s)')
     common.add_argument('--families', nargs='+', default=_FAMILIES, choices=_FAMILIES,
-                        metavar='FAMILY', help=f'which cases: {", ".join(_FAMILIES)} (all)')
+                        metavar='FAMILY', help=f'families of cases: {", ".join(_FAMILIES)} (all)')
     common.add_argument('--places', nargs='+', default=[''], metavar='TEXT',
                         help='only places whose names contain one of these')
     common.add_argument('--workers', type=positive_int, default=1, metavar='N',
                         help='processes (%(default)s)')
-    collects = commands.add_parser('collect', parents=[common], help='store what is found')
+    collects = commands.add_parser('collect', parents=[common], help='store records of all cases')
     collects.set_defaults(command=_collect)
     collects.add_argument('--sites', nargs='+', required=True, metavar='DIR[@METRES]',
-                          help='RGB-D and TUM folders, the latter with the unit of their depth, '
-                               'and rooms of demo.world.make_keyframe_rooms')
+                          help='RGB-D folders, TUM folders with the unit of their depth, and '
+                               'rooms of demo.world.make_keyframe_rooms')
     collects.add_argument('--model', required=True, help='weights of YOLO for real images')
     collects.add_argument('--queries', type=positive_int, default=24, metavar='N',
-                          help='the most of each case but the plain one (%(default)s)')
-    fits = commands.add_parser('fit', parents=[common], help='fit the verdict, and print numbers')
+                          help='most queries of a case, except the plain case (%(default)s)')
+    fits = commands.add_parser('fit', parents=[common], help='fit and print the coefficients')
     fits.set_defaults(command=_fit)
-    judges = commands.add_parser('judge', parents=[common], help='decide, and print tables')
+    judges = commands.add_parser('judge', parents=[common], help='judge records, and print tables')
     judges.set_defaults(command=_judge)
     judges.add_argument('--ways', nargs='+', default=verdicts.WAYS, choices=verdicts.WAYS,
-                        metavar='WAY', help=f'what answers: {", ".join(verdicts.WAYS)} (all)')
+                        metavar='WAY', help=f'ways to localize: {", ".join(verdicts.WAYS)} (all)')
     judges.add_argument('--by', nargs='+', action='append',
                         choices=['site', 'place', 'family', 'case'],
-                        help='what a line of a table is about (a table by family, one by case)')
+                        help='columns that group the rows of a table (one table by family, one by '
+                             'case)')
     judges.add_argument('--figure', type=Path, metavar='FILE.png',
-                        help='draw the reliability of the confidence')
+                        help='file for a reliability diagram of the confidence')
     options = parser.parse_args()
     interrupt_on_sigterm()
     return run_command(lambda: options.command(options))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The cases: what happens to queries, map and layer, and where each query then is in the map."""
+"""The cases: changes of queries, map and layer, and the true poses of the changed queries."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,26 +24,27 @@ from cliploc_ros.offline.datasets.frames import RawFrame
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
-# A picture shows a place that looks another way; a second look is about 20 cm from the first.
+# A picture shows a mapped image whose viewing direction differs by more than 60 degrees. A second
+# look is about 20 cm from the first.
 _AWAY_COS = 0.5
 _SECOND_M, _SECOND_RANGE_M, _SECOND_DEG = 0.2, (0.1, 0.35), 25.0
 
 
 @dataclass(frozen=True)
 class Place:
-    """A part of a site that is mapped, and images of the rest: queries, and their second looks."""
+    """A mapped part of a site, and images of the remaining part: queries and second looks."""
 
     site: str
-    name: str  # begins with the site's
+    name: str  # begins with the name of the site
     model: str  # weights of YOLO
     mapped: tuple[RawFrame, ...]
     asked: tuple[RawFrame, ...]
     seconds: tuple[RawFrame, ...]
-    map_file: Path | None = None  # None: the map is built of the mapped images
+    map_file: Path | None = None  # None: the map is built from the mapped images
 
 
 class World(NamedTuple):
-    """A map, its layer, and where else in the map a query may be said to be, as a shift [m]."""
+    """A map, its layer, and the shift (3,) to the other place where a query also fits [m]."""
 
     landmark_map: LandmarkMap
     layer: KeyframeLayer
@@ -52,24 +53,24 @@ class World(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """What differs from a plain query."""
+    """The differences from a plain query."""
 
     image: str = ''  # name of a change of the image
     picture: tuple[str, float] | None = None  # of the mapped place: kind, share of the image
-    looks: int = 1  # 2: the robot looks once more from 20 cm aside
+    looks: int = 1  # 2: the robot looks once more from 20 cm to the side
     is_strange: bool = False  # the image is of another site: every accepted pose is false
-    focal: float = 1.0  # the robot takes the focal length for this many times the true one
+    focal: float = 1.0  # factor of the focal length that the robot assumes
     features: int = 3000
-    draws_classes: bool = False  # the class of each box is drawn again
-    prior: str = ''  # known wrongly: 'height' (1 to 3 m too high) or 'vertical' (by 30 degrees)
+    draws_classes: bool = False  # the class of each box is drawn at random
+    prior: str = ''  # a wrong prior: 'height' (1 to 3 m too high) or 'vertical' (by 30 degrees)
     world: Callable[[World, Rng], World] | None = None  # changes map and layer
-    truths: tuple[int, ...] = (0,)  # where the query is, in shifts of the world: the first counts
+    truths: tuple[int, ...] = (0,)  # positions of the query, in shifts of the world: first counts
 
 
 class Query(NamedTuple):
-    """Images of one robot, the oldest first, and its true poses at the last one; none elsewhere.
+    """Images of one robot, oldest first, and its true poses at the last; none at another site.
 
-    Each image comes with the camera as the robot believes it, and odom_from_camera or None.
+    Each image comes with the camera that the robot assumes, and odom_from_camera or None.
     """
 
     shots: list[tuple[Image, Camera, Floats | None]]
@@ -79,7 +80,7 @@ class Query(NamedTuple):
 
 
 def _light_unevenly(image: Image, rng: Rng) -> Floats:
-    """Let the light fall from 1.6 times as much to a fifth, across the image."""
+    """Vary the light linearly across the image, from a factor of 1.6 to 0.2."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     y, x = np.mgrid[-1.0:1.0:image.shape[0] * 1j, -1.0:1.0:image.shape[1] * 1j]
     along = (x * np.cos(angle) + y * np.sin(angle)) / np.sqrt(2.0)
@@ -87,7 +88,7 @@ def _light_unevenly(image: Image, rng: Rng) -> Floats:
 
 
 def _cover(image: Image, share: float, other: Image | None, rng: Rng) -> Image:
-    """Cover a share from one side: in grey, or with another image."""
+    """Cover a share of the image from one side, in grey or with another image."""
     height, width = image.shape[:2]
     rows, columns = round(share * height), round(share * width)
     sides = np.s_[:, :columns], np.s_[:, width - columns:], np.s_[:rows], np.s_[height - rows:]
@@ -97,7 +98,7 @@ def _cover(image: Image, share: float, other: Image | None, rng: Rng) -> Image:
     return covered
 
 
-#: Changes of an image, by name: of the image, another site's image, and a generator.
+#: Changes of an image, by name: functions of the image, another site's image, and a generator.
 IMAGE_CHANGES: dict[str, Callable[[Image, Image, Rng], Any]] = {
     'dark and noisy': lambda image, _, rng: image * 0.25 + rng.normal(0.0, 6.0, image.shape),
     'blurred': lambda image, *_: cv2.GaussianBlur(image, (0, 0), 2.5),
@@ -109,7 +110,7 @@ IMAGE_CHANGES: dict[str, Callable[[Image, Image, Rng], Any]] = {
 
 
 class Picture(NamedTuple):
-    """A rectangle in front of a camera: a corner, the ways to the next ones (3,) [m], an image."""
+    """A textured rectangle in front of a camera: a corner (3,) and two edge vectors (3,) [m]."""
 
     corner: Floats
     right: Floats
@@ -119,10 +120,10 @@ class Picture(NamedTuple):
 
 def make_picture(kind: str, share: float, camera: Camera, source: Image, source_camera: Camera,
                  rng: Rng) -> Picture:
-    """Return a picture that takes a share of a camera's image.
+    """Return a picture that covers a share of a camera's image.
 
-    A 'crop' is like a window: each ray shows what the source's camera has on it. 'shrunk' is the
-    whole source, 'warped' too, but seen from the side by 30 to 60 degrees.
+    A 'crop' is like a window: each pixel shows the same ray as in the source's camera. 'shrunk'
+    is the complete source image; 'warped' is the same, seen from the side by 30 to 60 degrees.
     """
     size = np.array([source_camera.width, source_camera.height])
     depth, angle = rng.uniform(1.5, 2.5), rng.uniform(30.0, 60.0) * rng.choice([-1.0, 1.0])
@@ -141,7 +142,7 @@ def make_picture(kind: str, share: float, camera: Camera, source: Image, source_
     across, down = turn.apply([1.0, 0.0, 0.0]), np.array([0.0, size[1] / size[0], 0.0])
     coarse = replace(camera, width=camera.width // 8, height=camera.height // 8,
                      fx=camera.fx / 8, fy=camera.fy / 8, cx=camera.cx / 8, cy=camera.cy / 8)
-    for _ in range(12):  # until it takes its share
+    for _ in range(12):  # until it covers its share
         picture = Picture(np.array([0.0, 0.0, depth]) - 0.5 * (across + down), across, down,
                           np.asarray(texture, dtype=np.uint8))
         covered = float(_places_on(picture, coarse, np.eye(4))[0].mean())
@@ -151,7 +152,7 @@ def make_picture(kind: str, share: float, camera: Camera, source: Image, source_
 
 
 def hang(image: Image, picture: Picture, camera: Camera, first_from_camera: Floats) -> Image:
-    """Return an image with a picture, seen by a camera (4, 4) that has moved since it was hung."""
+    """Draw a picture into an image of a camera that has moved by first_from_camera (4, 4)."""
     inside, places = _places_on(picture, camera, first_from_camera)
     pixels = (places * (np.array(picture.texture.shape[1::-1]) - 1)).astype(np.float32)
     shown = cv2.remap(picture.texture, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR)
@@ -160,29 +161,29 @@ def hang(image: Image, picture: Picture, camera: Camera, first_from_camera: Floa
 
 def _places_on(picture: Picture, camera: Camera, first_from_camera: Floats
                ) -> tuple[NDArray[np.bool_], Floats]:
-    """Return which pixels (h, w) show the picture, and where on it (h, w, 2): 0 to 1."""
+    """Return a mask (h, w) of pixels that show the picture, and places on it (h, w, 2), 0 to 1."""
     rays = _rays(camera) @ first_from_camera[:3, :3].T
     begin = first_from_camera[:3, 3] - picture.corner
     normal = np.cross(picture.right, picture.down)
     with np.errstate(divide='ignore', invalid='ignore'):
         distances = -(begin @ normal) / (rays @ normal)
         points = begin + distances[..., None] * rays
-        places = np.stack([points @ one / (one @ one) for one in (picture.right, picture.down)],
-                          axis=-1)
+        places = np.stack([points @ edge / (edge @ edge)
+                           for edge in (picture.right, picture.down)], axis=-1)
         inside = (distances > 0.0) & ((places >= 0.0) & (places <= 1.0)).all(axis=-1)
     return inside, np.where(inside[..., None], places, 0.0)
 
 
 @lru_cache(maxsize=8)
 def _rays(camera: Camera) -> Floats:
-    """Return the direction (h, w, 3) of each pixel; NaN where the lens shows nothing."""
+    """Return the ray (h, w, 3) of each pixel; NaN outside the lens's field of view."""
     rows, columns = np.mgrid[:camera.height, :camera.width]
     points = camera.normalize_points(np.stack([columns, rows], axis=-1).reshape(-1, 2))
     return np.column_stack([points, np.ones(len(points))]).reshape(*rows.shape, 3)
 
 
 def mirrored_map(world: World, rng: Rng) -> World:
-    """Mirror the landmarks about an upright plane through their middle; keyframes stay."""
+    """Mirror the landmarks about a vertical plane through their mean; keyframes stay."""
     landmarks, normal = world.landmark_map, _level_direction(rng)
     mirror = np.eye(3) - 2.0 * np.outer(normal, normal)
     middle = landmarks.centers.mean(axis=0)
@@ -193,7 +194,7 @@ def mirrored_map(world: World, rng: Rng) -> World:
 
 
 def moved_half(metres: float, world: World, rng: Rng) -> World:
-    """Move all on one side of an upright plane through the room, on the level."""
+    """Move everything on one side of a vertical plane through the room, horizontally."""
     landmarks, layer = world.landmark_map, world.layer
     points = [layer.points_in_map(row) for row in range(len(layer))]
     middle = np.median(np.concatenate(points), axis=0)
@@ -209,9 +210,9 @@ def moved_half(metres: float, world: World, rng: Rng) -> World:
 
 
 def twin(share: float, removed: int, world: World, rng: Rng) -> World:
-    """Add a room 20 m away that looks the same, without some of the objects.
+    """Add a room 20 m away that looks the same, with some objects removed.
 
-    The layer has this share of the second room's keyframes: the first ones of its recording.
+    The layer has this share of the second room's keyframes, from the start of its recording.
     """
     landmarks, layer, shift = world.landmark_map, world.layer, np.array([20.0, 0.0, 0.0])
     kept = rng.permutation(len(landmarks))[:max(1, len(landmarks) - removed)]
@@ -226,7 +227,7 @@ def twin(share: float, removed: int, world: World, rng: Rng) -> World:
     return World(
         LandmarkMap(
             landmarks.frame_id,
-            landmarks.landmark_ids + tuple(f'{one}_twin' for one in second.landmark_ids),
+            landmarks.landmark_ids + tuple(f'{name}_twin' for name in second.landmark_ids),
             landmarks.labels + second.labels, landmarks.class_ids + second.class_ids,
             np.concatenate([landmarks.centers, second.centers + shift]),
             np.concatenate([landmarks.semi_axes, second.semi_axes]),
@@ -269,14 +270,14 @@ def cases() -> dict[str, Case]:
 
 def make_query(case: Case, place: Place, others: Sequence[Place], frame: RawFrame,
                shift_m: Floats, rng: Rng) -> Query | None:
-    """Return a query of a frame of a place; None where there is no second look.
+    """Return a query from a frame of a place; None if there is no second look.
 
-    The others are of other sites. The shift is that of the changed world.
+    ``others`` are places of other sites. ``shift_m`` is that of the changed world.
     """
     other = others[int(rng.integers(len(others)))]
     strange = other.asked[int(rng.integers(len(other.asked)))]
-    # A mapped image that looks another way, by more than 60 degrees or else the most.
-    cosines = np.array([pose_of(one)[:3, 2] for one in place.mapped]) @ pose_of(frame)[:3, 2]
+    # A mapped image whose direction differs by more than 60 degrees, or else differs most.
+    cosines = np.array([pose_of(mapped)[:3, 2] for mapped in place.mapped]) @ pose_of(frame)[:3, 2]
     away = np.nonzero(cosines < _AWAY_COS)[0]
     source = place.mapped[int(rng.choice(away)) if len(away) else int(np.argmin(cosines))]
     if case.is_strange:
@@ -284,19 +285,19 @@ def make_query(case: Case, place: Place, others: Sequence[Place], frame: RawFram
     frames = [frame, *_second_look(frame, place.seconds)][:case.looks]
     if len(frames) < case.looks:
         return None
-    poses = [pose_of(one) for one in frames]
+    poses = [pose_of(raw) for raw in frames]
     picture = case.picture and make_picture(*case.picture, frame.color()[1], *source.color(), rng)
     shots: list[tuple[Image, Camera, Floats | None]] = []
-    # `odom_from_camera` of one or two poses, with the error that the package expects.
-    # Poses of files are rounded, so their rotations are made exact.
+    # `odom_from_camera` of one or two poses, with the errors that the package assumes.
+    # Poses in files are rounded, so their rotations are orthonormalized.
     exact = [make_transform(Rotation.from_matrix(pose[:3, :3]).as_matrix(), pose[:3, 3])
              for pose in poses]
     steps = [invert_transform(exact[0]) @ pose for pose in exact]
     errors = [odometry_deviations(step) * rng.normal(size=6) for step in steps]
     odometry = [step @ make_transform(Rotation.from_rotvec(error[3:]).as_matrix(), error[:3])
                 for step, error in zip(steps, errors, strict=True)]
-    for one, pose, odom in zip(frames, poses, odometry, strict=True):
-        image, camera = one.color()
+    for raw, pose, odom in zip(frames, poses, odometry, strict=True):
+        image, camera = raw.color()
         if picture is not None:
             image = hang(image, picture, camera, invert_transform(poses[0]) @ pose)
         if case.image:
@@ -321,7 +322,7 @@ def pose_of(frame: RawFrame) -> Floats:
 
 
 def _second_look(frame: RawFrame, others: Sequence[RawFrame]) -> list[RawFrame]:
-    """Return the image whose distance is nearest to 20 cm; none where all look another way."""
+    """Return the image at about 20 cm in a similar direction; none if there is no such image."""
     found = [(abs(distance - _SECOND_M), row) for row, other in enumerate(others)
              for distance, angle in [pose_error(pose_of(frame), pose_of(other))]
              if _SECOND_RANGE_M[0] <= distance <= _SECOND_RANGE_M[1] and angle < _SECOND_DEG]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Map places, and collect what objects and keyframes say about each query, without a verdict."""
+"""Map places, and collect the results of objects and keyframes for each query, without verdict."""
 
 import pickle
 import zlib
@@ -51,22 +51,22 @@ from studies.keyframes.cases import (
 )
 from studies.rooms.rooms import Looker, frames_of_raws, keep, open_folder, posed
 
-# Of a rendered room: what is mapped, what is asked, and where second looks come from.
+# Walks of a rendered room: for the map, for the queries, and for second looks.
 _ROOM_WALKS = (('mapping', 'viewpoints', 'viewpoints_aside'),
                ('mapping', 'other_light', 'other_light_aside'),
                ('one_side', 'other_side', 'other_side'))
 
 
 class Seen(NamedTuple):
-    """What is known of one image: the search of its objects, and what keyframes say."""
+    """The results of one image: the search of its objects, and the recognition by keyframes."""
 
     searched: SearchedFrame
-    seen: tuple[Recognition, Recognition]  #: In the fast pass and in the thorough one
+    seen: tuple[Recognition, Recognition]  #: In the fast pass and in the thorough pass
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What a verdict about one query needs: its looks, the oldest first; truths as of Query."""
+    """The input of a verdict on one query: its looks, oldest first, and truths as in Query."""
 
     number: int
     looks: tuple[Seen, ...]
@@ -89,7 +89,7 @@ _NO_IMAGE = np.empty((0, 0, 3), dtype=np.uint8)
 
 
 class StoredRecognizer(ImageRecognizer):
-    """Says of an image again what keyframes said when it was collected."""
+    """Returns the stored recognition of an image."""
 
     def __init__(self, seen: tuple[Recognition, Recognition], keyframes: KeyframeLocalizer,
                  camera: Camera, may_be_thorough: bool) -> None:
@@ -99,7 +99,7 @@ class StoredRecognizer(ImageRecognizer):
 
     def recognize(self, guesses: Sequence[Floats], constraint: Constraint = NOTHING_KNOWN
                   ) -> Recognition:
-        """Return what was stored."""
+        """Return the stored recognition of the current pass."""
         self._known = set(), self._seen[self._fast is not None]
         return self._known[1]
 
@@ -107,7 +107,7 @@ class StoredRecognizer(ImageRecognizer):
 def localize(landmark_map: LandmarkMap, options: RelocalizerOptions,
              frames: Sequence[SearchedFrame],
              recognizers: Sequence[ImageRecognizer | None]) -> Relocalization:
-    """Return the answer at the last look of a robot that looked before, too."""
+    """Return the answer at the last look, given the earlier looks."""
     relocalizer, looks = Relocalizer(landmark_map, options), Looks()
     for count, (frame, recognizer) in enumerate(zip(frames, recognizers, strict=True), start=1):
         found = relocalizer.look_again(relocalizer.locate(
@@ -120,15 +120,15 @@ def localize(landmark_map: LandmarkMap, options: RelocalizerOptions,
 
 def make_collect(out: Path, places: Sequence[Place], queries: int
                  ) -> Callable[[tuple[Place, str]], None]:
-    """Return what collects the records of a case at a place, or builds the place: without one.
+    """Return a function that collects the records of a case at a place; '' only builds the place.
 
-    All images are asked in the plain case, in the others at most a number of queries.
+    The plain case uses all images, other cases at most ``queries``.
     """
     import torch
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    lookers = {one.model: Looker(out / 'looks', one.model) for one in places}
+    lookers = {place.model: Looker(out / 'looks', place.model) for place in places}
 
     def collect(task: tuple[Place, str]) -> None:
         place, name = task
@@ -141,10 +141,10 @@ def make_collect(out: Path, places: Sequence[Place], queries: int
             world = case.world(world, np.random.default_rng(key))
         path = out / 'cases' / place.name.replace('/', '.') / f'{name}.pickle'
         stored = pickle.loads(path.read_bytes()).records if path.exists() else ()
-        records = {one.number: one for one in stored}
-        others = {one.site: one for one in places if one.site != place.site}
+        records = {record.number: record for record in stored}
+        others = {other.site: other for other in places if other.site != place.site}
         localizer = KeyframeLocalizer(world.layer)
-        # more queries include those of a run with fewer
+        # a run with more queries includes those of a run with fewer
         order = np.random.default_rng(0).permutation(len(place.asked)).tolist()
         for number in order if case == Case() else order[:queries]:
             rng = np.random.default_rng([key, number])
@@ -161,7 +161,7 @@ def make_collect(out: Path, places: Sequence[Place], queries: int
 
 
 def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, KeyframeLayer]:
-    """Return map and layer of a place; the first time, they are made and kept."""
+    """Return map and layer of a place; build and store them the first time."""
     path = folder / f'{place.name.replace("/", ".")}.pickle'
     if not path.exists():
         frames = frames_of_raws(Path(place.name), place.mapped)
@@ -177,21 +177,21 @@ def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, Key
 
 
 class _Features(ImageFeatures):
-    """The strongest features of an image, up to a number; kept from run to run."""
+    """The strongest features of an image, up to a number; stored for later runs."""
 
     def __init__(self, image: Image, camera: Camera, looker: Looker, most: int) -> None:
         super().__init__(lambda: image, camera)
         self._looker, self._most = looker, most
 
     def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
-        """Return the features of a pass; finding them took no time that counts."""
+        """Return the features of a pass, with a time of 0."""
         found = self._looker.features(self._read_rgb(), is_thorough)
         return Features(*(column[:self._most] for column in vars(found).values())), 0.0
 
 
 def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,
          localizer: KeyframeLocalizer, looker: Looker, rng: Rng) -> Record:
-    # by classes alone: CLIP's weights are no part of this study
+    # match by class only, since CLIP is not part of this study
     options = RelocalizerOptions(matching='class', height_range_m=query.height_range_m)
     relocalizer, looks = Relocalizer(landmark_map, options), list[Seen]()
     for second, (image, camera, odom) in enumerate(query.shots):
@@ -218,8 +218,8 @@ def read_places(where: str, model: str) -> Iterator[Place]:
     Parameters
     ----------
     where : str
-        A folder that make_keyframe_rooms made; a TUM folder with a map.yaml, which is mapped
-        without depth; or an RGB-D folder. ``DIR@METRES`` gives a TUM folder's unit of depth.
+        A folder from make_keyframe_rooms; a TUM folder with a map.yaml, which is mapped without
+        depth; or an RGB-D folder. ``DIR@METRES`` gives a TUM folder's unit of depth.
     model : str
         Weights of YOLO for real images.
     """

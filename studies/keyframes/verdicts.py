@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Judge stored records by the package's verdict, and fit what it says of keyframes.
+"""Judge stored records by the package's verdict, and fit its coefficients for keyframes.
 
-What points of keyframes say, and the signs of pictures, are logistic models, fitted by maximum
-likelihood. First the odds of a place by its points, against a place by chance: images as they are,
-or darker, blurred and covered, and other rooms. Then the signs that a place is there, in all
-records, given what the verdict says without them.
+Two logistic models are fitted by maximum likelihood. The first gives the odds of a place from its
+points, against a match by chance. It is fitted to images as they are, to darker, blurred and
+covered ones, and to other rooms. The second gives the odds that a place is genuine and not a
+picture of it, from the signs in all records, given the verdict without them.
 
-Robots see places far more often than pictures of them, so untroubled images weigh more than there
-are. Their weight is a choice: so large that no more pictures, moved halves and wrong cameras are
-accepted than before the thorough pass; of the pictures on up to 30 % of the image, fewer than one
-of a hundred, in rooms that did not fit.
+Robots see places far more often than pictures of them, so untroubled images have a greater weight.
+This weight was chosen as large as possible without accepting more pictures, moved halves and wrong
+cameras than before the thorough pass was introduced. Of the pictures on up to 30 % of the image,
+fewer than 1 % are accepted in rooms outside the fit.
 """
 
 import pickle
@@ -37,22 +37,23 @@ from studies.rooms.rooms import without_boxes
 
 Floats = NDArray[np.float64]
 
-#: The families in which a wrong place is wrong by chance.
+#: The families in which wrong places match by chance.
 BY_CHANCE = ('plain', 'image', 'other room', 'classes', 'features')
-#: The terms that are fitted, as calibration.yaml calls them.
+#: Names in calibration.yaml of the fitted terms.
 POINTS = ('none', 'inliers', 'confirmed', 'explained', 'unexplained')
 GENUINE = ('none', *Signs._fields)
 _UNTROUBLED = ('plain', 'image', 'classes', 'features')
 _WEIGHT = 5.5
-# Deviations of the Gaussian prior of all coefficients but the first, for signs of deviation 1.
+# Standard deviation of the Gaussian prior of all coefficients but the first, for predictors with a
+# standard deviation of 1.
 _PRIOR = 3.0
-#: What answers; fast: both, without the thorough search of keyframes.
+#: Ways to localize; fast: both, without the thorough search of keyframes.
 WAYS = ('objects', 'keyframes', 'both', 'fast')
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome(Answer):
-    """One way's answer to a query, by one of its true poses."""
+    """The answer of one way to a query, compared with one of its true poses."""
 
     site: str
     place: str
@@ -60,7 +61,7 @@ class Outcome(Answer):
     case: str
     number: int
     way: str
-    truth: int = 0  #: Which of the true poses: 1 is that by a moved half
+    truth: int = 0  #: Number of the true pose: 1 is the pose relative to a moved half
     refusal: str
 
 
@@ -69,7 +70,7 @@ def decide(case: StoredCase, record: Record, way: str) -> Relocalization:
     searched, keyframes = [look.searched for look in record.looks], _keyframes(case)
     if way == 'keyframes':
         relocalizer = Relocalizer(case.landmark_map, record.options)
-        searched = [relocalizer.search(without_boxes(one.observation)) for one in searched]
+        searched = [relocalizer.search(without_boxes(look.observation)) for look in searched]
     return localize(case.landmark_map, record.options, searched, [
         None if way == 'objects' else StoredRecognizer(
             look.seen, keyframes, look.searched.observation.camera, may_be_thorough=way != 'fast')
@@ -82,7 +83,7 @@ def _keyframes(case: StoredCase) -> KeyframeLocalizer:
 
 
 def make_judge(ways: Sequence[str] = WAYS) -> Callable[[Path], list[Outcome]]:
-    """Return what judges the records of a file in some ways."""
+    """Return a function that judges the records of a file in the given ways."""
     def judge(path: Path) -> list[Outcome]:
         case: StoredCase = pickle.loads(path.read_bytes())
         return [outcome for record in case.records for way in ways
@@ -102,7 +103,7 @@ def _outcomes(case: StoredCase, record: Record, way: str) -> list[Outcome]:
 
 @dataclass(frozen=True, kw_only=True)
 class Row(Answer):
-    """A place: predictors with a leading 1, and the most that its chance can be."""
+    """A row of a fit: predictors with a leading 1, and the greatest possible chance."""
 
     site: str
     family: str
@@ -117,13 +118,13 @@ def place_rows(case: StoredCase) -> list[Row]:
     for record in case.records:
         look = record.looks[-1]
         joined = join_frames(case.landmark_map, record.options, [look.searched])
-        places = [one for seen in look.seen for one in seen.places]
-        for place, one in zip(places, contenders_of(joined, [
+        places = [place for seen in look.seen for place in seen.places]
+        for place, contender in zip(places, contenders_of(joined, [
                 unrefined(place.map_from_camera) for place in places], [True] * len(places)),
                 strict=True):
             rows.append(_row(case, record, place.map_from_camera, [
                 np.log(counted_points(place)), place.confirmed,
-                min(most, one.support.inliers), min(most, one.support.unexplained)]))
+                min(most, contender.support.inliers), min(most, contender.support.unexplained)]))
     return rows
 
 
@@ -148,7 +149,7 @@ def _row(case: StoredCase, record: Record, pose: Floats, predictors: Sequence[fl
 
 
 def make_rows() -> Callable[[Path], list[tuple[list[Row], list[Row]]]]:
-    """Return what reads the rows of a file: of places by chance, and of signs."""
+    """Return a function that reads the rows of a file: of places by chance, and of signs."""
     def rows(path: Path) -> list[tuple[list[Row], list[Row]]]:
         case: StoredCase = pickle.loads(path.read_bytes())
         by_chance = case.name.partition(':')[0] in BY_CHANCE
@@ -157,7 +158,7 @@ def make_rows() -> Callable[[Path], list[tuple[list[Row], list[Row]]]]:
 
 
 def fit(rows: Sequence[Row]) -> Floats:
-    """Return the coefficients of a logistic model whose chance counts below each row's ceiling."""
+    """Return the coefficients of a logistic model with a ceiling of each row's chance."""
     predictors = np.array([row.predictors for row in rows])
     return fit_logistic(
         predictors, np.array([row.right for row in rows]),
@@ -167,16 +168,16 @@ def fit(rows: Sequence[Row]) -> Floats:
 
 
 def left_out(rows: Sequence[Row]) -> list[Row]:
-    """Return rows, accepted by the coefficients that the other sites fit."""
+    """Return the rows as judged by coefficients that are fitted to the other sites."""
     others = {site: fit([row for row in rows if row.site != site])
               for site in {row.site for row in rows}}
     chances = [float(row.ceiling * chance(row.predictors, others[row.site])) for row in rows]
-    return [replace(row, confidence=its, accepted=its >= RelocalizerOptions().min_confidence)
-            for row, its in zip(rows, chances, strict=True)]
+    return [replace(row, confidence=likely, accepted=likely >= RelocalizerOptions().min_confidence)
+            for row, likely in zip(rows, chances, strict=True)]
 
 
 def paste(section: str, names: Sequence[str], coefficients: Floats) -> Iterator[str]:
-    """Yield what calibration.yaml is to say."""
+    """Yield the lines of a section of calibration.yaml."""
     yield f'{section}:'
     for name, value in zip(names, coefficients, strict=True):
         yield f'    {name}: {value:.3g}'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A part of a room is mapped; the rest of it and other rooms are asked, in several ways."""
+"""Map a part of a room, and localize images of the other part and of other rooms in it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -34,13 +34,13 @@ from studies.rooms.rooms import (
 if TYPE_CHECKING:
     from studies.rooms.baseline import SiftMap
 
-#: What answers.
+#: Ways to localize.
 WAYS = OBJECTS, KEYFRAMES, BOTH, BASELINE = 'objects', 'keyframes', 'both', 'baseline'
-#: What is known besides the image. Keyframes do not use depth.
+#: Input besides the image. Keyframes do not use depth.
 KNOWN = NOTHING, VERTICAL, DEPTH, ALL = '-', 'vertical', 'depth', 'vertical, depth'
-# Numbers of boxes that are counted together, from each on.
+# Lower bounds of the bins of the number of boxes.
 _BOXES = (0, 3, 4, 5, 7)
-# A failure by objects is one beyond this error, and is blamed on something [m].
+# An object-based pose with a greater error is a failure, and its cause is determined [m].
 _FAILED_M = 0.5
 
 
@@ -53,11 +53,11 @@ class Task(NamedTuple):
 
 
 class AskOptions(NamedTuple):
-    """How many images to ask of a map at most, and how."""
+    """Greatest numbers of queries of a map, and their input."""
 
-    images: int  # of the rest of the room
-    elsewhere: int  # of each other room
-    known: Sequence[str]  # in turn
+    images: int  # from the other part of the room
+    elsewhere: int  # from each other room
+    known: Sequence[str]  # each query is repeated with each of these
     with_baseline: bool
 
 
@@ -69,14 +69,14 @@ class Outcome(Answer):
     kind: str
     part: str
     asked: str  #: The room of the image
-    number: int  #: Of the image in its room
+    number: int  #: Number of the image in its room
     way: str
     known: str
     source: str
     reason: str
     boxes: int
     inliers: int
-    cause: str = ''  #: What the failure of objects is blamed on
+    cause: str = ''  #: Cause of the failure of objects
 
     @property
     def is_here(self) -> bool:
@@ -85,13 +85,13 @@ class Outcome(Answer):
 
     @property
     def boxes_from(self) -> int:
-        """Return the least number of boxes of those that are counted with this one."""
-        return max(one for one in _BOXES if one <= self.boxes)
+        """Return the lower bound of the bin of the number of boxes."""
+        return max(bound for bound in _BOXES if bound <= self.boxes)
 
 
 @dataclass(frozen=True)
 class Answers:
-    """All outcomes of a part, and what it was mapped to."""
+    """All outcomes of a part, and the size of its map."""
 
     task: Task
     landmarks: int = 0
@@ -102,7 +102,7 @@ class Answers:
 
 def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
              ) -> Callable[[Task], list[Answers]]:
-    """Return the function that maps a part and asks its map, for a worker."""
+    """Return the function that maps a part and localizes queries in its map, for a worker."""
     cv2.setNumThreads(1)
 
     @lru_cache
@@ -125,7 +125,7 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
         asking = room.by_robot if task.kind == ROBOT else room
         if len(asked) > options.images:  # evenly spread over the time
             asked = asked[np.linspace(0, len(asked) - 1, options.images).astype(np.int64)]
-        found = [one for row in asked for one in _ask_here(
+        found = [outcome for row in asked for outcome in _ask_here(
             task, options.known, asking, landmark_map, keyframes, baseline, asking.queries[row])]
         rng = np.random.default_rng(len(task.part))
         for other in rooms().values():

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What anybody can build in an afternoon: RootSIFT, tracks at the known poses, PnP of pycolmap.
+"""A simple baseline: RootSIFT, tracks at the known poses, PnP of pycolmap.
 
-RootSIFT (Lowe 2004; Arandjelovic and Zisserman 2012) of all map images, matched pair by pair; the
-tracks of the matches are triangulated with the known poses; an image is matched with all map
-images, and LO-RANSAC (Chum et al. 2003) of pycolmap finds its pose and refines it.
+The RootSIFT features (Lowe 2004; Arandjelovic and Zisserman 2012) of all map images are matched
+pair by pair, and the tracks of the matches are triangulated with the known poses. An image is
+matched with all map images; LO-RANSAC (Chum et al. 2003) of pycolmap finds and refines its pose.
 """
 
 from collections.abc import Iterable
@@ -25,16 +25,16 @@ from cliploc_ros.offline.datasets.frames import PosedImage
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 _FEATURES, _CONTRAST = 1500, 0.02
-# Images that look in directions further apart show no common points.
+# Images whose viewing directions differ by more have no common points.
 _MOST_DEG = 70.0
-# Rays of a match, and those of a track, pass their point this near [px at f = 525 px]; the widest
-# angle between two rays of a track is at least this.
+# Greatest distance of a ray of a match or track from its point [px at f = 525 px], and least
+# value of the widest angle between two rays of a track.
 _NEAR, _LEAST_ANGLE = 3.0 / 525.0, np.radians(1.5)
 _LEAST_INLIERS = 12
 
 
 class SiftMap:
-    """The points of posed images, and the features that show them."""
+    """The triangulated points of posed images, and their features."""
 
     def __init__(self, frames: Iterable[PosedImage]) -> None:
         seen = [(frame, *_features(frame.image_rgb, frame.camera)) for frame in frames
@@ -44,27 +44,27 @@ class SiftMap:
         rays = [np.column_stack([bearings, np.ones(len(bearings))]) for _, bearings, _ in seen]
         starts = np.cumsum([0, *map(len, rays)])
         matches = [np.empty((0, 2), dtype=np.int64)]
-        for one, other in combinations(range(len(seen)), 2):
-            if poses[one, :3, 2] @ poses[other, :3, 2] < np.cos(np.radians(_MOST_DEG)):
+        for first, second in combinations(range(len(seen)), 2):
+            if poses[first, :3, 2] @ poses[second, :3, 2] < np.cos(np.radians(_MOST_DEG)):
                 continue
-            pairs, _ = match(self._descriptors[one], self._descriptors[other])
-            near = _is_epipolar(rays[one][pairs[:, 0]], rays[other][pairs[:, 1]],
-                                invert_transform(poses[other]) @ poses[one])
-            matches.append(pairs[near] + (starts[one], starts[other]))
+            pairs, _ = match(self._descriptors[first], self._descriptors[second])
+            near = _is_epipolar(rays[first][pairs[:, 0]], rays[second][pairs[:, 1]],
+                                invert_transform(poses[second]) @ poses[first])
+            matches.append(pairs[near] + (starts[first], starts[second]))
         images = np.repeat(np.arange(len(seen)), np.diff(starts))
-        #: (n, 3): the point of each feature of all images, NaN without one
+        #: (n, 3): the point of each feature of all images, NaN if it has none
         points = _triangulate(np.concatenate(matches), images, np.concatenate(rays), poses)
         self._points = [points[first:last] for first, last in pairwise(starts)]
 
     def locate(self, image_rgb: NDArray[np.uint8], camera: Camera) -> Floats | None:
-        """Return map_from_camera (4, 4); None where too few features agree on a pose."""
+        """Return map_from_camera (4, 4); None if too few features agree on a pose."""
         bearings, descriptors = _features(image_rgb, camera)
         found = set[tuple[int, float, float, float]]()
         for theirs, points in zip(self._descriptors, self._points, strict=True):
             known = np.nonzero(np.isfinite(points[:, 0]))[0]
             pairs, _ = match(descriptors, theirs)
             pairs = pairs[np.isin(pairs[:, 1], known)]
-            found |= {(one, *points[other]) for one, other in pairs.tolist()}
+            found |= {(feature, *points[point]) for feature, point in pairs.tolist()}
         if len(found) < _LEAST_INLIERS:
             return None
         matched = np.array(sorted(found))
@@ -94,7 +94,7 @@ def _features(image_rgb: NDArray[np.uint8], camera: Camera) -> tuple[Floats, NDA
 
 
 def _is_epipolar(ours: Floats, theirs: Floats, theirs_from_ours: Floats) -> NDArray[np.bool_]:
-    """Return which rays (k, 3) of a match can meet."""
+    """Return a mask (k,) of matches whose rays (k, 3) can meet."""
     x, y, z = theirs_from_ours[:3, 3]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ theirs_from_ours[:3, :3]
     lines = ours @ essential.T
@@ -103,18 +103,18 @@ def _is_epipolar(ours: Floats, theirs: Floats, theirs_from_ours: Floats) -> NDAr
 
 
 def _triangulate(matches: Rows, images: Rows, rays: Floats, poses: Floats) -> Floats:
-    """Return the point (n, 3) of each feature, by the track of its matches; NaN without one."""
+    """Return the point (n, 3) of each feature, from the track of its matches; NaN if none."""
     count = len(images)
     graph = coo_matrix((np.ones(len(matches)), matches.T), shape=(count, count))
     _, tracks = connected_components(graph, directed=False)
-    # a track that shows one image twice is wrong
+    # a track with two features of the same image is wrong
     pairs, repeats = np.unique(np.stack([tracks, images]), axis=1, return_counts=True)
     is_wrong = np.zeros(tracks.max() + 1, dtype=bool)
     is_wrong[pairs[0, repeats > 1]] = True
     used = np.bincount(tracks)[tracks] > 1
     used &= ~is_wrong[tracks]
     points = np.full((count, 3), np.nan)
-    for _ in range(2):  # again without the features that miss their point
+    for _ in range(2):  # repeat without the features that are too far from their point
         found = _nearest_points(tracks[used], images[used], rays[used], poses)
         points[used] = found[tracks[used]]
         inside = np.einsum('nji,nj->ni', poses[images, :3, :3], points - poses[images, :3, 3])
@@ -134,7 +134,7 @@ def _triangulate(matches: Rows, images: Rows, rays: Floats, poses: Floats) -> Fl
 
 
 def _nearest_points(tracks: Rows, images: Rows, rays: Floats, poses: Floats) -> Floats:
-    """Return the point (t, 3) that is nearest to all rays of each track; NaN where none is."""
+    """Return the point (t, 3) nearest to all rays of each track; NaN if it is undetermined."""
     turned = np.einsum('nij,nj->ni', poses[images, :3, :3], rays)
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
     across = np.eye(3) - turned[:, :, None] * turned[:, None, :]

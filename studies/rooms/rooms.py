@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of real rooms: what detector and features say of each image, and their parts."""
+"""Recordings of real rooms, with the detections and features of each image, and their splits."""
 
 import hashlib
 import pickle
@@ -45,22 +45,22 @@ from studies.acceptance.places import observation_of
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Rows = NDArray[np.int64]
-#: A map by one camera, asked by another at another height.
+#: The split with a map from one camera, and queries from another camera at another height.
 ROBOT = 'phone to robot'
-# An accelerometer is averaged so near each image, as the node does [s].
+# Accelerations within this time of an image are averaged, as in the node [s].
 _WINDOW_S = 0.1
-# Without an accelerometer, the deviation of a simulated vertical.
+# Deviation of the simulated vertical without an accelerometer.
 _VERTICAL_DEG = 1.0
-# A camera without calibration is taken to see so much from left to right.
+# Assumed horizontal field of view of a camera without calibration.
 _USUAL_VIEW_DEG = 65.0
-# What the robot's camera shows of an image, and the width of its own.
+# Share of an image that the robot's camera shows, and width of the robot's images.
 _ROBOT_SHARE, _ROBOT_PX = 0.8, 424
-# Parts with fewer images are not a map, or no question.
+# Least number of images to map, and to query.
 _LEAST_IMAGES = 15
 
 
 class Looker:
-    """Detector and features; what they say of each image is kept in a folder."""
+    """Detects boxes and features, and stores the results of each image in a folder."""
 
     def __init__(self, folder: Path, model: str) -> None:
         self._folder, self._model = folder, model
@@ -68,7 +68,7 @@ class Looker:
         self._code = hashlib.sha256(Path(features.__file__).read_bytes()).hexdigest()[:8]
 
     def detect(self, image_rgb: Image) -> Detections:
-        """Return the boxes in an image, as an ObjectDetector does."""
+        """Return the detections in an image, as an ObjectDetector does."""
         def find() -> Detections:
             self._detector = self._detector or load_detector(
                 DetectorOptions(self._model, conf=0.25))
@@ -89,14 +89,14 @@ class Looker:
 
 
 class KeptFeatures(ImageFeatures):
-    """The features of an image, from an earlier run if there was one."""
+    """The features of an image, stored for later runs."""
 
     def __init__(self, looker: Looker, raw: RawFrame) -> None:
         super().__init__(lambda: raw.color()[0], raw.color()[1])
         self._looker = looker
 
     def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
-        """Return the features of a pass; finding them took no time that counts."""
+        """Return the features of a pass, with a time of 0."""
         return self._looker.features(self._read_rgb(), is_thorough), 0.0
 
 
@@ -108,18 +108,18 @@ def keep(path: Path, what: Any) -> None:
 
 @dataclass(frozen=True)
 class RoomOptions:
-    """How rooms are read."""
+    """Options of reading rooms."""
 
     model: str  #: Weights of YOLO
-    out: Path  #: Folder of what is kept from run to run
+    out: Path  #: Folder for results that later runs reuse
     conf: float = DetectorOptions.conf
-    #: Metres of a unit of the poses, by the names of folders that do not know it
+    #: Unit of the poses [m], by the names of folders that do not state it
     scales: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A recording; row i of all columns is its i-th image. Without poses it can only be asked."""
+    """A recording; row i of all columns is its i-th image. Without poses it has only queries."""
 
     name: str
     options: RoomOptions
@@ -128,7 +128,7 @@ class Room:
     detections: PosedDetections
     features: tuple[ImageFeatures, ...]
     has_poses: bool
-    ups: Floats | None  #: (n, 3): measured verticals in the camera; None: they are simulated
+    ups: Floats | None  #: (n, 3): measured verticals in the camera; None: simulate them
 
     def __len__(self) -> int:
         """Return the number of images."""
@@ -141,7 +141,7 @@ class Room:
 
     @cached_property
     def by_robot(self) -> 'Room':
-        """Return the room as another camera sees it: a part of each image, and coarser."""
+        """Return the room as seen by another camera: a part of each image at less resolution."""
         raws = tuple(replace(raw, color=partial(_robot_view, raw.color), depth=None)
                      for raw in self.raws)
         frames = frames_of_raws(self.frames.source, raws)
@@ -150,21 +150,22 @@ class Room:
 
     @cached_property
     def queries(self) -> tuple[PosedQuery, ...]:
-        """Return all images as queries, with all that is known of them."""
+        """Return all images as queries, with vertical and depth."""
         plain = [PosedQuery(row, observation_of(self.detections, row, raw.stamp_ns),
                        self.detections.map_from_camera[row],
                        image=self.features[row])
                  for row, raw in enumerate(self.raws)]
         if self.ups is None:
             return with_vertical(plain, _VERTICAL_DEG)
-        return tuple(replace(one, observation=replace(one.observation, up_in_camera=up))
-                     for one, up in zip(plain, self.ups, strict=True))
+        return tuple(replace(query, observation=replace(query.observation, up_in_camera=up))
+                     for query, up in zip(plain, self.ups, strict=True))
 
     def parts(self) -> Iterator[tuple[str, str, Rows, Rows]]:
-        """Yield a kind of split, the name of a part, and the rows to map and to ask.
+        """Yield a kind of split, the name of a part, and the rows to map and to query.
 
-        Split by time (images in turn, and halves), by where the camera looks, and by its height;
-        'phone to robot' maps one height, and asks the other with another camera, see by_robot.
+        Images are split by time (alternately, and into halves), by viewing direction, and by
+        height. 'phone to robot' maps one height, and queries the other with another camera, see
+        by_robot.
         """
         if not self.has_poses:
             return
@@ -183,7 +184,7 @@ class Room:
 
 
 def read_room(where: str, options: RoomOptions) -> Room:
-    """Return a room: a folder that the readers take, or one of images alone.
+    """Read a room from a folder of a known layout, or from a folder of images only.
 
     ``DIR@METRES`` gives the unit of depth.
     """
@@ -197,10 +198,9 @@ def read_room(where: str, options: RoomOptions) -> Room:
 
 def open_folder(where: str, scales: Mapping[str, float] = MappingProxyType({})
                 ) -> tuple[Path, Frames, bool]:
-    """Return a folder, its frames, z up, and whether their poses are true.
+    """Return a folder, its frames with z up, and whether they have true poses.
 
-    Scales are metres of a unit of the poses by the name of a folder.
-
+    ``scales`` gives the unit of the poses [m] by the name of a folder.
     ``DIR@METRES`` gives the unit of depth.
     """
     path, _, text = where.partition('@')
@@ -218,19 +218,19 @@ def open_folder(where: str, scales: Mapping[str, float] = MappingProxyType({})
 
 
 def posed(frames: Frames) -> tuple[RawFrame, ...]:
-    """Return the frames that have a pose, not decoded."""
+    """Return the frames that have a pose, without decoding their images."""
     return tuple(frames.read_raw(lambda place, stamp_ns, pose: pose is not None))
 
 
 def frames_of_raws(source: Path, raws: tuple[RawFrame, ...]) -> Frames:
-    """Return frames of a list of them."""
+    """Make frames from raw frames in memory."""
     return Frames(source, len(raws), lambda is_wanted: (
         raw for raw in raws if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera)))
 
 
 def _seen(frames: Frames, raws: tuple[RawFrame, ...], options: RoomOptions, name: str
           ) -> dict[str, Any]:
-    """Return detections and features of all images; those of an earlier run."""
+    """Return detections and features of all images, from an earlier run if there was one."""
     recorded = record_once(
         frames, RecordingOptions(DetectorOptions(options.model, conf=options.conf), None,
                                  EVERY_FRAME, reading=name), options.out / f'{name}.npz')
@@ -255,10 +255,10 @@ def _robot_view(color: Callable[[], tuple[Image, Camera]]
 
 
 def _without_poses(folder: Path) -> Frames:
-    """Return images whose poses nobody knows, by a usual camera."""
+    """Return the images of a folder, with unknown poses and an assumed camera."""
     paths = sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in ('.jpg', '.png'))
     if not paths:
-        raise DatasetError(f'{folder}: has no images')
+        raise DatasetError(f'{folder} has no images')
     first = cv2.imread(str(paths[0]))
     if first is None:
         raise DatasetError(f'{paths[0]} cannot be read as an image')
@@ -270,9 +270,9 @@ def _without_poses(folder: Path) -> Frames:
 
 
 def _measured_verticals(folder: Path, raws: tuple[RawFrame, ...]) -> Floats | None:
-    """Return the vertical in the camera (n, 3) by a TUM folder's accelerometer, None without one.
+    """Return the vertical in the camera (n, 3) from a TUM folder's accelerometer, None if none.
 
-    How the sensor is mounted is not published: one rotation is fitted to all true poses.
+    The mount of the sensor is not published, so one rotation is fitted to all true poses.
     """
     file = folder / 'accelerometer.txt'
     if not file.exists():
@@ -283,7 +283,7 @@ def _measured_verticals(folder: Path, raws: tuple[RawFrame, ...]) -> Floats | No
     means = near @ samples[:, 1:] / np.maximum(near.sum(axis=1), 1)[:, None]
     lengths = np.linalg.norm(means, axis=1)
     if (lengths == 0.0).any():
-        raise DatasetError(f'{file}: has gaps: no sample is within {_WINDOW_S} s of some images')
+        raise DatasetError(f'{file} has gaps: no sample is within {_WINDOW_S} s of some images')
     ups = means / lengths[:, None]
     true = np.array([raw.map_from_camera[2, :3] for raw in raws
                      if raw.map_from_camera is not None])
@@ -292,13 +292,13 @@ def _measured_verticals(folder: Path, raws: tuple[RawFrame, ...]) -> Floats | No
 
 
 def without_boxes(observation: Observation) -> Observation:
-    """Return an observation for keyframes alone."""
+    """Return an observation without boxes, for keyframes only."""
     return replace(observation, depths=None,
                    detections=Detections(np.empty((0, 4)), (), np.empty(0)))
 
 
 def known_of(observation: Observation, names: str) -> Observation:
-    """Return an observation with only what is named of 'vertical' and 'depth'."""
+    """Return an observation with only the named input of 'vertical' and 'depth'."""
     return replace(observation,
                    up_in_camera=observation.up_in_camera if 'vertical' in names else None,
                    depths=observation.depths if 'depth' in names else None)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How long things take, and what memory they need: ``python -m studies.speed --help``."""
+"""Measure times and memory: ``python -m studies.speed --help``."""
 
 import argparse
 import sys
@@ -9,7 +9,7 @@ from importlib import import_module
 from cliploc_ros.command import run_command
 
 STUDIES = {
-    'search': 'the search, beside a plain loop in the same run, and against the map',
+    'search': 'the search, compared with a plain loop in the same run, and by size of the map',
     'frame': 'a request by stage, for each profile, in PyTorch and OpenVINO',
     'node_start': 'the start of the relocalizer'}
 

@@ -4,8 +4,8 @@
 
 Each pair of detector and CLIP runs in two processes, one after the other: with PyTorch and with
 OpenVINO. The image, its boxes and the map are the demo's. The search uses the similarities of the
-demo's own CLIP, since those of random weights mean nothing. Weights that are not in the cache are
-random: then the times hold, and the detections and embeddings do not.
+demo's own CLIP, since similarities from random weights mean nothing. Weights that are not in the
+cache are random: the times are then still valid, but the detections and embeddings are not.
 """
 
 import os
@@ -47,7 +47,7 @@ from demo import ASSETS
 from studies.reports import table
 from studies.rooms.rooms import open_folder, posed
 
-# Those of ultralytics and open_clip: both engines run them.
+# Networks of ultralytics and open_clip, which both engines run.
 _PAIRS = {'paper': PROFILES['accurate'], 'small': Profile('yolov8n.pt', 'ViT-B-32', 'openai')}
 _ENGINES = ('pytorch', 'openvino')
 _STAGES = ('detection', 'CLIP', 'search')
@@ -63,7 +63,8 @@ def run(arguments: Sequence[str]) -> int:
     parser.add_argument('--crops', type=int, default=12, metavar='N', help='(%(default)s)')
     parser.add_argument('--rounds', type=int, default=5, metavar='N', help='(%(default)s)')
     parser.add_argument('--threads', type=int, default=2, metavar='N', help='(%(default)s)')
-    parser.add_argument('--device', default='cpu', help='with a GPU, PyTorch alone (%(default)s)')
+    parser.add_argument('--device', default='cpu',
+                        help='on a GPU only PyTorch is measured (%(default)s)')
     parser.add_argument('--child', nargs=4, metavar='X', help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.child:
@@ -81,8 +82,9 @@ def run(arguments: Sequence[str]) -> int:
                 env=os.environ | {'OMP_NUM_THREADS': str(options.threads)})
             found = json.loads(done.stdout.splitlines()[-1])
             wall, processor = found['wall_ms'], found['processor_ms']
-            rows.append([name, engine, *(f'{one:.0f} ({other:.0f})' for one, other in zip(
-                [*wall, sum(wall)], [*processor, sum(processor)], strict=True)),
+            rows.append([name, engine, *(
+                f'{wall_ms:.0f} ({processor_ms:.0f})' for wall_ms, processor_ms in zip(
+                    [*wall, sum(wall)], [*processor, sum(processor)], strict=True)),
                 f'{found["start_s"]:.1f}', f'{found["mib"]:.0f}', kind])
     print(f'{options.crops} crops of 640 x 480 px, all embedded; {options.threads} threads, device'
           f' {options.device}; median of {options.rounds} rounds: ms (ms of processor time)')
@@ -91,7 +93,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _weights(name: str, folder: Path) -> tuple[str, str, str]:
-    """Return the file of the detector, the encoder as JSON, and what they are."""
+    """Return the file of the detector, the encoder as JSON, and 'published' or what is random."""
     profile = _PAIRS[name]
     kept = resolve_cache_dir('') / 'weights' / profile.detector
     yolo, clip = kept, ''
@@ -119,7 +121,7 @@ def _weights(name: str, folder: Path) -> tuple[str, str, str]:
 
 def _measure(engine: str, yolo: str, clip: str, folder: str, *, crops: int, rounds: int,
              device: str) -> dict[str, Any]:
-    """Load networks, and return the median times of requests with them."""
+    """Load networks, and measure the median times of requests with them."""
     import open_clip  # noqa: F401  (before the measurements)
 
     import_ultralytics()
@@ -142,7 +144,7 @@ def _measure(engine: str, yolo: str, clip: str, folder: str, *, crops: int, roun
         lambda: relocalizer.relocalize([observation]))
     wall_ms, processor_ms = [], []
     for stage in stages:
-        stage()  # kernels and memory for these sizes
+        stage()  # warm-up for these sizes
         times = []
         for _ in range(rounds):
             begin, used = time.perf_counter(), time.process_time()
@@ -155,7 +157,7 @@ def _measure(engine: str, yolo: str, clip: str, folder: str, *, crops: int, roun
 
 
 def _demo_frame(crops: int, folder: str) -> tuple[NDArray[np.uint8], Observation]:
-    """Return an image of the demo with enough boxes, and what the demo's networks say of it."""
+    """Return an image of the demo with enough boxes, and the demo networks' observation of it."""
     detector = load_detector(DetectorOptions(str(ASSETS / 'yolo.pt'), inference='pytorch'))
     for raw in posed(open_folder(str(ASSETS / 'sequence'))[1]):
         image_rgb, camera = raw.color()

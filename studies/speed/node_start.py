@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the start of the relocalizer with the demo's map: the first ones, and a warm one.
+"""Measure the start of the relocalizer with the demo's map: first starts, and a warm start.
 
     python -m studies.speed node_start [--package FOLDER]
 
-Each start is a process of its own, from its command line to its log line that it is ready.
+Each start is a separate process; it is measured from its command line to its log line 'ready'.
 """
 
 import argparse
@@ -21,8 +21,8 @@ from studies.reports import print_section, table
 
 _PROJECT = Path(__file__).resolve().parents[2]
 _READY = 'landmarks in frame'
-# What was before a start, and the folder of label embeddings: 'colcon build' finds no kernels,
-# 'script/setup' finds kernels and no labels of the map.
+# State before a start, and the folder of label embeddings. After 'colcon build' there are no
+# compiled kernels; after 'script/setup' there are kernels, but no embeddings of the map's labels.
 _STARTS = {'colcon build': 'first', 'script/setup': 'second', 'warm': 'second'}
 
 
@@ -45,7 +45,7 @@ def _start(package: Path, matching: str, kernels: Path, cache: Path) -> tuple[fl
             if _READY in line:
                 break
         else:
-            raise SystemExit(f'the relocalizer does not start:\n{"".join(lines)}')
+            raise SystemExit(f'the relocalizer did not start:\n{"".join(lines)}')
         wall_s = time.monotonic() - begin
         # user and system time, the 14th and 15th field of proc(5)
         fields = Path(f'/proc/{process.pid}/stat').read_text().rsplit(')', 1)[1].split()

@@ -56,22 +56,22 @@ def run(arguments: Sequence[str]) -> int:
     """Measure and print; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--queries', type=Path, metavar='NPZ', help='recorded frames')
-    parser.add_argument('--map', type=Path, metavar='YAML', help='their map')
+    parser.add_argument('--map', type=Path, metavar='YAML', help='map of the frames')
     parser.add_argument('--landmarks', type=int, nargs='*', default=(100, 100_000, 1_000_000),
                         metavar='N', help='sizes of the maps (%(default)s); 1,000,000 take 6 GB')
     options = parser.parse_args(arguments)
     if (options.queries is None) != (options.map is None):
-        parser.error('--queries and --map belong together')
+        parser.error('--queries and --map must be given together')
     measure_first_request()
     _measure_hypotheses(synthetic_scene())
     measure_maps(options.landmarks)
     if options.queries is not None:
         place = Recording(options.queries, options.map, every_frame=False).load()
         for matching, algorithm in (('hybrid', 'b-prosac'), ('class', 'bf')):
-            # candidates as the paper has them
+            # candidates as in the paper
             paper = RelocalizerOptions(matching=matching, algorithm=algorithm)
-            scenes = [match_frame(place.landmark_map, one.observation, paper)[0]
-                      for one in place.ask(ONE)]
+            scenes = [match_frame(place.landmark_map, query.observation, paper)[0]
+                      for query in place.ask(ONE)]
             _measure_whole(f'{matching}, every sample', scenes, strategies.search_exhaustively)
             _measure_whole(f'{matching}, every compatible sample', scenes,
                            lambda scene, leaders: strategies.search_progressively(
@@ -80,7 +80,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def synthetic_scene() -> Scene:
-    """Return twelve boxes, each with five landmarks of its class, one of them true: 60 pairs."""
+    """Return a scene of twelve boxes, each paired with five landmarks, one of them true."""
     rng = np.random.default_rng(0)
     count, in_view = 20, 12
     centers = np.c_[rng.uniform(-3, 3, (count, 2)), rng.uniform(3, 7, count)]
@@ -105,7 +105,7 @@ def _measure_hypotheses(scene: Scene) -> None:
     leaders = Leaders.none_yet()
     drain(strategies.search_samples(scene, samples[:_PLAIN_HYPOTHESES], leaders))
     print(f'{len(scene.bearings)} boxes, {len(scene.potential.detections)} pairs, one core:\n'
-          f'  {whole_us / solved:7.2f} us a hypothesis, P3P to whole verification\n'
+          f'  {whole_us / solved:7.2f} us a hypothesis, from P3P to complete verification\n'
           f'  {searched_us / len(samples):7.2f} us a sample, in a search\n'
           f'  {five_hundred_ms:7.2f} ms for N = 500\n'
           f'  {plain_us:7.0f} us a hypothesis, plain loop over OpenCV and NumPy: '
@@ -116,7 +116,7 @@ def _measure_hypotheses(scene: Scene) -> None:
 
 @compiled
 def _verify_all(bench, samples):
-    """Make every hypothesis and verify it to the end; return how many there are."""
+    """Make every hypothesis and verify it completely; return the number of hypotheses."""
     candidates, prior, targets, sample, poses, overlaps = bench
     solved = 0
     for number in range(samples.shape[0]):
@@ -157,7 +157,7 @@ def _plain(scene: Scene, samples: NDArray[np.int64]) -> tuple[float, float]:
 
 def _plain_pose(scene: Scene, duals: list[NDArray[np.float64]], pairs: NDArray[np.int64]
                 ) -> NDArray[np.float64] | None:
-    """Return camera_from_map (3, 4): of P3P's poses, the one whose sampled IoUs sum highest."""
+    """Return camera_from_map (3, 4), the pose from P3P with the greatest sum of sampled IoUs."""
     seen = scene.box_ellipses[pairs[:, 0], :2].reshape(3, 1, 2)
     points = scene.centers[pairs[:, 1]].reshape(3, 1, 3)
     _, vectors, translations = cv2.solveP3P(points, seen, np.eye(3), None, cv2.SOLVEPNP_AP3P)
@@ -166,7 +166,7 @@ def _plain_pose(scene: Scene, duals: list[NDArray[np.float64]], pairs: NDArray[n
         pose = np.concatenate([cv2.Rodrigues(vector)[0], translation], axis=1)
         ious = [_plain_iou(scene.box_ellipses[detection], _plain_outline(pose, duals[landmark]))
                 for detection, landmark in pairs]
-        if sum(ious) > best_total:  # never true of NaN
+        if sum(ious) > best_total:  # always false for NaN
             best, best_total = pose, sum(ious)
     return best
 
@@ -198,7 +198,7 @@ def _dual_quadric(center: NDArray[np.float64], shape: NDArray[np.float64]
 
 def _plain_outline(pose: NDArray[np.float64], dual: NDArray[np.float64]
                    ) -> NDArray[np.float64] | None:
-    """Return the dual conic of a landmark; None if the landmark is not wholly in front."""
+    """Return the dual conic of a landmark; None if it is not completely in front of the camera."""
     conic = pose @ dual @ pose.T
     if pose[2] @ dual[3] >= 0.0 or conic[2, 2] >= 0.0:
         return None
@@ -228,7 +228,7 @@ def _plain_iou(box: NDArray[np.float64], conic: NDArray[np.float64] | None) -> f
 
 
 def storey(count: int) -> tuple[LandmarkMap, Observation]:
-    """Return a map of one landmark in four square metres, and a frame of up to twelve boxes."""
+    """Return a map with one landmark per four square metres, and a frame of up to twelve boxes."""
     rng, side = np.random.default_rng(0), np.sqrt(4.0 * count)
     names = tuple(f'class {number}' for number in rng.integers(0, _CLASSES, count))
     quats = rng.normal(size=(count, 4))
@@ -264,7 +264,7 @@ def measure_maps(counts: Sequence[int]) -> None:
         sorted_mb = sum(array.nbytes for array in landmark_map.sorted_landmarks) / 1e6
         knn_ms = 1e3 * least_s(partial(nearest_landmarks, similarities, _K), 5)
         scene, _ = match_frame(landmark_map, observation, RelocalizerOptions())
-        # those of CLIP's candidates, whose mixture does not depend on the map's size
+        # samples of CLIP's candidates, whose mixture does not depend on the map's size
         samples = draw_ransac(scene.pairs[:min(len(scene.pairs), _K * _CROPS)], 4_000,
                               np.random.default_rng(0))
         samples = samples[samples[:, 0] >= 0]
@@ -313,7 +313,7 @@ def _search(scene: Scene, samples: NDArray[np.int64]) -> None:
 
 
 def drain(search: Iterator[Progress]) -> int:
-    """Search to the end; return how many hypotheses were tried."""
+    """Run a search to its end; return the number of hypotheses tried."""
     tried = 0
     for progress in search:
         tried = progress.tried
@@ -327,7 +327,7 @@ def _units(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
 
 
 def least_s(run: Callable[[], object], repetitions: int = 20) -> float:
-    """Return the least time [s] of some runs, the one least disturbed by other programs."""
+    """Return the least time of several runs [s], which other programs disturbed least."""
     least = inf
     for _ in range(repetitions):
         start = time.perf_counter()

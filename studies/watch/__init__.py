@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How well the watch tells whether a localizer is right."""
+"""Measure how well the watch detects a wrong localizer."""

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How well the watch tells whether a localizer is right: ``python -m studies.watch``.
+"""Measure how well the watch detects a wrong localizer: ``python -m studies.watch``.
 
-A simulated localizer drifts along with the robot, gets displaced, or the robot is carried away.
-``judge`` does so in simulated worlds, ``recorded`` with recorded boxes, ``mount`` with a camera
-that is turned on its robot. ``localizer`` judges recorded poses of a real one. ``fit`` fits the
-evidence of looks.
+A simulated localizer drifts, or is displaced, or its robot is kidnapped. ``judge`` uses simulated
+worlds, ``recorded`` uses recorded boxes, and ``mount`` uses a camera that is turned on its robot.
+``localizer`` judges the recorded poses of a real localizer. ``fit`` fits the evidence of looks.
 """
 
 import argparse
@@ -58,7 +57,7 @@ def _judge(options: argparse.Namespace) -> None:
 def _recorded(options: argparse.Namespace) -> None:
     recorded = load_observations(options.observations)
     its_map = LandmarkMap.from_file(options.map)
-    # the map was made of the even frames
+    # the map was built from the even frames
     _print((judge.recorded_drive('fr3', recorded, its_map, range(first, len(recorded), _STEP))
             for first in range(1, _STEP, options.every)), len(range(1, _STEP, options.every)),
            True, str(options.map))
@@ -83,9 +82,9 @@ def _localizer(options: argparse.Namespace) -> None:
 def _print(drives: Iterable[judge.Drive], count: int, wrong_poses: bool, title: str) -> None:
     right, alarms = list[judge.Right](), list[judge.Alarm]()
     for number, drive in enumerate(tqdm(drives, title, count, disable=None)):
-        one, its = judge.judge(drive, number, wrong_poses)
-        right.append(one)
-        alarms += its
+        of_drive, alarms_of_drive = judge.judge(drive, number, wrong_poses)
+        right.append(of_drive)
+        alarms += alarms_of_drive
     print_section(f'{title}: right poses', judge.right_table(right))
     if alarms:
         print_section(f'{title}: wrong poses', judge.alarm_table(alarms))
@@ -105,7 +104,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
     def add_worlds(own: argparse.ArgumentParser, worlds: int, first_seed: int) -> None:
         own.add_argument('--worlds', type=positive_int, default=worlds, metavar='N',
-                         help='of each kind (%(default)s)')
+                         help='worlds of each kind (%(default)s)')
         own.add_argument('--first-seed', type=int, default=first_seed, help='(%(default)s)')
         own.add_argument('--kinds', nargs='+', choices=KINDS, default=list(KINDS), metavar='KIND')
 
@@ -115,22 +114,23 @@ def run(arguments: Sequence[str] | None = None) -> int:
     judged.add_argument('--images', type=positive_int, default=300, help='(%(default)s)')
     judged.add_argument('--changed', type=float, nargs='+', default=[0.0, 0.2, 0.4],
                         help='shares of the objects that moved or are gone (0 0.2 0.4)')
-    judged.add_argument('--labels', action='store_true', help='of weak and strong encoders')
+    judged.add_argument('--labels', action='store_true',
+                        help='match by labels, with weak and strong encoders')
     recorded = add('recorded', _recorded, 'alarms with recorded boxes')
     recorded.add_argument('--observations', type=Path, required=True, metavar='NPZ')
     recorded.add_argument('--map', type=Path, required=True, metavar='YAML')
     recorded.add_argument('--splits', type=Path, metavar='JSON', help='rows to map and to query')
     recorded.add_argument('--every', type=positive_int, default=4, metavar='N',
-                          help='begin a drive at every N-th frame (%(default)s)')
+                          help='start a drive at every N-th frame (%(default)s)')
     own = add('localizer', _localizer, 'alarms at the recorded poses of a localizer')
     own.add_argument('--observations', type=Path, required=True, metavar='NPZ',
-                     help='of build_map --record-to: boxes, poses of the localizer and odometry')
+                     help='file of build_map --record-to, with localizer poses and odometry')
     own.add_argument('--map', type=Path, required=True, metavar='YAML')
     own.add_argument('--truth', type=Path, metavar='TUM', help='true poses of the camera')
     own.add_argument('--period', type=not_negative, default=2.0, metavar='SECONDS',
                      help='least time between two looks (%(default)s)')
     own.add_argument('--tilt-deviation', type=float, default=40.0, metavar='DEG',
-                     help='of the camera off upright (%(default)s)')
+                     help="deviation of the camera's tilt (%(default)s)")
     own.add_argument('--out', type=Path, default=Path('watched'), metavar='DIR')
     mount = add('mount', lambda options: print(judge.mount_table(
         options.kinds, range(options.first_seed, options.first_seed + options.worlds))),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of the evidence of one look: looks at right and at wrong poses in simulated worlds."""
+"""Fit the evidence of one look to looks at correct and wrong poses in simulated worlds."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from studies.watch.judge import (
 )
 
 _IMAGES = 60
-# Shares of objects that changed since the place was mapped, of one world after the other.
+# Shares of objects that changed since the place was mapped; worlds take these in turn.
 _CHANGED = (0.0, 0.0, 0.2, 0.4)
 # A quarter of the cameras is turned, by up to this angle [deg].
 _TURNED_SHARE, _TURNED_DEG = 0.25, (2.0, 10.0)
@@ -32,7 +32,7 @@ _RIDGE = 1e-5
 
 
 class Look(NamedTuple):
-    """The evidence of a look at a right or a wrong pose."""
+    """The evidence of a look at a correct or a wrong pose."""
 
     kind: str
     evidence: LookEvidence
@@ -40,7 +40,7 @@ class Look(NamedTuple):
 
 
 def looks_of(kind: str, seed: int) -> list[Look]:
-    """Return looks of a drive through a world, each at its right pose and at a wrong one."""
+    """Return the looks of a drive through a world, each at the correct and at a wrong pose."""
     drive = simulated_drive(kind, seed, _IMAGES, _CHANGED[seed % len(_CHANGED)])
     rng, options = np.random.default_rng([seed, 5]), RelocalizerOptions(matching='class')
     turn = turned_camera(rng.uniform(*_TURNED_DEG) if rng.random() < _TURNED_SHARE else 0.0, rng)
@@ -56,7 +56,7 @@ def looks_of(kind: str, seed: int) -> list[Look]:
 
 def _wrong(right: NDArray[np.float64], poses: NDArray[np.float64], bounds: NDArray[np.float64],
            rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return a wrong pose (4, 4) of a right one: moved, turned, or anywhere on the drive."""
+    """Make a correct pose (4, 4) wrong: moved, turned, or anywhere on the drive."""
     kind = rng.integers(5)
     if kind < 2:
         return kidnapped(right, rng.uniform(*_WRONG_M[kind]), 0.0, bounds, rng) @ right
@@ -70,23 +70,23 @@ def _wrong(right: NDArray[np.float64], poses: NDArray[np.float64], bounds: NDArr
 
 
 def fit(looks: Sequence[Look]) -> Calibration:
-    """Return the coefficients of maximum likelihood."""
+    """Return the maximum-likelihood coefficients."""
     seen = [look for look in looks if look.evidence.known]
-    terms = np.array([[*one.evidence.terms.values()] for one in seen])
-    found = fit_logistic(terms, np.array([one.is_right for one in seen]),
+    terms = np.array([[*look.evidence.terms.values()] for look in seen])
+    found = fit_logistic(terms, np.array([look.is_right for look in seen]),
                          np.full(terms.shape[1], 2.0 * _RIDGE * len(seen)))
     return CALIBRATION._replace(watch=CALIBRATION.watch._replace(
         **dict(zip(seen[0].evidence.terms, map(float, found), strict=True))))
 
 
 def report(looks: Sequence[Look], calibration: Calibration) -> str:
-    """Return a table of how well single looks at three objects or more tell right from wrong."""
+    """Return a table of how well single looks at three or more objects detect wrong poses."""
     rows = []
     for kind in (*dict.fromkeys(look.kind for look in looks), 'all'):
-        its = [look for look in looks if kind in (look.kind, 'all') and look.evidence.known >= 3]
-        odds = np.array([log_odds(one.evidence, True, calibration) for one in its])
-        right = np.array([one.is_right for one in its])
-        rows.append([kind, len(its), f'{odds[right].mean():.1f}', f'{odds[~right].mean():.1f}',
+        known = [look for look in looks if kind in (look.kind, 'all') and look.evidence.known >= 3]
+        odds = np.array([log_odds(look.evidence, True, calibration) for look in known])
+        right = np.array([look.is_right for look in known])
+        rows.append([kind, len(known), f'{odds[right].mean():.1f}', f'{odds[~right].mean():.1f}',
                      f'{(odds[right] < 0.0).mean():.2f}', f'{(odds[~right] > 0.0).mean():.2f}',
                      f'{np.logaddexp(0.0, np.where(right, -odds, odds)).mean():.2f}'])
     return table(['place', 'looks', 'mean log odds, right', 'wrong', 'right ones against',

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the watch says on drives: of a right localizer, a wrong one, and of a turned camera.
+"""Run the watch on drives with a correct localizer, a wrong one, and a turned camera.
 
-Localizers are simulated: right with drift, displaced, or of a camera mounted wrong.
+Localizers are simulated: correct up to drift, displaced, or with a wrong mount of the camera.
 """
 
 import copy
@@ -31,30 +31,33 @@ from studies.worlds.world import make_drive
 
 #: Time between looks [s].
 LOOK_S = 2.0
-# A localizer drifts, and its sensors correct it: deviations on x and y [m], and of the yaw [deg];
-# errors fall to 1 / e in this many looks. Odometry: of a step [m] [deg].
+# Drift of a localizer: range of the error in x and y [m], deviation of the yaw [deg], and number
+# of looks in which its sensors reduce an error to 1 / e.
 _DRIFT_M, _DRIFT_DEG, _DRIFT_LOOKS = (0.05, 0.3), 1.0, 5.0
+# Deviations of a step of odometry.
 _STEP_M, _STEP_DEG = 0.01, 0.3
-#: Displacements [m] [deg] against odometry.
+#: Displacements of a localizer against odometry [m], [deg].
 DISPLACED = ((1.0, 0.0), (2.0, 0.0), (5.0, 0.0), (0.0, 30.0), (0.0, 90.0), (0.0, 180.0))
 KIDNAPPED, TWIN = 'kidnapped', 'at a twin'
-# Looks at three objects or more within which a wrong pose should be noticed, and the most looks.
-# Poses become wrong at some looks of a drive.
+# Number of looks at three or more objects within which a wrong pose should be detected, and
+# greatest number of all looks.
 LOOKS, _OBJECTS, _MOST_LOOKS = 5, 3, 30
+# Looks of a drive at which poses become wrong: the first, their number, their least distance, and
+# the number of kidnaps at each.
 _FIRST_LOOK, _PARTS, _LEAST_PART, _KIDNAPS = 10, 6, 12, 3
 _FAR = Tolerance(2.0, 30.0)
 # Gap between the rooms of studies.worlds.places.two_rooms [m].
 _GAP_M = 1.5
-# A landmark counts where this many looks should show it.
+# A landmark counts if at least this many looks should show it.
 _EXPECTED = 5
 _TURNS_DEG = (0.0, 2.0, 3.0, 5.0, 7.0, 10.0)
-# Images of a drive with a turned camera, and looks that match three objects after which the turn
-# is judged.
+# Images of a drive with a turned camera, and number of looks that match three objects before the
+# turn is judged.
 _IMAGES, _TURN_LOOKS = 200, 20
 
 
 class Drive(NamedTuple):
-    """What a camera saw on a drive, and where it was."""
+    """The observations and poses of a camera on a drive."""
 
     name: str
     landmark_map: LandmarkMap
@@ -63,7 +66,7 @@ class Drive(NamedTuple):
     #: (L,): see studies.worlds.world.Drive
     changed: NDArray[np.bool_]
     wrong: NDArray[np.bool_]
-    #: (2, 2): least and greatest x and y where a localizer may put the robot [m]
+    #: (2, 2): least and greatest x and y of a localizer's poses [m]
     bounds: NDArray[np.float64]
 
 
@@ -74,8 +77,8 @@ def simulated_drive(kind: str, seed: int, images: int, changed: float = 0.0,
     poses = np.array([query.map_from_camera for query in found.world.queries])
     seen = [query.observation if labels else replace(query.observation, similarities=None)
             for query in found.world.queries]
-    stamped = [replace(one, stamp_ns=round(row * LOOK_S * NS_PER_S))
-               for row, one in enumerate(seen)]
+    stamped = [replace(observation, stamp_ns=round(row * LOOK_S * NS_PER_S))
+               for row, observation in enumerate(seen)]
     return Drive(kind, found.world.landmark_map, with_odometry(stamped, poses, seed), poses,
                  found.changed, found.wrong, np.array([(0.0, 0.0), found.size]))
 
@@ -100,7 +103,7 @@ def with_odometry(observations: Sequence[Observation], poses: NDArray[np.float64
 
 def drifting(poses: NDArray[np.float64], rng: np.random.Generator, drift_m: float | None = None
              ) -> NDArray[np.float64]:
-    """Return the poses (k, 4, 4) of a localizer whose errors come and go."""
+    """Return the poses (k, 4, 4) of a localizer with drift that its sensors correct."""
     count, keep = len(poses), np.exp(-1.0 / _DRIFT_LOOKS)
     noise = rng.normal(size=(count, 3))
     for row in range(1, count):
@@ -123,7 +126,7 @@ def displaced(pose: NDArray[np.float64], x: float, y: float, yaw: float
 
 def kidnapped(pose: NDArray[np.float64], metres: float, degrees: float,
               bounds: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return wrong_from_right (4, 4), which displaces a localizer at a pose (4, 4) in a place."""
+    """Return wrong_from_right (4, 4), which displaces a pose (4, 4) within the bounds."""
     x, y = 0.0, 0.0
     if metres:
         angles = rng.uniform(-np.pi, np.pi, 50)
@@ -136,7 +139,7 @@ def kidnapped(pose: NDArray[np.float64], metres: float, degrees: float,
 
 
 def turned_camera(degrees: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return a turn (4, 4) about a random axis: stated_from_true of a camera that was hit."""
+    """Return a turn (4, 4) about a random axis: stated_from_true of a displaced camera."""
     axis = rng.normal(size=3)
     return make_transform(Rotation.from_rotvec(
         np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix(), np.zeros(3))
@@ -144,7 +147,7 @@ def turned_camera(degrees: float, rng: np.random.Generator) -> NDArray[np.float6
 
 def recorded_drive(name: str, recorded: PosedDetections, landmark_map: LandmarkMap,
                    rows: Sequence[int]) -> Drive:
-    """Return some frames of a recording, in the order of time, as a drive, by class."""
+    """Return frames of a recording, in the order of time, as a drive without similarities."""
     poses = recorded.map_from_camera[np.array(rows)]
     seen = [observation_of(recorded, row, round(recorded.stamps_s[row] * NS_PER_S))
             for row in rows]
@@ -154,42 +157,42 @@ def recorded_drive(name: str, recorded: PosedDetections, landmark_map: LandmarkM
 
 
 class Alarm(NamedTuple):
-    """What the watch said about one wrong pose."""
+    """The result of the watch for one wrong pose."""
 
     place: str
     case: str
-    lost: bool  #: Within LOOKS looks at three objects or more
-    noticed: bool  #: No longer localized then
-    is_mapped: bool  #: Two of these looks or more should have shown two landmarks
+    lost: bool  #: Whether it was lost within LOOKS looks at three or more objects
+    noticed: bool  #: Whether the state after these looks was not localized
+    is_mapped: bool  #: Whether two or more of these looks should have shown two landmarks
 
 
 class Right(NamedTuple):
-    """What it said on a drive with a right localizer."""
+    """The result of the watch on a drive with a correct localizer."""
 
     place: str
     states: tuple[WatchState, ...]
-    named: int  #: Landmarks named as missing at the end, and those of them that are wrong
-    rightly: int
-    wrong: int  #: Landmarks that are wrong, of those that _EXPECTED looks should show
+    named: int  #: Number of landmarks named as missing at the end
+    rightly: int  #: Number of these that are wrong in the map
+    wrong: int  #: Number of wrong landmarks among those that _EXPECTED looks should show
 
 
 def watch_of(drive: Drive) -> Watch:
-    """Return a watch in the map of a drive."""
+    """Return a new watch with the map of a drive."""
     return Watch(Relocalizer(drive.landmark_map, RelocalizerOptions(
         matching='class' if drive.observations[0].similarities is None else 'hybrid',
         k=min(RelocalizerOptions.k, len(drive.landmark_map)))))
 
 
 def judge(drive: Drive, seed: int, wrong_poses: bool) -> tuple[Right, list[Alarm]]:
-    """Return what the watch says of a right localizer, and of wrong ones from some looks on."""
+    """Run the watch with a correct localizer, and with localizers that become wrong."""
     rng, watch = np.random.default_rng([seed, 9]), watch_of(drive)
     begins = range(_FIRST_LOOK, len(drive.poses), max(_LEAST_PART, len(drive.poses) // _PARTS))
     poses, alarms, reports = drifting(drive.poses, rng), list[Alarm](), list[WatchReport]()
     for row, (observation, pose) in enumerate(zip(drive.observations, poses, strict=True)):
         if wrong_poses and row in begins:
             for case, seen, wrong in _wrong_ways(drive, poses, row, rng):
-                its = copy.deepcopy(watch, {id(drive.landmark_map): drive.landmark_map})
-                found = _alarm(its, drive, case, seen, wrong)
+                wrong_watch = copy.deepcopy(watch, {id(drive.landmark_map): drive.landmark_map})
+                found = _alarm(wrong_watch, drive, case, seen, wrong)
                 alarms += [found] if found is not None else []
         reports.append(watch.look(observation, pose))
     ids = drive.landmark_map.landmark_ids
@@ -198,7 +201,7 @@ def judge(drive: Drive, seed: int, wrong_poses: bool) -> tuple[Right, list[Alarm
     for observation, pose in zip(drive.observations, drive.poses, strict=True):
         expected[expect(drive.landmark_map, observation.camera, pose,
                         np.empty(0, dtype=np.int64)).landmarks] += 1
-    named = [ids.index(one) for one in reports[-1].missing]
+    named = [ids.index(landmark_id) for landmark_id in reports[-1].missing]
     return Right(drive.name, tuple(report.state for report in reports), len(named),
                  int(is_wrong[named].sum()),
                  int((is_wrong & (expected >= _EXPECTED)).sum())), alarms
@@ -206,7 +209,7 @@ def judge(drive: Drive, seed: int, wrong_poses: bool) -> tuple[Right, list[Alarm
 
 def _wrong_ways(drive: Drive, poses: NDArray[np.float64], row: int, rng: np.random.Generator
                 ) -> Iterator[tuple[str, Sequence[Observation], NDArray[np.float64]]]:
-    """Return the case, what the camera sees and the wrong poses of a localizer from a look on."""
+    """Yield each case with the observations and the wrong poses of a localizer from a look on."""
     ahead = slice(row, row + _MOST_LOOKS)
     for metres, degrees in DISPLACED:
         wrong = kidnapped(poses[row], metres, degrees, drive.bounds, rng)
@@ -218,18 +221,18 @@ def _wrong_ways(drive: Drive, poses: NDArray[np.float64], row: int, rng: np.rand
     others = np.nonzero(~_FAR.agreeing(poses[row][None], poses[:-LOOKS])[0])[0]
     odom = np.array([observation.odom_from_camera for observation in drive.observations])
     for there in rng.choice(others, min(_KIDNAPS, len(others)), replace=False):
-        # neither odometry nor the localizer notice that the robot is carried away
+        # odometry and localizer continue as if the robot had not been kidnapped
         ahead = slice(there, there + _MOST_LOOKS)
         back = odom[row - 1] @ invert_transform(odom[there])
         later_ns = drive.observations[row].stamp_ns - drive.observations[there].stamp_ns
         yield KIDNAPPED, [replace(
-            one, stamp_ns=one.stamp_ns + later_ns, odom_from_camera=back @ its_odom)
-            for one, its_odom in zip(drive.observations[ahead], odom[ahead], strict=True)
+            seen, stamp_ns=seen.stamp_ns + later_ns, odom_from_camera=back @ odom_from_camera)
+            for seen, odom_from_camera in zip(drive.observations[ahead], odom[ahead], strict=True)
             ], poses[row - 1] @ invert_transform(poses[there]) @ poses[ahead]
 
 
 def _twin_of(drive: Drive, pose: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the move (4, 4) to the place that looks alike; None where there is none."""
+    """Return the transform (4, 4) to the place that looks alike; None if there is none."""
     _, (width, depth) = drive.bounds
     if drive.name == 'two rooms':
         shift = 0.5 * (width + _GAP_M)
@@ -242,7 +245,7 @@ def _twin_of(drive: Drive, pose: NDArray[np.float64]) -> NDArray[np.float64] | N
 
 def _alarm(watch: Watch, drive: Drive, case: str, seen: Sequence[Observation],
            poses: NDArray[np.float64]) -> Alarm | None:
-    """Return what a watch says of wrong poses; None if there are too few looks at objects."""
+    """Run a watch on wrong poses; None if there are too few looks at objects."""
     index, looks, lost, mapped = drive.landmark_map.classes, 0, False, 0
     for observation, pose in zip(seen, poses, strict=True):
         report = watch.look(observation, pose)
@@ -257,33 +260,34 @@ def _alarm(watch: Watch, drive: Drive, case: str, seen: Sequence[Observation],
 
 
 def right_table(found: Sequence[Right]) -> str:
-    """Return a table of drives with a right localizer, by place."""
+    """Return a table of drives with a correct localizer, by place."""
     rows = []
-    for place in (*dict.fromkeys(one.place for one in found), 'all'):
-        its = [one for one in found if place in (one.place, 'all')]
-        states = [state for one in its for state in one.states]
-        alarms = sum(now == WatchState.LOST != before for one in its for before, now in zip(
-            one.states, one.states[1:], strict=False))
+    for place in (*dict.fromkeys(drive.place for drive in found), 'all'):
+        drives = [drive for drive in found if place in (drive.place, 'all')]
+        states = [state for drive in drives for state in drive.states]
+        alarms = sum(now == WatchState.LOST != before for drive in drives for before, now in zip(
+            drive.states, drive.states[1:], strict=False))
         hours = len(states) * LOOK_S / 3600.0
-        named, rightly, wrong = (sum(values) for values in zip(*(one[2:] for one in its),
+        named, rightly, wrong = (sum(values) for values in zip(*(drive[2:] for drive in drives),
                                                                strict=True))
         rows.append([place, f'{hours:.1f}', alarms, f'{alarms / hours:.2f}',
                      f'{chi2.ppf(0.95, 2 * alarms + 2) / 2.0 / hours:.2f}',
-                     *(f'{states.count(one) / len(states):.2f}' for one in WatchState),
+                     *(f'{states.count(state) / len(states):.2f}' for state in WatchState),
                      f'{rightly} of {named}', f'{rightly} of {wrong}'])
     return table(['right poses', 'hours', 'false alarms', 'an hour', 'below (95 %)', *WatchState,
                   'named rightly', f'of those wrong and expected {_EXPECTED} times'], rows)
 
 
 def alarm_table(found: Sequence[Alarm]) -> str:
-    """Return a table of the shares of wrong poses that are called lost, by place and case."""
-    cases = [*dict.fromkeys(one.case for one in found)]
+    """Return a table of the shares of wrong poses that the watch reports as lost."""
+    cases = [*dict.fromkeys(alarm.case for alarm in found)]
     rows = []
-    for place in (*dict.fromkeys(one.place for one in found), 'all'):
-        its = [one for one in found if place in (one.place, 'all')]
-        rows.append([place, *(_share([one for one in its if one.case == case])
+    for place in (*dict.fromkeys(alarm.place for alarm in found), 'all'):
+        alarms = [alarm for alarm in found if place in (alarm.place, 'all')]
+        rows.append([place, *(_share([alarm for alarm in alarms if alarm.case == case])
                               for case in cases),
-                     _share([one for one in its if one.case == KIDNAPPED and one.is_mapped])])
+                     _share([alarm for alarm in alarms
+                             if alarm.case == KIDNAPPED and alarm.is_mapped])])
     return table([f'lost within {LOOKS} looks; not localized; cases', *cases,
                   f'{KIDNAPPED} to where the map shows something'], rows)
 
@@ -300,20 +304,20 @@ def glance_table(right: Sequence[Right], alarms: Sequence[Alarm]) -> str:
            short(float(np.mean([alarm.noticed for alarm in own])))] for (case,), own in by_case)])
 
 
-def _share(some: Sequence[Alarm]) -> str:
-    if not some:
+def _share(alarms: Sequence[Alarm]) -> str:
+    if not alarms:
         return ''
-    return (f'{np.mean([one.lost for one in some]):.2f}; '
-            f'{np.mean([one.noticed for one in some]):.2f}; {len(some)}')
+    return (f'{np.mean([alarm.lost for alarm in alarms]):.2f}; '
+            f'{np.mean([alarm.noticed for alarm in alarms]):.2f}; {len(alarms)}')
 
 
 def mount_table(kinds: Sequence[str], seeds: Sequence[int]) -> str:
-    """Return a table of how well the turn of a camera is known after some looks."""
+    """Return a table of the errors of a camera's estimated turn after some looks."""
     rows = []
     for degrees in _TURNS_DEG:
-        found = [one for kind in kinds for seed in seeds
-                 if (one := _turn_after_looks(kind, seed, degrees)) is not None]
-        named = np.array([one[1:] for one in found if one[0]]).reshape(-1, 3)
+        found = [turn for kind in kinds for seed in seeds
+                 if (turn := _turn_after_looks(kind, seed, degrees)) is not None]
+        named = np.array([turn[1:] for turn in found if turn[0]]).reshape(-1, 3)
         errors, level, sigmas = named.T if len(named) else np.zeros((3, 1))
         rows.append([f'{degrees:g}', len(found), len(named), f'{np.median(errors):.2f}',
                      f'{np.quantile(errors, 0.9):.2f}', f'{(errors < 0.5).mean():.2f}',
@@ -326,17 +330,17 @@ def mount_table(kinds: Sequence[str], seeds: Sequence[int]) -> str:
 
 def _turn_after_looks(kind: str, seed: int, degrees: float
                       ) -> tuple[bool, float, float, float] | None:
-    """Return whether a turn is named after _TURN_LOOKS looks, its errors and deviation [deg].
+    """Return whether the watch reports a turn after _TURN_LOOKS looks, its errors and deviation.
 
-    The second error is that without the part about the vertical. None: the drive has fewer looks
-    at three objects.
+    All are in degrees. The second error excludes the rotation about the vertical. None: the drive
+    has fewer looks at three objects.
     """
     drive, rng = simulated_drive(kind, seed, _IMAGES), np.random.default_rng([seed, 13])
     watch, turn = watch_of(drive), turned_camera(degrees, rng)
     poses = drifting(drive.poses, rng, 0.1)
     count = 0
     for observation, pose in zip(drive.observations, poses, strict=True):
-        # the stated mount puts the camera where it would be without the turn
+        # the localizer's pose is that of a camera without the turn, as its mount states
         given = pose @ invert_transform(turn)
         report = watch.look(observation, given)
         count += report.matched >= _OBJECTS

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The watch over a recording: what it says of the poses of a localizer, and when.
+"""Run the watch on a recording of a localizer's poses.
 
-The poses of the observation file are those of the localizer, the truth is a trajectory.
+The observation file holds the localizer's poses; a trajectory gives the true ones.
 """
 
 import json
@@ -25,7 +25,7 @@ from studies.acceptance.places import observation_of
 
 @dataclass(frozen=True)
 class WatchedLook:
-    """What the watch said after one look, and what is true."""
+    """The report of the watch after one look, and the localizer's true errors."""
 
     stamp_s: float
     state: str
@@ -35,14 +35,14 @@ class WatchedLook:
     expected: int
     missing: tuple[str, ...]
     fault: str
-    way_m: float  #: That the localizer's pose moved since the first look
-    #: Of the localizer's pose; None where the truth is unknown
+    way_m: float  #: Path length of the localizer's pose since the first look
+    #: Errors of the localizer's pose; None if the truth is unknown
     error_m: float | None
     error_deg: float | None
 
     @property
     def is_right(self) -> bool | None:
-        """Return whether the localizer's pose is right; None where the truth is unknown."""
+        """Return whether the localizer's pose is correct; None if the truth is unknown."""
         if self.error_m is None or self.error_deg is None:
             return None
         return self.error_m < SAME_ANSWER.distance_m and self.error_deg < SAME_ANSWER.angle_deg
@@ -50,7 +50,7 @@ class WatchedLook:
 
 def watch_recording(recorded: Recorded, watch: Watch, truth: Poses | None, period_s: float
                     ) -> list[WatchedLook]:
-    """Return what a watch says of a recording, whose poses are those of a localizer.
+    """Run a watch on a recording, whose poses are those of a localizer.
 
     Parameters
     ----------
@@ -78,16 +78,16 @@ def watch_recording(recorded: Recorded, watch: Watch, truth: Poses | None, perio
 
 
 def alarms_of(looks: Sequence[WatchedLook]) -> list[WatchedLook]:
-    """Return the looks at which an alarm begins."""
+    """Return the looks at which alarms start."""
     states = [WatchState.UNCERTAIN, *(look.state for look in looks)]
     return [look for look, (before, now) in zip(looks, pairwise(states), strict=True)
             if now == WatchState.LOST != before]
 
 
 def times_to_alarm(looks: Sequence[WatchedLook]) -> list[dict[str, Any]]:
-    """Return of each stretch of wrong poses when it began, and when the watch called it lost.
+    """Return the start of each stretch of wrong poses, and the delay of the watch's alarm.
 
-    seconds, metres and looks are None where it did not.
+    The delays seconds, metres and looks are None if there was no alarm.
     """
     found: list[dict[str, Any]] = []
     begins = [row for row, look in enumerate(looks) if look.is_right is False
@@ -107,21 +107,21 @@ def times_to_alarm(looks: Sequence[WatchedLook]) -> list[dict[str, Any]]:
 
 
 def summarize_watch(looks: Sequence[WatchedLook]) -> dict[str, Any]:
-    """Return the figures of a watched recording; None where the truth does not tell."""
+    """Return the statistics of a watched recording; None where the truth is unknown."""
     hours = (looks[-1].stamp_s - looks[0].stamp_s) / 3600.0 if len(looks) > 1 else 0.0
     alarms = alarms_of(looks)
     false = sum(alarm.is_right is True for alarm in alarms)
     knows = any(look.is_right is not None for look in looks)
     return {
         'looks': len(looks), 'hours': hours, 'way_m': looks[-1].way_m if looks else 0.0,
-        'states': {str(one): sum(look.state == one for look in looks) for one in WatchState},
+        'states': {str(state): sum(look.state == state for look in looks) for state in WatchState},
         'alarms': len(alarms), 'false_alarms': false if knows else None,
         'false_alarms_per_hour': false / hours if knows and hours else None,
         'wrong_stretches': times_to_alarm(looks)}
 
 
 def write_watch(folder: Path, looks: Sequence[WatchedLook]) -> str:
-    """Write watch.json; return a summary in a few lines."""
+    """Write watch.json; return a short summary."""
     summary = summarize_watch(looks)
     make_folder(folder)
     write_text(folder / 'watch.json', json.dumps(
@@ -133,8 +133,8 @@ def write_watch(folder: Path, looks: Sequence[WatchedLook]) -> str:
         rate = summary['false_alarms_per_hour']
         lines.append(f'false alarms: {summary["false_alarms"]}'
                      + ('' if rate is None else f', {rate:.2f} an hour'))
-    for one in summary['wrong_stretches']:
-        lines.append('wrong poses: never called lost' if one['looks'] is None else
-                     f'wrong poses: called lost after {one["looks"]} looks, '
-                     f'{one["seconds"]:.1f} s, {one["metres"]:.1f} m')
+    for stretch in summary['wrong_stretches']:
+        lines.append('wrong poses: never called lost' if stretch['looks'] is None else
+                     f'wrong poses: called lost after {stretch["looks"]} looks, '
+                     f'{stretch["seconds"]:.1f} s, {stretch["metres"]:.1f} m')
     return '\n'.join(lines)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a robot looks from: groups of five images while it turns or drives."""
+"""Camera poses of a robot: groups of five images while it turns or drives."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +11,23 @@ from studies.worlds.places import Objects, Place
 
 #: Images of one group.
 GROUP_SIZE = 5
-# Recordings have 500 (demo), 525 (kitchen) and 535 (TUM fr3); cameras of robots are wider.
+# Focal lengths: 500 (demo), 525 (kitchen) and 535 (TUM fr3); robots have wider cameras.
 _FOCAL_PX = (380.0, 620.0)
-# Hands and tripods: 1.28 to 1.64 (fr3), 1.12 to 1.35 (demo). Robots are lower, a guess.
+# Heights of hands and tripods: 1.28 to 1.64 (fr3), 1.12 to 1.35 (demo). That robots are lower is a
+# guess.
 _HEIGHT_M = (0.3, 1.8)
-# 20 to 39 down (fr3), 2 to 10 (demo). Low robots look up, by a guess. Deviation of the roll: 4.4
-# (fr3, hand), 1.2 (demo).
+# Pitch: 20 to 39 down (fr3), 2 to 10 (demo). That low robots look up is a guess. Deviation of the
+# roll: 4.4 (fr3, hand), 1.2 (demo).
 _PITCH_DEG, _ROLL_DEG = (-20.0, 35.0), 3.0
-# In a second: 5 to 21 degrees and .12 to .36 m (fr3, hand).
+# Motion in a second: 5 to 21 degrees and .12 to .36 m (fr3, hand).
 _TURN_DEG, _STEP_M = (5.0, 20.0), 0.15
-# Between two looks of a robot that drives about, 2 s apart; it is steadier than a hand.
+# Greatest motion of a driving robot between two looks 2 s apart. It is steadier than a hand.
 _DRIVE_M, _MOST_TURN_DEG, _DRIVE_ROLL_DEG = 0.5, 30.0, 0.5
 _ELBOW_ROOM_M = 0.2
-# A camera that is carried about one thing: its distance, and how it deviates from looking at it.
+# For a camera that is carried around a thing: its distance, and deviation of its direction.
 _ABOUT_M, _AIM_DEG = (0.8, 3.0), 5.0
 _TRIES = 100
-# Looks to choose from: the more things there are ahead, the more likely.
+# Number of looks to choose from. A look with more things ahead is more likely to be chosen.
 _CHOICES, _AHEAD_COSINE, _AHEAD_M = 16, 0.85, 4.0
 
 
@@ -40,8 +41,7 @@ def make_groups(place: Place, objects: Objects, groups: int, rng: np.random.Gene
                 ) -> NDArray[np.float64]:
     """Return the poses map_from_camera (groups, 5, 4, 4) of a robot in a place.
 
-    Its height and pitch are the same in the whole place. In each group it turns on the spot or
-    drives on while it turns.
+    Its height and pitch are constant. In each group it turns on the spot or drives while it turns.
     """
     height = rng.uniform(*_HEIGHT_M)
     pitch = np.radians(rng.uniform(*_PITCH_DEG))
@@ -65,7 +65,7 @@ def make_groups(place: Place, objects: Objects, groups: int, rng: np.random.Gene
 
 def _about(focus: NDArray[np.float64], height: float, rng: np.random.Generator
            ) -> NDArray[np.float64]:
-    """Return the poses (5, 4, 4) of a camera that is carried about a spot (3,) and looks at it."""
+    """Return the poses (5, 4, 4) of a camera that moves around a spot (3,) and looks at it."""
     distance, angle = rng.uniform(*_ABOUT_M), rng.uniform(-np.pi, np.pi)
     step, found = np.radians(rng.uniform(*_TURN_DEG)), np.empty((GROUP_SIZE, 4, 4))
     for number in range(GROUP_SIZE):
@@ -82,8 +82,8 @@ def drive_about(place: Place, objects: Objects, images: int, rng: np.random.Gene
                 ) -> NDArray[np.float64]:
     """Return the poses map_from_camera (images, 4, 4) of a robot that drives from spot to spot.
 
-    There are a look's time and at most half a metre or 30 degrees between two images. At each spot
-    it looks about or waits.
+    Two images are one period of looks apart, and at most half a metre or 30 degrees. At each spot
+    the robot looks around or waits.
     """
     height, pitch = rng.uniform(*_HEIGHT_M), np.radians(rng.uniform(*_PITCH_DEG))
     position, yaw = _look(place, objects, rng)
@@ -109,7 +109,7 @@ def drive_about(place: Place, objects: Objects, images: int, rng: np.random.Gene
 
 def _look(place: Place, objects: Objects, rng: np.random.Generator
           ) -> tuple[NDArray[np.float64], float]:
-    """Return a spot (2,) and a direction [rad] in which there are things to see."""
+    """Draw a spot (2,) and a viewing direction [rad], preferably towards many things."""
     spots = np.array([_free_spot(place, objects, rng) for _ in range(_CHOICES)])
     yaws = rng.uniform(-np.pi, np.pi, _CHOICES)
     offsets = objects.centers[:, :2] - spots[:, None]
@@ -132,7 +132,7 @@ def _free_spot(place: Place, objects: Objects, rng: np.random.Generator) -> NDAr
 
 def looking(position: NDArray[np.float64], yaw: float, pitch: float, roll: float = 0.0
           ) -> NDArray[np.float64]:
-    """Return map_from_camera of a camera that looks down by a pitch and rolls [rad]."""
+    """Return map_from_camera (4, 4) of a camera with a pitch downwards and a roll [rad]."""
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     down = np.cross(forward, right)

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detector and encoder in a simulated world.
 
-The detector misses, invents, jitters, splits and confuses. To the encoder, weak or strong, objects
-are vectors: a part of their class, and a part of their model, which is how they look. A crop is
-the vector of its object and noise, see cliploc_ros.offline.simulation.
+The detector has misses, false boxes, jitter, split boxes and confused classes. An encoder, weak or
+strong, represents an object by a vector with a part for its class and a part for its model, which
+is its look. A crop is the vector of its object plus noise, see cliploc_ros.offline.simulation.
 """
 
 from typing import NamedTuple
@@ -21,50 +21,51 @@ from studies.worlds.places import CLASS_NAMES, Objects, rows_of
 _LEAST_SIDE_PX, _RANGE_M = 12.0, 8.0
 _SHOWN_SHARE, _HIDDEN_SHARE = 0.4, 0.6
 _FALSE_SIDE_PX = (15.0, 150.0)
-# Ranges of detectors, from YOLOv3 on TUM fr3, YOLOv8n on the kitchen and the demo's detector;
-# measured by compare.py and, for rates of single objects, by hand.
+# The ranges below come from YOLOv3 on TUM fr3, YOLOv8n on the kitchen and the demo's detector.
+# They were measured by compare.py and, for rates of single objects, by hand.
 # An object that is seen half a second before and after is found at a rate of .55, .76, .89 and
 # .97 (quantiles .1, .25, .5 and .9 of the objects of fr3; the kitchen's: .74 to .83, -, .93, .99).
 _FOUND_A, _FOUND_B = (2.0, 5.0), (0.3, 1.2)  # of a beta distribution
 # Median distance of edges from the map's outlines: .053 (fr3), .050 (kitchen), .034 (demo); nine
 # tenths are below .18, .20 and .14. That includes the map's own errors.
 _BIAS = (0.01, 0.03)
-# From one frame to the next: .016 after 33 ms and .032 after .17 s (fr3), .026 (kitchen), .011
-# (demo), with long tails: nine tenths are below .07, .11, .10 and .04.
+# Change from one frame to the next: .016 after 33 ms and .032 after .17 s (fr3), .026 (kitchen),
+# .011 (demo), with long tails: nine tenths are below .07, .11, .10 and .04.
 _JITTER, _TAIL = (0.006, 0.025), 3
-# Half of the objects are ever taken for something else (fr3 .50, kitchen .30 to .50, demo .52),
-# at a median rate of .11 to .20; a tenth of these above .30 to .58.
+# Share of the objects that are ever classified wrongly: .50 (fr3), .30 to .50 (kitchen), .52
+# (demo). The median rate of these objects is .11 to .20; for a tenth of them it is above .30 to
+# .58.
 _CONFUSED, _CONFUSION_BETA = (0.1, 0.5), (0.6, 3.4)
 # Boxes in an image that no landmark explains: .3 to .7 (fr3), .2 to .4 (kitchen). Some of them
 # show objects that the map lacks.
 _FALSE_BOXES = (0.0, 0.4)
-# A guess: recordings do not tell halves from neighbours.
+# A guess, since half objects and neighbours cannot be distinguished in recordings.
 _SPLIT = (0.0, 0.05)
-# Of vectors: their size, and of their square, what tells an object from other ones of its model.
+# Size of vectors, and share of their squared length that distinguishes objects of one model.
 _SIZE, _OWN_SHARE = 128, 0.1
-# Top-1 rates of .85 to .4. The demo's CLIP, which knows its room, has .91. The simulated
-# similarities of TUM fr3 have .52 to .54, those of a weak encoder.
+# This noise gives top-1 rates of .85 to .4. The demo's CLIP, trained on similar rooms, has .91.
+# The simulated similarities of TUM fr3 have .52 to .54, like a weak encoder.
 _NOISE = (0.15, 0.6)
 
 
 class Detector(NamedTuple):
-    """A detector and how it sees n objects."""
+    """A detector, with its properties for each of n objects."""
 
     chances: NDArray[np.float64]  #: (n,): probability that an object in view is found
-    #: (n, 2, 4): by how much the edges of an object's box are off, as shares of its sides:
+    #: (n, 2, 4): systematic errors of the edges of an object's box, as shares of its sides:
     #: amplitudes of the cosine and the sine of the direction from which it is seen
     biases: NDArray[np.float64]
-    #: By how much each edge is off in each image, as a share of the box's side: the scale of
+    #: Random error of each edge in each image, as a share of the box's side: the scale of
     #: Student's t
     jitter: float
-    confused: tuple[str, ...]  #: The class that each object is taken for at times
-    confusion: NDArray[np.float64]  #: (n,): the share of these times
+    confused: tuple[str, ...]  #: The wrong class that each object is sometimes assigned
+    confusion: NDArray[np.float64]  #: (n,): probability of the wrong class
     split: float  #: Probability that an object gives two boxes
-    false_boxes: float  #: Mean number of boxes of nothing in an image
+    false_boxes: float  #: Mean number of boxes without an object in an image
 
     @staticmethod
     def random(objects: Objects, rng: np.random.Generator) -> 'Detector':
-        """Return a detector, drawn from the ranges of recorded ones."""
+        """Draw a detector from the ranges of recorded detectors."""
         count = len(objects.class_ids)
         is_confused = rng.random(count) < rng.uniform(*_CONFUSED)
         return Detector(
@@ -85,14 +86,14 @@ class Boxes(NamedTuple):
 
 def detect(detector: Detector, objects: Objects, shapes: NDArray[np.float64], camera: Camera,
            map_from_camera: NDArray[np.float64], rng: np.random.Generator) -> Boxes:
-    """Return what a detector finds in one image.
+    """Simulate the detections in one image.
 
     Parameters
     ----------
     objects : Objects
-        n of them.
+        The n objects of the world.
     shapes : ndarray (n, 6)
-        Theirs.
+        Shape matrices of the objects.
     map_from_camera : ndarray (4, 4)
     """
     rows, full = _in_view(objects, shapes, camera, map_from_camera)
@@ -108,7 +109,7 @@ def detect(detector: Detector, objects: Objects, shapes: NDArray[np.float64], ca
     names = np.where(rng.random(len(rows)) < detector.confusion[rows],
                      np.array(detector.confused, dtype=object)[rows],
                      np.array(objects.class_ids, dtype=object)[rows])
-    # Boxes, of which some have a second one around their upper half.
+    # Some objects get a second box around their upper half.
     twice = np.nonzero(rng.random(len(rows)) < detector.split)[0]
     halves = boxes[twice]
     halves[:, 3] = 0.5 * (halves[:, 1] + halves[:, 3])
@@ -127,14 +128,14 @@ def detect(detector: Detector, objects: Objects, shapes: NDArray[np.float64], ca
 def _in_view(objects: Objects, shapes: NDArray[np.float64], camera: Camera,
              map_from_camera: NDArray[np.float64]
              ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the objects in view (k,), the nearest first, and their boxes (k, 4) [px]."""
+    """Return the objects in view (k,), nearest first, and their boxes (k, 4) [px]."""
     distances = np.linalg.norm(objects.centers - map_from_camera[:3, 3], axis=1)
     near = np.argsort(distances)[:np.count_nonzero(distances < _RANGE_M)]
     found = boxes_in_image(camera, invert_transform(map_from_camera), objects.centers[near],
                            shapes[near], _SHOWN_SHARE, _LEAST_SIDE_PX)
     seen = np.nonzero(found.is_shown)[0]
     near, full, wholes = near[seen], found.boxes[seen], objects.wholes[near[seen]]
-    # parts of one thing do not hide one another
+    # parts of the same thing do not occlude each other
     is_part = (wholes[:, None] == wholes) & (wholes > 0)
     is_nearer = np.tri(len(seen), k=-1, dtype=np.bool_) & ~is_part
     free = ~is_hidden(found.shown[seen], is_nearer, _HIDDEN_SHARE)
@@ -149,7 +150,7 @@ class Encoder(NamedTuple):
 
     @staticmethod
     def random(rng: np.random.Generator) -> 'Encoder':
-        """Return a weak or a strong encoder."""
+        """Draw an encoder, from weak to strong."""
         return Encoder(_directions(len(CLASS_NAMES), rng), rng.uniform(*_NOISE))
 
     def vectors(self, class_ids: tuple[str, ...], models: NDArray[np.int64],
@@ -165,7 +166,7 @@ class Encoder(NamedTuple):
         return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
     def unknown(self, class_ids: tuple[str, ...]) -> NDArray[np.float64]:
-        """Return the vectors (n, D) of crops that show nothing but look like some class."""
+        """Return the vectors (n, D) of crops that show no object but resemble a class."""
         return np.asarray(np.sqrt(CLASS_SHARE) * self.classes[rows_of(class_ids)])
 
     def similarities(self, boxes: 'Boxes', vectors: NDArray[np.float64],
@@ -173,11 +174,11 @@ class Encoder(NamedTuple):
                      rng: np.random.Generator) -> NDArray[np.float32]:
         """Return the similarities (m, L) of the crops of m boxes and L labels.
 
-        Vectors and biases (n, D) are of the objects: what they are, and how all their crops differ
-        from it.
+        ``vectors`` (n, D) are those of the objects, ``biases`` (n, D) the common difference of all
+        crops of an object from its vector.
         """
         known = boxes.shown >= 0
-        # crops that show nothing look like some class
+        # crops that show no object resemble a class
         crops = np.sqrt(CLASS_SHARE) * self.classes[rows_of(boxes.class_ids)]
         crops[known] = vectors[boxes.shown[known]]
         own = draw_biases(len(known), rng)
@@ -187,7 +188,7 @@ class Encoder(NamedTuple):
 
 
 def draw_biases(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return how all crops of each object differ from its vector (n, D)."""
+    """Draw the common difference of all crops of each object from its vector (n, D)."""
     return np.asarray(rng.normal(size=(count, _SIZE)))
 
 

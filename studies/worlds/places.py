@@ -35,22 +35,22 @@ TYPICAL = {
     'sports ball': (0.11, 0.11, 0.11, 0.11), 'fire hydrant': (0.15, 0.15, 0.4, 0.4),
 }
 CLASS_NAMES = tuple(sorted(TYPICAL))
-#: What stands on the floor, what lies on a table, and what is on a shelf.
+#: Classes of things on the floor, on tables, on shelves and on walls.
 FURNITURE = ('chair', 'couch', 'potted plant', 'dining table', 'refrigerator', 'suitcase',
              'backpack', 'bench', 'teddy bear', 'sports ball', 'umbrella')
 ON_TABLES = ('laptop', 'keyboard', 'mouse', 'cell phone', 'book', 'vase', 'bottle', 'cup', 'bowl',
              'scissors', 'handbag', 'teddy bear')
 ON_SHELVES = ('bottle', 'book', 'cup', 'bowl', 'vase', 'wine glass', 'teddy bear', 'toaster')
 ON_WALLS = ('tv', 'clock')
-# What detectors take a vase with flowers, or a part of it, for.
+# Classes that detectors assign to a vase with flowers, or to a part of it.
 _CONFUSED = ('book', 'vase', 'potted plant', 'bottle', 'cup', 'book', 'book', 'chair')
-# Of each axis; volumes differ like those of the bottles, books and mice of TUM fr3, whose
-# logarithms of the mean axis deviate by .11 to .17.
+# Range of the factor of each axis. Volumes then vary like those of the bottles, books and mice of
+# TUM fr3, for which the logarithm of the mean axis has a deviation of .11 to .17.
 _GROWTH = (0.75, 1.3)
 
 
 class Thing(NamedTuple):
-    """One object: where its centre is [m], how it is turned [rad], and how it looks.
+    """An object: class, centre [m], yaw [rad] and look.
 
     Things of one class and model look alike.
     """
@@ -61,11 +61,11 @@ class Thing(NamedTuple):
     z: float
     yaw: float
     model: int
-    whole: int = 0  #: Number of what it is a part of; 0 for a thing of its own
+    whole: int = 0  #: Number of the thing that it is a part of; 0 for a complete thing
 
 
 class Objects(NamedTuple):
-    """The objects of a world, n of them."""
+    """The n objects of a world."""
 
     class_ids: tuple[str, ...]
     models: NDArray[np.int64]  #: (n,): objects of one class and model look alike
@@ -73,7 +73,7 @@ class Objects(NamedTuple):
     centers: NDArray[np.float64]
     semi_axes: NDArray[np.float64]
     yaws: NDArray[np.float64]  #: (n,): about the vertical [rad]
-    wholes: NDArray[np.int64]  #: (n,): what each is a part of; 0 for nothing else
+    wholes: NDArray[np.int64]  #: (n,): the thing that each is a part of; 0 for a complete thing
 
     @property
     def quats_xyzw(self) -> NDArray[np.float64]:
@@ -93,7 +93,7 @@ def rows_of(class_ids: Sequence[str]) -> list[int]:
 
 
 def make_objects(things: Sequence[Thing], rng: np.random.Generator) -> Objects:
-    """Return things as objects; those of one class and model have the same size."""
+    """Return things as objects; objects of one class and model have the same size."""
     models = np.array([thing.model for thing in things])
     sizes = np.array([TYPICAL[CLASS_NAMES[row]][:3] for row in rows_of([
         thing.name for thing in things])])
@@ -102,7 +102,8 @@ def make_objects(things: Sequence[Thing], rng: np.random.Generator) -> Objects:
     sizes *= [growth[thing.name, thing.model] for thing in things]
     return Objects(tuple(thing.name for thing in things), models,
                    np.array([[thing.x, thing.y, thing.z] for thing in things]), sizes,
-                   np.array([one.yaw for one in things]), np.array([one.whole for one in things]))
+                   np.array([thing.yaw for thing in things]),
+                   np.array([thing.whole for thing in things]))
 
 
 class Place(NamedTuple):
@@ -111,11 +112,11 @@ class Place(NamedTuple):
     width: float
     depth: float
     things: Sequence[Thing]
-    focus: tuple[float, float, float] | None = None  #: Where robots look from all sides [m]
+    focus: tuple[float, float, float] | None = None  #: Point that robots look at, all around [m]
 
 
 def room(rng: np.random.Generator) -> Place:
-    """Return a room: furniture, tables with things on them, no two alike."""
+    """Return a room: furniture and tables with things on them, all different."""
     width, depth = rng.uniform(3.0, 6.0, 2)
     things = _scattered(rng, FURNITURE, _some(rng, 5, 13), width, depth)
     for _ in range(_some(rng, 2, 5)):
@@ -138,7 +139,7 @@ def office(rng: np.random.Generator) -> Place:
 
 
 def shop(rng: np.random.Generator) -> Place:
-    """Return a shop: shelves with runs of the same thing, and few other objects."""
+    """Return a shop: shelves with rows of identical things, and few other objects."""
     aisles = _some(rng, 2, 5)
     width, depth = rng.uniform(4.0, 7.0), 1.5 + 1.8 * aisles
     things = []
@@ -157,11 +158,11 @@ def shop(rng: np.random.Generator) -> Place:
 
 
 def corridor(rng: np.random.Generator) -> Place:
-    """Return a corridor of equal bays; some bays lack a thing or have one of their own."""
+    """Return a corridor of equal bays; some bays lack a thing or have an extra one."""
     bays, pitch = _some(rng, 4, 11), rng.uniform(2.2, 4.0)
     width, depth = bays * pitch, rng.uniform(1.8, 3.0)
     pattern = _scattered(rng, (*FURNITURE, *ON_WALLS), _some(rng, 3, 8), pitch, depth)
-    things = [one._replace(x=one.x + pitch * bay) for bay in range(bays) for one in pattern
+    things = [thing._replace(x=thing.x + pitch * bay) for bay in range(bays) for thing in pattern
               if rng.random() < 0.93]
     things += _scattered(rng, FURNITURE, _some(rng, 0, bays), width, depth)
     return Place(width, depth, things)
@@ -173,9 +174,9 @@ def hall(rng: np.random.Generator) -> Place:
     half = _scattered(rng, FURNITURE, _some(rng, 6, 15), 0.5 * width, depth)
     for _ in range(_some(rng, 1, 4)):
         half += _table(rng, *_spot(rng, 0.5 * width, depth), _some(rng, 2, 9))
-    turned = [one._replace(x=width - one.x, y=depth - one.y, yaw=one.yaw + np.pi)
-              for one in half]
-    things = [one for one in half + turned if rng.random() < 0.93]
+    turned = [thing._replace(x=width - thing.x, y=depth - thing.y, yaw=thing.yaw + np.pi)
+              for thing in half]
+    things = [thing for thing in half + turned if rng.random() < 0.93]
     return Place(width, depth, things + _scattered(rng, (*FURNITURE, *ON_WALLS),
                                                    _some(rng, 0, 5), width, depth))
 
@@ -188,20 +189,20 @@ def bare_room(rng: np.random.Generator) -> Place:
 
 
 def two_rooms(rng: np.random.Generator) -> Place:
-    """Return two equal rooms side by side, of which each has up to three things of its own."""
-    one = room(rng)
+    """Return two equal rooms side by side, each with up to three extra things."""
+    first = room(rng)
     gap = 1.5
-    twin = [thing._replace(x=thing.x + one.width + gap) for thing in one.things]
-    own = [_scattered(rng, FURNITURE, _some(rng, 0, 4), one.width, one.depth)
+    twin = [thing._replace(x=thing.x + first.width + gap) for thing in first.things]
+    own = [_scattered(rng, FURNITURE, _some(rng, 0, 4), first.width, first.depth)
            for _ in range(2)]
-    moved = [thing._replace(x=thing.x + one.width + gap) for thing in own[1]]
-    return Place(2.0 * one.width + gap, one.depth, [*one.things, *twin, *own[0], *moved])
+    moved = [thing._replace(x=thing.x + first.width + gap) for thing in own[1]]
+    return Place(2.0 * first.width + gap, first.depth, [*first.things, *twin, *own[0], *moved])
 
 
 def arrangement(rng: np.random.Generator) -> Place:
-    """Return a room with a table, and a robot that looks at what stands on it from all sides.
+    """Return a room with a table; a robot looks at the things on it from all sides.
 
-    A detector takes these things, or parts of them, for several classes.
+    A detector assigns several classes to these things, or to parts of them.
     """
     size = rng.uniform(4.0, 6.0)
     table, *things = _table(rng, 0.5 * size, 0.5 * size, 0)
@@ -216,7 +217,7 @@ def arrangement(rng: np.random.Generator) -> Place:
 
 
 def row(rng: np.random.Generator) -> Place:
-    """Return things on one line: a shelf, or what stands along a corridor."""
+    """Return things on one line: on a shelf, or along a corridor."""
     length, on_floor = rng.uniform(2.0, 5.0), rng.random() < 0.5
     count, height = _some(rng, 5, 13), float(rng.choice((0.5, 0.9, 1.3)))
     things = [Thing(name, length * (number + rng.uniform(0.2, 0.8)) / count,
@@ -228,7 +229,7 @@ def row(rng: np.random.Generator) -> Place:
 
 
 def one_desk(rng: np.random.Generator) -> Place:
-    """Return a desk with its usual things, and one or two of furniture."""
+    """Return a desk with its usual things, and up to two pieces of furniture."""
     things = _desk(rng, 2.0, 2.0, rng.uniform(0.0, np.pi), rng.uniform(0.3, 0.9))
     things += _scattered(rng, FURNITURE, _some(rng, 0, 3), 4.0, 4.0)
     return Place(4.0, 4.0, things, (2.0, 2.0, 0.8))
@@ -242,7 +243,7 @@ KINDS: dict[str, Callable[[np.random.Generator], Place]] = {
 
 
 def _some(rng: np.random.Generator, least: int, limit: int) -> int:
-    """Return a whole number from least to below limit."""
+    """Draw an integer from least (inclusive) to limit (exclusive)."""
     return int(rng.integers(least, limit))
 
 
@@ -256,7 +257,7 @@ def _spot(rng: np.random.Generator, width: float, depth: float) -> tuple[float, 
 
 def _scattered(rng: np.random.Generator, names: Sequence[str], count: int, width: float,
                depth: float) -> list[Thing]:
-    """Return things at random spots, at the usual height, each with its own looks."""
+    """Return things at random spots, at their usual heights, all looking different."""
     return [Thing(name, *_spot(rng, width, depth), TYPICAL[name][3],
                   rng.uniform(0.0, np.pi), _new_model(rng))
             for name in map(str, rng.choice(names, count))]
@@ -296,7 +297,7 @@ def _beside(table: Thing, name: str, u: float, v: float, rng: np.random.Generato
 
 def _desk(rng: np.random.Generator, x: float, y: float, yaw: float, likeness: float
           ) -> list[Thing]:
-    """Return a desk; likeness is the share of its things that look as on every desk."""
+    """Return a desk; likeness is the share of its things that look the same on every desk."""
     desk = Thing('dining table', x, y, TYPICAL['dining table'][3], yaw, 0)
     usual = (('tv', 0.0, 0.25, 0.9), ('keyboard', 0.0, -0.1, 0.9), ('mouse', 0.35, -0.1, 0.9),
              ('chair', 0.0, -0.7, 0.9), ('laptop', -0.45, 0.0, 0.4), ('cup', 0.55, 0.1, 0.5),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One simulated world: a map with errors, and what a robot sees there."""
+"""A simulated world: a map with errors, and a robot's observations."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -22,25 +22,25 @@ from studies.worlds.places import KINDS, Objects, Place, make_objects
 
 _FRAME_S = 1.0
 _SCORE = 0.8
-# Where objects are that were taken away [m], and from where on a landmark is wrong.
+# Position of removed objects [m], and distance from its object beyond which a landmark is wrong.
 _GONE, _WRONG_M = 1e3, 0.3
-# Cameras of one robot lie on a circle of this radius; their mounts are off on each axis.
+# Radius of the circle of a robot's cameras, and deviations of their mounts on each axis.
 _RADIUS_M, _MOUNT_M, _MOUNT_DEG = 0.15, 0.01, 0.5
 # Deviation of the scale of depth from world to world: a guess.
 _DEPTH_SCALE = 0.02
-# Sources of the errors of maps: maps that build_map made of TUM fr3 (splits even, block and half),
+# The errors of maps come from maps that build_map made of TUM fr3 (splits even, block and half),
 # of the kitchen's even and odd frames, and of the demo's walk.
-# Landmarks of two maps are off by 0.3 to 1.7 cm on each axis (fr3), 0.5 to 3 cm (kitchen); poses
-# that are off by 5 cm cost 3 cm (doc/mapping.md). Deviation, and its spread among the landmarks
-# of a map: position_sigma is .003, .009 and .026 m at the quantiles .1, .5 and .9.
+# Landmarks of two maps differ by 0.3 to 1.7 cm on each axis (fr3), 0.5 to 3 cm (kitchen); errors
+# of 5 cm in the poses add 3 cm (doc/mapping.md). Range of the deviation, and its spread among the
+# landmarks of a map: position_sigma is .003, .009 and .026 m at the quantiles .1, .5 and .9.
 _SIGMA_M, _SIGMA_SPREAD, _MOST_SIGMA_M = (0.004, 0.025), 0.85, 0.1
 # Logarithms of axes differ by .05 to .14 (fr3), .11 (kitchen). The tilt is a guess.
 _SHAPE_DEVIATION, _TILT_DEG = (0.04, 0.12), 5.0
-# Boxes that no landmark explains: .04 to .19 (fr3), .05 to .12 (kitchen), .15 (demo); a quarter
-# of the demo's objects is not found.
+# Share of boxes that no landmark explains: .04 to .19 (fr3), .05 to .12 (kitchen), .15 (demo); a
+# quarter of the demo's objects is missing in the map.
 _MISSING = (0.0, 0.25)
-# Landmarks of one class inside each other: .03 to .12 in automatic maps, two for each double; none
-# in maps that a person has seen.
+# Share of landmarks that overlap another of their class: .03 to .12 in automatic maps, counting
+# both of each pair; none in maps that a person has checked.
 _DOUBLED = (0.0, 0.06)
 # Guesses: no recording has changes or wrong labels.
 _MOVED, _MOVED_M, _MISLABELLED = (0.0, 0.1), (0.3, 3.0), (0.0, 0.06)
@@ -51,8 +51,8 @@ class World:
     """A simulated world."""
 
     kind: str  #: One of KINDS
-    landmark_map: LandmarkMap  #: With errors
-    #: All images, five of each group in order of time. They know neither vertical nor odometry.
+    landmark_map: LandmarkMap  #: The map, with errors
+    #: All images, five of each group in order of time, without vertical and odometry
     queries: tuple[PosedQuery, ...]
 
     @property
@@ -62,7 +62,7 @@ class World:
 
 
 class Survey(NamedTuple):
-    """A map, and the object that each landmark is and is described as (L,)."""
+    """A map; the object of each landmark (L,), and the object that its label describes (L,)."""
 
     landmark_map: LandmarkMap
     objects: NDArray[np.int64]
@@ -70,13 +70,13 @@ class Survey(NamedTuple):
 
 
 def survey(objects: Objects, rng: np.random.Generator) -> Survey:
-    """Return a map of some objects, with what is wrong in maps: places, doubles, gaps, labels."""
+    """Return a map of objects with errors: wrong positions, doubles, gaps and wrong labels."""
     sigma_m, shape, missing, doubled, moved_share, mislabelled = (
         rng.uniform(*limits) for limits in (_SIGMA_M, _SHAPE_DEVIATION, _MISSING, _DOUBLED, _MOVED,
                                             _MISLABELLED))
     states_sigma = rng.random() < 0.5
     kept = np.nonzero(rng.random(len(objects.class_ids)) >= missing)[0]
-    if len(kept) < 3:  # a map of fewer localizes nothing
+    if len(kept) < 3:  # localization needs three landmarks
         kept = np.arange(len(objects.class_ids))
     rows = np.concatenate([kept, kept[rng.random(len(kept)) < doubled]])
     described = rows.copy()
@@ -92,7 +92,7 @@ def survey(objects: Objects, rng: np.random.Generator) -> Survey:
     axes = objects.semi_axes[rows] * np.exp(shape * rng.normal(size=(len(rows), 3)))
     tilts = Rotation.from_rotvec(np.radians(_TILT_DEG) * rng.normal(size=(len(rows), 3)))
     names = tuple(objects.class_ids[row] for row in described)
-    details = tuple(LandmarkDetails(position_sigma=float(one)) for one in sigmas) \
+    details = tuple(LandmarkDetails(position_sigma=float(sigma)) for sigma in sigmas) \
         if states_sigma else ()
     return Survey(LandmarkMap(
         'map', tuple(f'{name.replace(" ", "_")}_{number}' for number, name in enumerate(names)),
@@ -102,7 +102,7 @@ def survey(objects: Objects, rng: np.random.Generator) -> Survey:
 
 
 class _Scene(NamedTuple):
-    """Everything that the images of a world show."""
+    """The content of a world that determines its images."""
 
     objects: Objects
     shapes: NDArray[np.float64]
@@ -111,7 +111,7 @@ class _Scene(NamedTuple):
     encoder: Encoder
     vectors: NDArray[np.float64]
     biases: NDArray[np.float64]
-    depth_scale: float | None = None  #: Measured over true depth; None without depth
+    depth_scale: float | None = None  #: Ratio of measured to true depth; None without depth
 
 
 def make_world(kind: str, seed: int, groups: int = 4, has_depth: bool = False,
@@ -123,11 +123,12 @@ def make_world(kind: str, seed: int, groups: int = 4, has_depth: bool = False,
     kind : str
         One of KINDS.
     groups : int
-        Places from which the robot looks, five images each.
+        Number of places from which the robot looks, with five images each.
     has_depth : bool
-        Whether the camera measures depth; all else stays the same.
+        Whether the camera measures depth; everything else is the same.
     cameras : int
-        The robot has more cameras, in equal angles. They are neighbours of the first one's image.
+        Number of the robot's cameras, at equal angles. Images of the others are neighbours of the
+        first camera's image.
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     place, scene = _make_scene(kind, rng)
@@ -146,8 +147,8 @@ class Drive:
     """A world, and the images of a long drive through it."""
 
     world: World
-    size: tuple[float, float]  #: Of the place, from (0, 0) [m]
-    #: (L,): landmarks whose object was taken away or moved since the place was mapped
+    size: tuple[float, float]  #: Size of the place, from (0, 0) [m]
+    #: (L,): landmarks whose object was removed or moved since the place was mapped
     changed: NDArray[np.bool_]
     #: (L,): landmarks that are not where an object of their class is, or have another class
     wrong: NDArray[np.bool_]
@@ -156,14 +157,14 @@ class Drive:
 def make_drive(kind: str, seed: int, images: int, changed: float = 0.0) -> Drive:
     """Return a world and a drive through it, after a share of its objects changed.
 
-    Half of these were taken away, the others are elsewhere in the place.
+    Half of these objects are removed, the others are elsewhere in the place.
 
     Parameters
     ----------
     kind : str
         One of KINDS.
     seed : int
-        Its objects and map are those of make_world.
+        Seed of the world; objects and map are the same as in make_world.
     """
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     place, scene = _make_scene(kind, rng)
@@ -201,7 +202,7 @@ def _seen(kind: str, scene: _Scene, camera: Camera, poses: NDArray[np.float64],
 
 def _with_cameras(scene: _Scene, camera: Camera, query: PosedQuery, count: int,
                   rng: np.random.Generator) -> PosedQuery:
-    """Return a query with what the robot's other cameras see, whose mounts are a bit wrong."""
+    """Return a query with observations of the robot's other cameras, whose mounts have errors."""
     others = []
     for row in range(1, count):
         turn = Rotation.from_euler('y', 360.0 * row / count, degrees=True)

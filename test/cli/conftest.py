@@ -12,7 +12,7 @@ from cliploc_ros.offline.datasets.observations import load_observations, save_ob
 
 @pytest.fixture
 def start():
-    """Start an executable as its own process; kill it at the end if it still runs."""
+    """Start an executable in a separate process; kill it at the end if it is still running."""
     processes = []
 
     def start_process(module: str, *args: object, **options) -> subprocess.Popen:
@@ -35,7 +35,7 @@ def make_sequence(tmp_path):
 
 @pytest.fixture(scope='session')
 def observations(shared_data, tmp_path_factory):
-    """Every sixteenth frame of the office: enough for a map, and quick."""
+    """Return every sixteenth frame of the office: enough for a map, and fast."""
     whole = load_observations(shared_data / 'tum_fr3_office' / 'observations.npz')
     path = tmp_path_factory.mktemp('office') / 'office.npz'
     save_observations(path, whole.select_frames(range(0, len(whole), 16)))

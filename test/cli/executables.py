@@ -27,7 +27,7 @@ from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import RELIABLE_QOS, BagWriter
 
 PROJECT = Path(__file__).resolve().parents[2]
-TIMEOUT_S = 120.0  # a limit for hangs alone, on a machine under load
+TIMEOUT_S = 120.0  # only to stop hangs, on a machine under load
 SIZE = (64, 48)
 START_NS = 1_700_000_000_123_456_789
 MS = 1_000_000
@@ -36,7 +36,7 @@ RECORDED_QOS = RELIABLE_QOS._replace(history=QosHistory.UNKNOWN, depth=0)
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = TIMEOUT_S) -> None:
-    """Wait for a condition; fail if it does not come true in time."""
+    """Wait for a condition; fail at the time limit."""
     deadline = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > deadline:
@@ -49,7 +49,7 @@ def command(module: str, *args: object) -> list[str]:
 
 
 def run(module: str, *args: object, **options) -> subprocess.CompletedProcess:
-    """Run an executable to its end."""
+    """Run an executable until it ends."""
     return subprocess.run(command(module, *args), cwd=PROJECT, text=True, capture_output=True,
                           timeout=TIMEOUT_S, **options)
 
@@ -92,7 +92,7 @@ def write_sequence(folder: Path, count: int = 4, suffix: str = 'png') -> SmallSe
 
 
 def write_poses(path, offsets_ms, topics=None):
-    """Write a recording of poses at offsets [ms] on topics with their QoS, all at once."""
+    """Write a recording of poses at offsets [ms] on topics with their QoS."""
     topics = topics or {'/pose': RECORDED_QOS}
     with BagWriter(path, 'mcap') as bag:
         for name, qos in topics.items():

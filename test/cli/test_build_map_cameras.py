@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``build_map --bag --cameras``: the demo's rig, four cameras at six places, in one recording."""
+"""Test ``build_map --bag --cameras`` with the demo's rig: four cameras at six places."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def bag(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def built(bag):
-    """Return the files of maps: from all cameras, whose poses are in tf, and from one."""
+    """Return the files of two maps: from all cameras, with poses in tf, and from one camera."""
     paths = {}
     for names in (ALL, ('back',)):
         paths[names] = path = bag.with_name(f'{len(names)}.yaml')
@@ -42,10 +42,10 @@ def built(bag):
 
 
 def errors_of(path):
-    """Return how far each landmark is from the nearest true object of its class [m]."""
+    """Return the distance of each landmark to the nearest true object of its class [m]."""
     found, objects = LandmarkMap.from_file(path), read_objects(RIG / 'front')
-    return np.array([min(np.linalg.norm(one.center - center) for one in objects
-                         if one.class_id == name)
+    return np.array([min(np.linalg.norm(item.center - center) for item in objects
+                         if item.class_id == name)
                      for center, name in zip(found.centers, found.class_ids, strict=True)])
 
 
@@ -61,7 +61,7 @@ def test_the_observations_keep_cameras_and_poses(built):
     recorded = load_observations(built[ALL].with_suffix('.npz'))
     assert recorded.camera_names == ALL
     assert np.bincount(recorded.frame_cameras).tolist() == [6] * 4
-    assert [(one.width, one.fx) for one in recorded.cameras] == [
+    assert [(camera.width, camera.fx) for camera in recorded.cameras] == [
         (640, 500.0), (320, 250.0), (640, 500.0), (640, 500.0)]
     for frame in range(24):
         truth = read_tum(RIG / recorded.name_of(frame)).pose_at(

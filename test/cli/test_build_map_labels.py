@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""build_map labels a map with the demo's CLIP, and stores what it saw next to the map."""
+"""build_map labels a map with the demo's CLIP, and stores image embeddings next to the map."""
 
 import contextlib
 import io
@@ -17,7 +17,7 @@ from cliploc_ros.offline.datasets.observations import load_observations
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 CLIP = ('--clip-pretrained', ASSETS / 'clip', '--device', 'cpu')
-# a short walk sees objects from one side
+# a short walk shows objects from one side only
 SHORT = ('--min-baseline', '0.5', '--no-check')
 IMAGES = 10
 COLOURS = ('red', 'orange', 'yellow', 'green', 'blue', 'purple', 'pink', 'brown', 'black', 'white')
@@ -29,7 +29,7 @@ def build(*args):
 
 @pytest.fixture(scope='module', autouse=True)
 def own_cache(tmp_path_factory):
-    """Phrases are encoded once in this module."""
+    """Provide an encoder cache, so that phrases are encoded once in this module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv('XDG_CACHE_HOME', str(tmp_path_factory.mktemp('cache')))
         yield
@@ -37,7 +37,7 @@ def own_cache(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
-    """The first images of the demo's walk."""
+    """Return the first images of the demo's walk."""
     folder = tmp_path_factory.mktemp('walk') / 'tum'
     shutil.copytree(ASSETS / 'sequence', folder)
     rows = [row for row in (folder / 'rgb.txt').read_text().splitlines() if row[0] != '#']
@@ -47,7 +47,7 @@ def walk(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def observations(walk):
-    """What the networks said of the walk, and a map labelled with the shipped vocabulary."""
+    """Return recorded observations of the walk, and a map labelled with the shipped vocabulary."""
     file = walk.parent / 'walk.npz'
     with contextlib.redirect_stdout(io.StringIO()):
         code = build('--tum', walk, '--model', ASSETS / 'yolo.onnx', *CLIP, '--keyframes', 0, 0,
@@ -57,7 +57,7 @@ def observations(walk):
 
 
 def true_labels(built):
-    """Return the true label of each landmark that lies at the place of one, else ''."""
+    """Return the true label of each landmark at the place of an object, otherwise ''."""
     true = LandmarkMap.from_file(ASSETS / 'map.yaml')
     distances = np.linalg.norm(built.centers[:, None] - true.centers, axis=2)
     return [true.labels[row] if distance < 0.15 else ''

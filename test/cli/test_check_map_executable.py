@@ -73,8 +73,8 @@ def test_the_office_passes_but_for_its_doubles(check_map, shared_data, tmp_path)
     checked = json.loads((tmp_path / 'check.json').read_text())
     assert checked['recording']['held_out']['explained'] > 0.8
     # all images show these two pairs; a third one, a spoon in a cup, has few boxes here
-    doubles = [{one['first'], one['second']} for one in checked['overlaps']
-               if one['is_duplicate']]
+    doubles = [{overlap['first'], overlap['second']} for overlap in checked['overlaps']
+               if overlap['is_duplicate']]
     assert len(doubles) == 3
     assert {'teddy_bear_1', 'chair_3'} in doubles and {'refrigerator_1', 'book_5'} in doubles
     assert len(checked['queries']) == 52

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of the pages, from a recorded bag to a pose, in their order."""
+"""Run the commands of the pages in order, from a recorded bag to a pose."""
 
 import importlib
 import json
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.full
 
 PAGES = [PROJECT / page for page in ('doc/first_relocalization.md', 'README.md',
                                      'doc/your_robot.md', 'doc/mapping.md', 'doc/keyframes.md')]
-# Of another robot or recording, or with a network that has to be downloaded.
+# Commands for another robot or recording, or for a network that has to be downloaded.
 OTHER = {'--cameras', '--update', '--observations', '--colmap', '--queries', '--keyframe-features'}
 MOUNT = mount_from_numbers([0.1, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5])
 FEW = ('--positions', '4', '--headings', '2', '--frames', '10')
@@ -43,7 +43,7 @@ TOPICS = {'/camera/image_raw': bag_messages.IMAGE,
 
 
 def write_drive(path, folder, every):
-    """Write the bag that the pages record: images, camera_info, and the robot's tf."""
+    """Write the bag that the pages record: images, camera_info and the robot's tf."""
     sequence, camera, _ = read_sequence(folder, None)
     sequence = sequence.every(every)
     image, info = list(TOPICS)[:2]
@@ -84,9 +84,9 @@ def drive(request, tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def built(drive, tmp_path_factory):
-    """Return the drive, and what the first command of the page printed.
+    """Return the drive, and the output of the page's first command.
 
-    Where its networks are ONNX files, PyTorch is not there.
+    With ONNX networks, PyTorch cannot be imported.
     """
     folder, networks, _ = drive
     has_onnx = any(each.endswith('.onnx') for each in networks)
@@ -103,11 +103,11 @@ def main_of(name):
 
 
 def documented(pages):
-    """Return the commands that make, check or open the map of a drive, each once."""
+    """Return the commands that make, check or open the map of a drive, without duplicates."""
     found = []
     for page in pages:
-        for one in commands_of(page):
-            module, arguments = program_of(one)
+        for command in commands_of(page):
+            module, arguments = program_of(command)
             name = module.rpartition('.')[2]
             if (name in ('build_map', 'check_map', 'studio') and not OTHER & {*arguments}
                     and ('drive' in arguments or (name != 'build_map'
@@ -117,7 +117,7 @@ def documented(pages):
 
 
 FIRST, *ON_PAGE = documented(PAGES[:1])
-ELSEWHERE = [one for one in documented(PAGES) if one not in (FIRST, *ON_PAGE)]
+ELSEWHERE = [command for command in documented(PAGES) if command not in (FIRST, *ON_PAGE)]
 
 
 @BOTH
@@ -134,7 +134,7 @@ def test_one_command_leads_from_a_bag_to_a_checked_map(built):
 
 @BOTH
 def test_the_other_commands_run(built, monkeypatch):
-    """In one test, so that pytest makes each map once."""
+    """Test all commands in one test, so that pytest makes each map once."""
     folder, networks, _, _ = built
     monkeypatch.chdir(folder)
     for name, *arguments in (*ON_PAGE, *(() if '--no-clip' in networks else ELSEWHERE)):
@@ -157,8 +157,8 @@ def test_the_nodes_answer_as_the_page_says(built, monkeypatch):
     monkeypatch.chdir(folder)
     processes = []
     try:
-        for one in commands_of(PAGES[0]):
-            module, arguments = program_of(one)
+        for command in commands_of(PAGES[0]):
+            module, arguments = program_of(command)
             name = module.rpartition('.')[2]
             words = [sys.executable, '-m', module, *arguments]
             if name in ('detector', 'relocalizer'):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map of a COLMAP project, a walk of a phone in it, and the studio with its images."""
+"""Build a map of a COLMAP project, localize a phone's walk in it, and open it in the studio."""
 
 import json
 import shutil
@@ -61,7 +61,7 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     assert '12 of 12 images' in capsys.readouterr().out
     accepted = [trial for trial in json.loads((tmp_path / 'out/results.json').read_text())
                 if trial['accepted']]
-    assert len(accepted) > 4 and max(one['error_m'] for one in accepted) < 0.5
+    assert len(accepted) > 4 and max(result['error_m'] for result in accepted) < 0.5
 
     studio = open_studio(make_parser().parse_args([str(built), '--images', str(walk)]))
     try:
@@ -70,7 +70,7 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
             studio.recording.detections.stamps_s[3])).shape == (480, 640, 3)
     finally:
         studio.document.close()
-    # the studio shows each image as the camera of the boxes does, whatever its own focus is
+    # the studio shows each image through the camera of its boxes, whatever focal length it states
     image = open_images(folder, None).near(2.0, '', Camera(640, 480, 250.0, 250.0, 319.5, 239.5))
     assert (image[:110] == 0).all() and image[240, 320].any()
 
@@ -83,7 +83,7 @@ def errors_of(folder):
 @pytest.mark.parametrize('how', [('--scale', '0.4'), ('--object-size', 'clock', '0.3')])
 def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, capsys, caplog,
                                                                      how):
-    """The options are known from the map; another scale runs no network again."""
+    """The options are known from the map; a different scale does not run the networks again."""
     import pycolmap
 
     tilt = np.eye(4)
@@ -119,7 +119,7 @@ def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, c
     assert len(twice) == again.sum()
     np.testing.assert_array_equal(once.select_frames(np.nonzero(again)[0]).bboxes_xyxy,
                                   twice.bboxes_xyxy)
-    # boxes are of the pinhole of their camera: those of another camera would be wrong
+    # boxes refer to the pinhole of their camera, so boxes of another camera would be wrong
     model = pycolmap.Reconstruction(str(folder / 'sparse/0'))
     for camera in model.cameras.values():
         camera.focal_length_x *= 1.01

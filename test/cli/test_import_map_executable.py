@@ -25,7 +25,7 @@ def office(shared_data):
 
 @pytest.fixture(scope='module')
 def table(office, tmp_path_factory):
-    """The office as another system may have it: 5 cm off on each axis, too large (simulated)."""
+    """Return the office as another system may store it: 5 cm off on each axis, and too large."""
     rng = np.random.default_rng(0)
     text = table_text(LandmarkMap(
         'map', office.landmark_ids, office.labels, office.class_ids,

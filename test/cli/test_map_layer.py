@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``build_map --keyframe-layer``: what it refuses, and the file that it writes."""
+"""``build_map --keyframe-layer``: what it refuses, and the written file."""
 
 from pathlib import Path
 

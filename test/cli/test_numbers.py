@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""No executable takes what is not a number for a number."""
+"""No executable accepts text that is not a number as a number."""
 
 import argparse
 from importlib import import_module
@@ -9,7 +9,7 @@ import pytest
 
 PROGRAMS = ('build_map', 'check_map', 'demo', 'doctor', 'evaluate', 'import_map', 'prepare',
             'replay', 'studio', 'tum_to_bag', 'wake_up')
-#: Options without a limit may say so.
+#: Options without a limit may accept infinity.
 MAY_BE_INFINITE = {'--time-budget-ms', '--height-range'}
 
 
@@ -40,5 +40,5 @@ def test_options_that_are_numbers_refuse_nan_and_infinity(program):
     ('evaluate', '--max-gap'), ('evaluate', '--seed'), ('import_map', '--scale'),
     ('tum_to_bag', '--every')])
 def test_what_is_counted_or_measured_is_not_negative(program, name):
-    action = next(one for one in options_of(program) if name in one.option_strings)
+    action = next(action for action in options_of(program) if name in action.option_strings)
     assert takes(action, '2') and not takes(action, '-1')

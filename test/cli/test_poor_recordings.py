@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings without landmarks, with poor ones, and with what moves: said plainly."""
+"""Recordings without landmarks, with poor landmarks or moving objects get clear messages."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ from cliploc_ros.offline.mapping.options import MappingOptions
 
 
 def test_a_map_of_keyframes_alone(shared_data, tmp_path, capsys):
-    """Nothing is a landmark, and the images still tell where the camera is."""
+    """There is no landmark, but the images still localize the camera."""
     folder, out = shared_data / 'tum_fr3_office', tmp_path / 'office.yaml'
     given = ['--tum', str(folder), '--no-clip', '--min-viewpoints', '16', '--out', str(out),
              '--model', str(shared_data / 'weights/yolov8n_coco.pt'),
@@ -56,7 +56,7 @@ def office(shared_data):
 
 
 def test_a_poor_map_takes_no_place(office, tmp_path, capsys):
-    """Poses that are not of the images: the map is kept beside, and the exit code tells it."""
+    """Poses of other images: the map is written under another name, and the exit code is 1."""
     rng = np.random.default_rng(0)
     poses = office.map_from_camera.copy()
     poses[:, :3, 3] += rng.normal(0.0, 1.2, (len(poses), 3))
@@ -71,7 +71,7 @@ def test_a_poor_map_takes_no_place(office, tmp_path, capsys):
 
 
 def test_what_moves_is_no_landmark(office, tmp_path, capsys):
-    """The bottles are persons now: none is mapped, unless the list says otherwise."""
+    """The bottles are persons here: none is mapped unless the list allows it."""
     names = tuple('person' if name == 'bottle' else name for name in office.class_names)
     crowded = replace(office, class_names=names)
     plain = build(crowded, MappingOptions(moving_classes=())).landmark_map

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executables tum_to_bag and replay: real recordings, processes and listening nodes."""
+"""Test the executables tum_to_bag and replay with real recordings, processes and nodes."""
 
 import os
 import signal
@@ -51,7 +51,7 @@ def recorded(path):
 
 
 def offset_ms(data):
-    """Return how long after the recording's start a received pose is [ms]."""
+    """Return the stamp of a received pose relative to the recording's start [ms]."""
     return (bag_messages.stamp_ns(deserialize_message(data, PoseStamped)) - START_NS) / MS
 
 
@@ -68,7 +68,8 @@ def test_real_frames_arrive_byte_identical(shared_data, tmp_path, listener, stor
         listener.listen(topic, CLASSES[topic])
     done = run('replay', bag, '--rate', 16, '--wait-for-subscribers')
     assert done.returncode == 0, done.stderr
-    wait_until(lambda: all(len(listener.received[one]) == len(expected[one]) for one in expected))
+    wait_until(lambda: all(len(listener.received[topic]) == len(expected[topic])
+                           for topic in expected))
     for topic, messages in expected.items():
         for received, sent in zip(listener.received[topic], messages, strict=True):
             # RTPS pads a payload to a multiple of four bytes
@@ -96,7 +97,7 @@ def test_qos_is_as_recorded(tmp_path, listener, start):
         (endpoint,) = endpoints(name)
         assert endpoint.qos_profile.reliability == reliability, name
         assert endpoint.qos_profile.durability == durability, name
-    # The first message is sent; a late subscriber still receives the latched ones.
+    # The first message has been sent; a late subscriber still receives the latched messages.
     late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     listener.listen('/map', PoseStamped, late)
     listener.listen('/latched', PoseStamped, late)
@@ -150,7 +151,7 @@ def test_start_offset_sends_what_is_latched_first(tmp_path, listener):
 
 
 def stop(process, number):
-    """Signal a process; expect it to end cleanly within 2 s."""
+    """Signal a process; expect it to exit cleanly within 2 s."""
     begin = time.monotonic()
     process.send_signal(number)
     output, errors = process.communicate(timeout=10)
@@ -173,7 +174,7 @@ def test_signal_ends_a_long_pause(tmp_path, start, listener, number):
 def assert_refused(done, *messages):
     assert done.returncode == 1
     *before, line = done.stderr.splitlines()
-    assert all('[rcl]' in one for one in before)  # rcl logs the error too
+    assert all('[rcl]' in line for line in before)  # rcl logs the error too
     assert line.startswith('error: ')
     for message in messages:
         assert message in line
@@ -216,7 +217,7 @@ print('received', flush=True)
 
 @pytest.fixture
 def subscriber():
-    """Start a reliable subscriber of /pose in a process of its own."""
+    """Start a reliable subscriber of /pose in a separate process."""
     process = subprocess.Popen([sys.executable, '-c', SUBSCRIBER], stdout=subprocess.PIPE,
                                text=True)
     assert process.stdout.readline() == 'ready\n'

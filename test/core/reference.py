@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The method in plain Python: what the compiled kernels are compared with.
+"""The method in plain Python, as a reference for the compiled kernels.
 
 Candidates are masks (n, L) of detections and landmarks. Poses are compared pair by pair, without
 bounds and without culling.
@@ -39,7 +39,7 @@ def candidate_mask(candidates: Candidates, shape: tuple[int, int]) -> NDArray[np
 
 def scene_of(room, map_from_camera=MAP_FROM_CAMERA, rows=slice(None), noise_px=0.0, rng=None
              ) -> Scene:
-    """Return the scene of a frame: boxes of some landmarks, which may be any of their class."""
+    """Return the scene of a frame: boxes of some landmarks, with all landmarks of their class."""
     boxes = boxes_of(room, map_from_camera)[rows]
     if noise_px:
         boxes = boxes + rng.normal(0, noise_px, boxes.shape)
@@ -51,15 +51,15 @@ def scene_of(room, map_from_camera=MAP_FROM_CAMERA, rows=slice(None), noise_px=0
 def sample_pose(scene: Scene, sample: NDArray[np.int64]) -> tuple[Pose | None, float]:
     """Return the hypothesis of a minimal sample, and the sum of the IoUs of its three pairs.
 
-    The hypothesis is the P3P solution with the greatest sum, of those for which all three
-    ellipsoids lie wholly in front of the camera; None if there is none.
+    The hypothesis is the P3P solution with the greatest sum among those for which all three
+    ellipsoids lie completely in front of the camera; None if there is none.
     """
     detections, landmarks = scene.pairs[sample].T
     best, best_total = None, -1.0
     for pose in zip(*solve_p3p(scene.bearings[detections], scene.centers[landmarks]), strict=True):
         total = sum(pair_iou(scene, detection, outline) for detection, outline in zip(
             detections, outlines_of(scene, landmarks, pose), strict=True))
-        if total > best_total:  # never true of NaN
+        if total > best_total:  # always false for NaN
             best, best_total = pose, total
     return best, best_total
 
@@ -81,7 +81,7 @@ def score(scene: Scene, potential: NDArray[np.bool_], pose: Pose
         best = scene.iou_threshold
         for landmark in np.nonzero(mask)[0]:
             iou = pair_iou(scene, detection, outlines[landmark])
-            if iou > best:  # never true of NaN
+            if iou > best:  # always false for NaN
                 best, landmarks[detection] = iou, landmark
         total += best if landmarks[detection] >= 0 else 0.0
     return total, landmarks
@@ -107,14 +107,14 @@ def bearings_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def nearest(rotations: NDArray[np.float64], translations: NDArray[np.float64],
             rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> float:
-    """Return how far the nearest of some poses is from another, as the largest difference."""
+    """Return the distance from a pose to the nearest of other poses, as the largest difference."""
     return min((max(np.abs(r - rotation).max(), np.abs(t - translation).max())
                 for r, t in zip(rotations, translations, strict=True)), default=np.inf)
 
 
 def verify(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]
            ) -> Verified:
-    """Return what a pose explains in one frame, by the kernel: a rig of one."""
+    """Return the landmarks that a pose explains in one frame, by the kernel (a rig of one)."""
     rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None],
                    np.zeros(len(scene.centers)))
     return verify_rig(rig, rotation, translation)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of the office's real queries, held to test/thresholds.yaml."""
+"""Compare poses of the office's real queries with the limits in test/thresholds.yaml."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ HEIGHTS = replace(OPTIONS, height_range_m=(0.8, 2.2))
 
 @pytest.fixture
 def judge(office_map):
-    """Return what became of queries, by seed, and the share within their 95 % ellipsoids."""
+    """Return the results of queries by seed, and the share within their 95 % ellipsoids."""
     def run(options, *queries):
         found, = summarize([result for trial, its in enumerate(queries) for result in run_trial(
             office_map, Method('auto', options), trial, its)])
@@ -67,7 +67,7 @@ def test_success_with_what_is_known(case, office_map, queries, judge, thresholds
 
 @pytest.mark.parametrize('case', ['nothing', 'vertical_1_deg'])
 def test_five_frames_joined_by_odometry(case, office_map, queries, judge, thresholds):
-    """The 52 queries with their neighbours, 1 cm and 0.5 degrees of noise a step and axis."""
+    """The 52 queries have neighbours; a step has noise of 1 cm and 0.5 degrees on each axis."""
     least, asked = thresholds['fused'][case], []
     for seed in range(2):
         frames = make_queries(queries, office_map, every_frame=True)

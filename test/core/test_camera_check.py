@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A camera_info or boxes that are wrong for all objects alike: looks tell, poses are refused.
+"""A camera_info or boxes with an error common to all objects: looks detect it, poses are refused.
 
-A simulated room, seen from many places."""
+The room is simulated and seen from many places."""
 
 import json
 from dataclasses import replace
@@ -34,7 +34,7 @@ LOOKS = 24
 
 
 def place(rng):
-    """A place before the room, from which most of it is seen."""
+    """Return a pose in front of the room, from which most of it is visible."""
     x, y, z = rng.uniform((-1.0, -0.8, -1.5), (1.0, 0.8, 0.5))
     turn = Rotation.from_euler('yxz', [np.arctan2(-x, 4.5 - z), np.arctan2(y, 4.5 - z), 0.0])
     return make_transform((turn * Rotation.from_rotvec(rng.normal(0.0, 0.08, 3))).as_matrix(),
@@ -42,7 +42,7 @@ def place(rng):
 
 
 def query(rng, noise_px=1.0, pose=None):
-    """A query at a place: boxes that the border of the image cuts."""
+    """Return a query at a place, with boxes cut at the border of the image."""
     pose = place(rng) if pose is None else pose
     boxes = boxes_of(ROOM, pose)
     boxes = np.clip(boxes + rng.normal(0.0, noise_px, boxes.shape), 0.0, [*SIZE, *SIZE])
@@ -52,11 +52,11 @@ def query(rng, noise_px=1.0, pose=None):
 
 
 def localized(localizer, queries):
-    return [localizer.answer(Query((one.observation,), run=None)) for one in queries]
+    return [localizer.answer(Query((query.observation,), run=None)) for query in queries]
 
 
 def matches(boxes, map_from_camera):
-    """Rows of residuals_of for known matches, and the pose (3, 3), (3,)."""
+    """Return the rows of residuals_of for known matches, and the pose (3, 3), (3,)."""
     left, top, right, bottom = CAMERA.normalize_bboxes(boxes).T
     half_x, half_y = (right - left) / 2, (bottom - top) / 2
     pairs = np.column_stack([(left + right) / 2, (top + bottom) / 2, half_x, half_y, ROOM.centers,
@@ -74,7 +74,7 @@ def test_errors_of_a_camera_are_found_with_the_pose(errors, rng):
     for _ in range(12):
         pose = place(rng)
         right, rotation, translation = matches(boxes_of(ROOM, pose), pose)
-        # the boxes of which these are the corrected ones
+        # the uncorrected boxes of these corrected ones
         pairs = right.copy()
         for axis, scale in enumerate(np.exp(errors[0] + errors[1] * np.array([0.5, -0.5]))):
             pairs[:, axis] = scale * (right[:, axis] + 2.0 * errors[4 + axis]
@@ -98,7 +98,7 @@ def test_a_right_camera_is_verified(focal, noise_px, rng):
         assert found.accepted
         assert pose_error(found.map_from_camera, asked.map_from_camera)[0] < 0.5
         assert localizer.cameras.faults == []
-    # what looks know of it makes a pose surer
+    # evidence on the camera from earlier looks makes a pose more certain
     assert found.evidence.camera > 0.99
 
 
@@ -119,10 +119,10 @@ WRONG = {
 def test_a_wrong_camera_is_refused_with_the_cause(what, rng):
     localizer = Localizer(RELOCALIZER)
     found = localized(localizer, WRONG[what]([query(rng) for _ in range(LOOKS)]))
-    wrong = [one.refusal_kind is RefusalKind.WRONG_CAMERA for one in found]
-    refused = [not one.accepted for one in found]
+    wrong = [result.refusal_kind is RefusalKind.WRONG_CAMERA for result in found]
+    refused = [not result.accepted for result in found]
     assert all(refused[LOOKS // 2:])
-    assert sum(wrong[LOOKS // 2:]) > 0 or not any(one.accepted for one in found)
+    assert sum(wrong[LOOKS // 2:]) > 0 or not any(result.accepted for result in found)
 
 
 def test_looks_from_one_view_count_once(rng):
@@ -144,12 +144,12 @@ def test_a_mended_camera_is_accepted_again(mended, rng):
     assert localizer.cameras.faults
     found = localized(localizer, [query(rng) for _ in range(LOOKS)])
     assert localizer.cameras.faults == []
-    accepted = [one.accepted for one in found]
+    accepted = [result.accepted for result in found]
     assert all(accepted if mended == 'camera_info' else accepted[LOOKS // 2:])
 
 
 def drawn(rng, count, low, high):
-    """Boxes of objects that are anywhere, cut at a rectangle from low (2,) to high (2,)."""
+    """Return boxes of randomly placed objects, cut at a rectangle from low (2,) to high (2,)."""
     sides = rng.uniform(40.0, 160.0, (count, 2))
     corners = rng.uniform(np.subtract(low, sides), high)
     boxes = np.hstack([corners, corners + sides])
@@ -182,7 +182,7 @@ def test_the_check_hears_of_boxes_and_goes_on_with_slightly_other_intrinsics(rng
 
 
 def test_a_view_that_stays_the_same_has_no_border(rng):
-    """A robot stands before objects that all are within the image."""
+    """The robot stands; all objects before it are completely within the image."""
     corners = rng.uniform(100.0, 250.0, (8, 2))
     extent, boxes = Extent(), np.hstack([corners, corners + rng.uniform(40.0, 160.0, (8, 2))])
     for _ in range(50):
@@ -208,7 +208,7 @@ def test_the_error_of_a_wrong_camera_is_named(error, size, said, rng):
 
 @pytest.mark.parametrize('focal', [1.0, 1.3])
 def test_with_what_was_known_before_the_same_answer_comes_again(focal, rng):
-    """As a recorded request is answered again, from a file."""
+    """Answer again from a file, as evaluate repeats a recorded request."""
     localizer = Localizer(RELOCALIZER)
     queries = wrong_sensors.scaled_focal([query(rng) for _ in range(LOOKS)], focal)
     for one in queries:
@@ -288,6 +288,6 @@ def test_odd_scores_are_doubted_and_used(score):
 
 
 def test_an_accepted_pose_is_left_alone():
-    """Keyframes alone may recognize a place."""
+    """Keyframes without objects may recognize a place."""
     accepted = Relocalization(True, '')
     assert checked(detections('zebra')).explain(accepted) == accepted

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What each detection may show: by class, label and image, in maps small and large."""
+"""Candidates of each detection by class, label and image, in small and large maps."""
 
 from dataclasses import replace
 from math import comb
@@ -135,7 +135,7 @@ def _unit_rows(rows):
 
 
 def make_world(count, seed=0, classes=12):
-    """A map around a camera at its origin, and what this sees of it."""
+    """Return a map around a camera at its origin, and the camera's observation of it."""
     rng = np.random.default_rng(seed)
     centers = np.c_[rng.uniform(-4, 4, (count, 2)), rng.uniform(-8, 8, count)]
     names = tuple(f'class {number}' for number in rng.integers(0, classes, count))
@@ -212,7 +212,7 @@ def test_too_many_candidates_are_cut_and_said(monkeypatch):
 
 @pytest.mark.parametrize('limit', [1, 77, 2_000])
 def test_no_more_are_tried_than_asked_for(limit):
-    """Whatever the time a block takes, so that equal options give equal results."""
+    """The duration of a block has no influence, so that equal options give equal results."""
     landmark_map, observation = make_world(400)
     options = RelocalizerOptions(iterations=limit)
     first = Relocalizer(landmark_map, options).relocalize([observation])
@@ -223,10 +223,9 @@ def test_no_more_are_tried_than_asked_for(limit):
 
 
 def time_budget_is_kept(observation, landmark_map, frames):
-    """To within 10 %; the least of some runs, since others work beside it.
+    """The budget is kept to within 10 %, by the least of some runs, since other programs run too.
 
-    Where what no budget shortens takes long, on a slow machine, only that may come after the end
-    of the refinement.
+    On a slow machine, a long step that cannot be shortened may follow only refinement.
     """
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(iterations=1_000_000,
                                                                time_budget_s=0.05))
@@ -261,20 +260,20 @@ BY_CLASS = RelocalizerOptions(matching='class')
 
 
 def see(classes) -> Observation:
-    """A perfect view of the room by a detector that gives these classes."""
+    """Return a perfect view of the room by a detector with these classes."""
     seen = see_room(ROOM)
     return Observation(CAMERA, Detections(seen.bboxes_xyxy, tuple(classes), seen.scores))
 
 
 def weighted(landmark_map: LandmarkMap, share: float) -> LandmarkMap:
-    """Every landmark looks like a 'z' in a share of its boxes."""
+    """Return a map in which every landmark is detected as 'z' in a share of its boxes."""
     return replace(landmark_map, details=tuple(
         LandmarkDetails(class_weights=((name, 1.0 - share), ('z', share)))
         for name in landmark_map.class_ids))
 
 
 def with_others(landmark_map: LandmarkMap, count: int) -> LandmarkMap:
-    """The map with more landmarks, far away."""
+    """Return the map with additional landmarks far away."""
     rng = np.random.default_rng(5)
     return LandmarkMap(
         'map', landmark_map.landmark_ids + tuple(f'far_{i}' for i in range(count)),
@@ -286,7 +285,7 @@ def with_others(landmark_map: LandmarkMap, count: int) -> LandmarkMap:
 
 @pytest.mark.parametrize('landmarks', [len(ROOM), FEW + 20])
 def test_a_detection_of_a_second_class_finds_its_landmark(landmarks):
-    """By pairs in a small map, by the tree of culling in a large one."""
+    """A small map uses pairs, a large map the culling tree."""
     landmark_map = with_others(ROOM, landmarks - len(ROOM))
     mistaken = see('zz' + ''.join(ROOM.class_ids[2:-2]) + 'zz')
     plain = Relocalizer(landmark_map, BY_CLASS).relocalize([mistaken])
@@ -296,7 +295,7 @@ def test_a_detection_of_a_second_class_finds_its_landmark(landmarks):
     assert {match.detection: match.landmark for match in both.matches} == {
         row: row for row in range(len(ROOM))}
     assert pose_error(both.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
-    # 'z' says nothing: every landmark may look like one
+    # 'z' gives no information: every landmark may be detected as 'z'
     its, plain_its = both.hypotheses[0].support, plain.hypotheses[0].support
     assert its.rarity == pytest.approx(plain_its.rarity)
     assert both.confidence >= plain.confidence
@@ -318,7 +317,7 @@ def test_a_landmark_has_its_own_class_even_if_its_weights_lack_it():
 
 
 def test_a_class_that_a_landmark_is_only_taken_for_is_not_expected():
-    """A person who walks through the view does not count against the pose."""
+    """A person walking through the view does not count against the pose."""
     seen = see_room(ROOM)
     detections = Detections(np.r_[seen.bboxes_xyxy, [[5.0, 5, 60, 90]]],
                             (*seen.class_ids, 'z'), np.ones(len(seen) + 1))
@@ -340,7 +339,7 @@ def unit_rows(rng, rows) -> np.ndarray:
 
 @pytest.fixture
 def world(rng):
-    """Labels, images and crops of one space: labels and images lie apart, as those of CLIP."""
+    """Return labels, images and crops of one space, with labels and images apart as in CLIP."""
     objects, gap = unit_rows(rng, COUNT), unit_rows(rng, 2)
     labels = unit_rows(rng, gap[0] + 0.25 * objects)
     means = unit_rows(rng, gap[1] + objects)
@@ -382,7 +381,7 @@ def test_a_landmark_without_images_keeps_its_label(world, compare):
     rows = with_images(labels, replace(images, means=means), compare)
     similarities = crops @ np.asarray(rows).T
     known, unknown = similarities[:, 10:], similarities[:, :10]
-    # neither the best nor the worst of all crops because it has no images
+    # without images it is neither the best nor the worst of all crops
     assert abs(unknown.mean() - known.mean()) < similarities.std(axis=1).mean()
     own = np.arange(10)
     assert (np.argmax(unknown[own], axis=1) == own).mean() > 0.8

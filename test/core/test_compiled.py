@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled kernels on disk: found by their source, whole, and never needed for the search."""
+"""Compiled kernels on disk: found by their source, written completely, and optional."""
 
 import os
 import shutil
@@ -28,7 +28,7 @@ KERNELS = 5
 
 
 def run(*within, package=PROJECT, program=PROGRAM, **environment):
-    """Run the program; return how many kernels were missing, the result, and the log."""
+    """Run the program; return the number of missing kernels, the result, and the log."""
     variables = {name: value for name, value in os.environ.items()
                  if name not in ('NUMBA_CACHE_DIR', 'XDG_CACHE_HOME')}
     done = subprocess.run([*within, sys.executable, '-c', program], text=True, check=False,
@@ -61,7 +61,7 @@ def kernels(compiled_kernels, tmp_path):
 
 @pytest.fixture
 def package(tmp_path):
-    """Copy the package to another place, with new times of modification."""
+    """Copy the package to another place, with new modification times."""
     copy = tmp_path / 'elsewhere'
     shutil.copytree(PROJECT / 'cliploc_ros', copy / 'cliploc_ros', copy_function=shutil.copy,
                     ignore=shutil.ignore_patterns('__pycache__'))
@@ -80,7 +80,7 @@ def test_a_second_start_compiles_nothing(kernels):
 
 
 def test_an_upgrade_of_other_code_compiles_nothing(kernels, package):
-    """Neither a copy nor another module counts."""
+    """Neither a copy of the package nor a change of an unrelated module outdates the kernels."""
     replace_in(package / 'cliploc_ros/errors.py', '_HEAD, _TAIL = 700', '_HEAD, _TAIL = 701')
     assert run_in(kernels, package=package)[0] == 0
 
@@ -90,7 +90,7 @@ def test_a_change_of_a_module_compiles_its_kernels_and_their_callers(kernels, pa
     replace_in(package / 'cliploc_ros/core/geometry/minimal_solvers.py', '_ROUNDING = 4e-16',
                '_ROUNDING = 5e-16')
     assert run_in(kernels, package=package)[0] == KERNELS
-    assert len(list(kernels.iterdir())) == count, 'the outdated ones remain'
+    assert len(list(kernels.iterdir())) == count, 'outdated kernels remain'
 
 
 @pytest.mark.parametrize('damage', ['cut', 'changed'])
@@ -115,13 +115,13 @@ def test_a_full_disk_costs_only_the_cache(tmp_path):
     limit = 'import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n'
     missing, result, log = run_in(tmp_path, program=limit + PROGRAM)
     assert missing == KERNELS and result == pytest.approx(np.pi)
-    assert log.count('WARNING') == 1, 'not one for each kernel'
+    assert log.count('WARNING') == 1, 'one message for all kernels'
     assert 'cannot keep' in log and 'set cache_dir' in log
     assert not list(tmp_path.iterdir())
 
 
 def test_the_preferred_folder_gets_what_lies_elsewhere(tmp_path, monkeypatch):
-    """So a folder to carry to another machine becomes complete."""
+    """This completes a folder that is to be carried to another machine."""
     monkeypatch.delenv('NUMBA_CACHE_DIR', raising=False)
     monkeypatch.setattr('cliploc_ros.core.kernels.compiled._PACKAGE', tmp_path / 'package')
     folders = KernelFolders()
@@ -133,8 +133,8 @@ def test_the_preferred_folder_gets_what_lies_elsewhere(tmp_path, monkeypatch):
     assert folders.read('b.kernel') is None and folders.missing == 1
 
 
-# In a process of its own: here other tests have called the kernels. It prints how many kernels the
-# warm-up brought, and how many each kind of request added.
+# Runs in a separate process, since other tests have called the kernels in this one. Prints the
+# number of kernels after the warm-up, and the number that each kind of request added.
 WARM_UP = """
 import sys
 sys.path[:0] = sys.argv[1:3]

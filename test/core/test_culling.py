@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Large maps: what is left out would not have counted, and a hypothesis costs little more."""
+"""Large maps: culled landmarks would not have counted, and a hypothesis costs little more."""
 
 
 import numpy as np
@@ -27,12 +27,12 @@ HERE = Poses(np.eye(3)[None], np.zeros((1, 3)))
 
 
 def own_classes(class_ids):
-    """Landmarks of one class each, as ClassIndex.members has them."""
+    """Return landmarks of one class each, in the format of ClassIndex.members."""
     return np.column_stack([np.arange(len(class_ids)), class_ids])
 
 
 def make_storey(count, seed=0, classes=40, by_class=True) -> Scene:
-    """A landmark a four square metres; up to twelve boxes, each with all of its class."""
+    """Return a map with a landmark per four square metres, and up to twelve boxes in a frame."""
     rng, side = np.random.default_rng(seed), np.sqrt(4.0 * count)
     centers = np.c_[rng.uniform(0, side, (count, 2)), rng.uniform(0, 2, count)]
     quats = rng.normal(size=(count, 4))

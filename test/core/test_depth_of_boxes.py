@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Depth of boxes and of images: it helps where it is right, and does no harm where it is not."""
+"""Depth of boxes and of images: correct depth helps, wrong depth does no harm."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ NONE = np.full(len(ROOM), np.nan)
 
 
 def look(rng, rows=None, noise_px=4.0):
-    """Noisy boxes of some objects, and their depths."""
+    """Return noisy boxes of some objects, and their depths."""
     seen = see_room(ROOM)
     seen = replace(seen, bboxes_xyxy=seen.bboxes_xyxy + rng.normal(0.0, noise_px, (len(ROOM), 4)))
     depths = simulate_depths(ROOM.centers, ROOM.shapes, MAP_FROM_CAMERA, rng)
@@ -107,7 +107,7 @@ def test_wrong_depth_does_no_harm(change):
         assert found.accepted == alone.accepted
         assert found.depth is None or not found.depth.is_passed
         np.testing.assert_array_equal(found.map_from_camera, alone.map_from_camera)
-        # a mirror image is judged without depth, too
+        # a mirror image is also judged without depth
         assert found.confidence == alone.confidence
 
 
@@ -140,7 +140,7 @@ def test_depth_of_a_wrong_scale_is_used_no_more(rng):
 
 
 def test_depth_is_off_by_eight_percent_at_most():
-    """As doc/interface.md promises; five accepted poses tell, and their median counts."""
+    """As doc/interface.md states: five accepted poses decide, by their median."""
     for ratio, is_wrong in {0.92: True, 0.93: False, 1.07: False, 1.09: True}.items():
         scale = DepthScale()
         for number, one in enumerate([ratio, 1.0, ratio, 1.0, ratio], 1):
@@ -172,17 +172,17 @@ def test_depth_that_is_not_registered():
         np.eye(3), np.array([-0.025, 0.0, 0.0])))
     depths = np.full((480, 640), 4.0, dtype=np.float32)
     depths[200:280, 400:480] = 1.0
-    # where the colour camera sees it: scaled by .897, shifted by 525 * 25 mm / 1 m = 13 px
+    # position in the colour camera: scaled by .897, shifted by 525 * 25 mm / 1 m = 13 px
     left = 320 + (400 - 320) * 525 / 585 - 13.125
     box = np.array([[left, 204.1, left + 71.8, 275.9]])
     found, spread = depths_of_boxes(DepthImage(depths, own), COLOR, box)
     np.testing.assert_allclose([found[0], spread[0]], [1.0, 0.0], atol=1e-6)
-    # a depth camera on its side, its x axis where the other's y axis is
+    # a depth camera on its side, with its x axis along the other's y axis
     aside = DepthCamera(585.0, 585.0, 240.0, 639.0 - 320.0, own.color_from_depth @ make_transform(
         np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3)))
     found, spread = depths_of_boxes(DepthImage(np.rot90(depths), aside), COLOR, box)
     np.testing.assert_allclose([found[0], spread[0]], [1.0, 0.0], atol=1e-6)
-    # taken for registered, the box further left shows the wall
+    # if taken for registered, the box further left shows the wall
     box = box - [20, 0, 20, 0]
     assert depths_of_boxes(DepthImage(depths), COLOR, box)[0][0] == 4.0
     assert depths_of_boxes(DepthImage(depths, own), COLOR, box)[0][0] == 1.0

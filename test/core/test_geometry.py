@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras, ellipses, ellipsoids and poses: exact cases and properties; a room seen by fisheyes."""
+"""Cameras, ellipses, ellipsoids and poses: exact cases, properties, and a room in fisheyes."""
 
 import json
 
@@ -70,7 +70,7 @@ def test_beyond_the_fold_of_a_lens_is_nan():
     folded = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 'plumb_bob', (-2.0, 0.0, 0.0, 0.0))
     assert np.isnan(folded.normalize_points(np.array([[0.0, 0.0]]))).all()
     assert np.isfinite(folded.normalize_points(np.array([[300.0, 200.0]]))).all()
-    # it would show these points in the middle of the image
+    # otherwise these points would be in the middle of the image
     sides = np.array([[0.69, 0.0], [0.0, -0.7], [0.2, 0.2]])
     assert np.isnan(folded.project_normalized(sides)).all(axis=1).tolist() == [True, True, False]
 
@@ -122,7 +122,7 @@ def judged(changes):
     {'fx': 300.0, 'fy': 300.0}, {'fx': 5000.0, 'fy': 5000.0},
     {'fx': 244.5, 'fy': 244.5, **FISHEYE}, {'fx': 180.0, 'fy': 180.0, **FISHEYE}])
 def test_valid_odd_cameras_are_sound(changes):
-    """Among them 10 % off the middle, fx and fy 3 % apart, portrait, thermal, fisheyes."""
+    """Valid cameras: 10 % off the middle, fx and fy 3 % apart, portrait, thermal, fisheyes."""
     assert judged(changes) == 'sound'
 
 
@@ -137,7 +137,7 @@ def test_valid_odd_cameras_are_sound(changes):
     ({'fx': 0.7, 'fy': 0.9, **FISHEYE}, 'refused'), ({'fx': 140.0, 'fy': 140.0, **FISHEYE},
                                                      'doubted'),
     ({'fx': 700.0}, 'doubted'), ({'fx': 1400.0}, 'refused'),
-    # the coefficients of another lens, or in another order
+    # coefficients of another lens, or in another order
     ({'distortion_model': 'plumb_bob', 'distortion': (-6.0, 0.0, 0.0, 0.0)}, 'refused'),
     ({'distortion_model': 'plumb_bob', 'distortion': (-1.0, 0.0, 0.0, 0.0)}, 'doubted')])
 def test_cameras_that_no_image_has(changes, verdict):
@@ -147,7 +147,7 @@ def test_cameras_that_no_image_has(changes, verdict):
 def test_recorded_cameras_are_sound(shared_data):
     cameras = [*PRESETS.values(), *map(read_camera, shared_data.glob('**/camera.json'))]
     assert len(cameras) >= 7
-    assert [camera_faults(one) for one in cameras] == [()] * len(cameras)
+    assert [camera_faults(camera) for camera in cameras] == [()] * len(cameras)
 
 
 def test_the_field_of_view_is_that_of_the_lens():
@@ -161,12 +161,12 @@ offsets = st.one_of(st.just(0.0), st.floats(-3.0, 3.0))
 
 
 def iou_by_chords(half_width, half_height, center, shape, chords=20001):
-    """The same IoU from the lengths of many vertical chords; the first ellipse at the origin."""
+    """Return the IoU from the lengths of many vertical chords, with one ellipse at the origin."""
     reach = np.sqrt(shape[0, 0])
     low, high = max(-half_width, center[0] - reach), min(half_width, center[0] + reach)
     if low >= high:
         return 0.0
-    # nodes crowd at both ends, where chords shrink like a square root
+    # nodes are dense at both ends, where chords shrink like a square root
     angles = (np.arange(chords) + 0.5) / chords * np.pi
     x = (low + high) / 2 - (high - low) / 2 * np.cos(angles)
     weights = (high - low) / 2 * np.sin(angles) * np.pi / chords
@@ -314,7 +314,7 @@ def test_a_quarter_turn_about_z():
 
 
 def test_moving_a_covariance_by_a_lever(rng):
-    """The moved origin's covariance equals that of moved samples."""
+    """The covariance about the moved origin equals that of moved samples."""
     spread = np.diag([0.01, 0.02, 0.03, 0.001, 0.002, 0.003])
     lever = np.array([0.5, -1.0, 0.2])
     samples = rng.multivariate_normal(np.zeros(6), spread, 200_000)
@@ -329,7 +329,7 @@ REQUESTS = 10
 
 @pytest.fixture(scope='module')
 def room():
-    """Twenty-four upright objects of ten classes in a room of 6 x 5 m."""
+    """Return twenty-four upright objects of ten classes in a room of 6 x 5 m."""
     rng, count = np.random.default_rng(1), 24
     quats = Rotation.from_euler('z', rng.uniform(0, 360, (count, 1)), degrees=True).as_quat()
     return LandmarkMap(
@@ -341,7 +341,7 @@ def room():
 
 
 def surfaces(room):
-    """Points (L, 2000, 3) on the ellipsoids, by a spiral over each."""
+    """Return points (L, 2000, 3) on the ellipsoids, on a spiral over each."""
     steps = np.arange(2000)
     z = 1.0 - (2 * steps + 1) / 2000
     turn = steps * np.pi * (3 - np.sqrt(5))
@@ -359,7 +359,7 @@ def fisheye_pixels(points, focal_px, d):
 
 
 def looks(room, focal_px, d, rng):
-    """Yield requests from random places: a pose, and the boxes of what the image shows."""
+    """Yield requests from random places: a pose, and the boxes of visible objects."""
     points = surfaces(room)
     for _ in range(REQUESTS):
         axes = Rotation.from_euler('ZXZ', rng.normal((0, -90, 0), (120, 8, 4)), degrees=True)
@@ -380,7 +380,7 @@ def looks(room, focal_px, d, rng):
 @pytest.mark.parametrize(('wide_deg', 'd'), [
     (120.0, (0.0,) * 4), (190.0, (0.0,) * 4), (150.0, (-0.02, 0.01, -0.005, 0.001))])
 def test_poses_of_a_fisheye_are_right(room, wide_deg, d):
-    """Taken for pinholes, 10 of 10 images of an ideal fisheye were accepted .2 to .5 m off."""
+    """With a pinhole model, 10 of 10 images of an ideal fisheye were accepted .2 to .5 m off."""
     focal_px = SIZE[0] / np.radians(wide_deg)
     camera = Camera(*SIZE.tolist(), focal_px, focal_px, *(SIZE / 2), 'equidistant', d)
     relocalizer = Relocalizer(room, RelocalizerOptions(matching='class'))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The method against values of an independent implementation (../shared/data/README.md)."""
+"""Compare the method with values of an independent implementation (../shared/data/README.md)."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from cliploc_ros.core.search.strategies import Leaders, search_exhaustively
 
 @pytest.fixture(scope='module')
 def golden_scenes(office, office_map, queries, observe):
-    """Scene, B-PROSAC pairs and golden values of each query that has them."""
+    """Return scene, B-PROSAC pairs and golden values of each query that has them."""
     golden = np.load(office / 'golden.npz')
     scenes = []
     for number, frame in enumerate(queries.main_frames()):
@@ -68,7 +68,7 @@ def test_scores_inliers_and_poses_agree(golden_scenes):
             verified = verify(scene, rotation, translation)
             worst = max(worst, abs(verified.score - score))
             assert (verified.landmarks >= 0).sum() == inliers
-            # theirs is rounded to single precision
+            # the other implementation rounds to single precision
             assert np.abs(rotation - pose[:, :3]).max() < 1e-2
             assert np.abs(translation - pose[:, 3]).max() < 1e-2
     print(f'\n{compared} golden hypotheses: scores at most {worst:.1e} off; {only_ours} more that '
@@ -79,7 +79,7 @@ def test_scores_inliers_and_poses_agree(golden_scenes):
 
 
 def assert_solves(scene, rows, rotation, translation):
-    """A pose that only we found must look along the three bearings."""
+    """A pose that only this implementation found must look along the three bearings."""
     seen = scene.centers[scene.pairs[rows, 1]] @ rotation.T + translation
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     assert np.abs(seen - scene.bearings[scene.pairs[rows, 0]]).max() < 1e-8

@@ -46,7 +46,7 @@ def file(tmp_path):
 
 
 def rewrite(path, header=None, **changes):
-    """Write the file again with other arrays, without those that are None, with another header."""
+    """Write the file again with other arrays or header; None removes an array."""
     with np.load(path) as content:
         arrays = {name: content[name] for name in content.files} | changes
     if header:
@@ -62,7 +62,7 @@ def test_a_layer_comes_back_as_it_was(file):
     for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words',
                  'vocabulary'):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name
-    assert not isinstance(after.descriptors, np.memmap), 'a small file may be written over'
+    assert not isinstance(after.descriptors, np.memmap), 'a small file may be overwritten'
 
 
 def test_the_arrays_of_a_large_file_stay_in_it(file, monkeypatch):
@@ -87,7 +87,7 @@ def test_the_most_similar_keyframe_has_the_same_words():
 
 @pytest.fixture
 def corridor():
-    """Twenty keyframes 10 m apart, each of forty points of its own in the middle of the image."""
+    """Return twenty keyframes 10 m apart, each with forty points in the middle of the image."""
     layer = make_layer(ROOM, keyframes=20)
     poses = layer.map_from_camera.copy()
     poses[:, 0, 3] = 10.0 * np.arange(len(layer))
@@ -96,7 +96,7 @@ def corridor():
 
 
 def features_at(layer, keyframe, shown=slice(None)):
-    """Features of some points of a keyframe, as its camera sees them 0.1 m to the right."""
+    """Return features of some points of a keyframe, from a camera 0.1 m to the right."""
     rows = np.arange(*layer.offsets[keyframe:keyframe + 2])[shown]
     points = layer.points[rows] - np.array([0.1, 0.0, 0.0])
     return CAMERA.project_normalized(points[:, :2] / points[:, 2:]), layer.descriptors[rows]
@@ -104,7 +104,7 @@ def features_at(layer, keyframe, shown=slice(None)):
 
 @pytest.mark.parametrize('misleading', [0, 15])
 def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, misleading, rng):
-    """These show most words of the image, but their points agree on no pose."""
+    """These keyframes have most words of the image, but their points agree on no pose."""
     pixels, descriptors = features_at(corridor, 18, slice(30))
     for keyframe in range(misleading):
         descriptors = np.concatenate([descriptors, features_at(corridor, keyframe)[1]])
@@ -113,7 +113,7 @@ def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, mi
                     np.ones(len(descriptors), np.float32))
     localizer = KeyframeLocalizer(corridor)
     fast = localizer.localize_features(seen, CAMERA)
-    # the thorough pass, whose pooled matches show the pose less clearly, does not lose it
+    # the thorough pass finds it too, although its pooled matches are less clear
     for place, in (fast.places, localizer.localize_features(seen, CAMERA, fast=fast).places):
         assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
         assert (place.inliers, place.keyframes) == (30, (18,))
@@ -124,7 +124,7 @@ def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, mi
 @pytest.mark.parametrize('has_empty', [False, True])
 def test_one_keyframe_and_one_without_points_are_searched(corridor, has_empty, fast):
     layer, pose = corridor.select(np.arange(20) == 18), corridor.map_from_camera[18]
-    if has_empty:  # another one that sees the same, but keeps no point of it
+    if has_empty:  # another keyframe with the same view, but without points
         layer = replace(layer, map_from_camera=np.array([pose, pose]), offsets=np.array(
             [0, 0, POINTS]))
     pixels, descriptors = features_at(corridor, 18)
@@ -135,7 +135,7 @@ def test_one_keyframe_and_one_without_points_are_searched(corridor, has_empty, f
 
 
 def test_a_pose_is_refined_by_points_that_matching_missed(corridor):
-    """Each point of the second half looks like its neighbour, so that no match of it is clear."""
+    """Each point of the second half looks like its neighbour, so none of its matches is clear."""
     layer = corridor.select(np.arange(20) == 18)
     alike = np.arange(POINTS // 2, POINTS - 1, 2)
     layer.descriptors[alike + 1] = layer.descriptors[alike]
@@ -150,7 +150,7 @@ def test_a_pose_is_refined_by_points_that_matching_missed(corridor):
 
 @pytest.mark.parametrize('focal', [1.0, 1e5, 1e-3])
 def test_a_thorough_search_ends_with_any_focal_length(corridor, focal):
-    """With a long lens, the image shows all features at the place of each point."""
+    """With a long lens, all features are at the position of each point in the image."""
     pixels, descriptors = features_at(corridor, 18)
     count = 3000 // len(pixels)
     seen = Features(np.tile(pixels, (count, 1)), np.tile(descriptors, (count, 1)),
@@ -330,7 +330,7 @@ def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_po
 
 def test_a_constraint_excludes_by_height_and_tilt_and_tells_how_far_the_vertical_is_off():
     def tilted(degrees, height=1.0):
-        """Return the pose of a camera that looks along the map's x axis, and leans to the side."""
+        """Return the pose of a camera that looks along the map's x axis, rolled to the side."""
         level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
         return make_transform(level @ Rotation.from_euler('z', degrees, True).as_matrix(),
                               np.array([5.0, 6.0, height]))
@@ -352,7 +352,7 @@ MANY, WEAK = np.arange(40), np.tile(np.arange(LEAST_INLIERS - 2), 2)
 
 
 def places_of(*rows):
-    """Return the places of equal rooms, whose image shows some points each, and where [m]."""
+    """Return the places of equal rooms at given positions [m], with some matched points each."""
     pose, points, bearings = look(np.random.default_rng(9), len(MANY))
     features = Features(bearings * LENS.fx + (LENS.cx, LENS.cy),
                         np.zeros((len(points), DIMENSIONS), np.uint8),
@@ -365,20 +365,20 @@ def places_of(*rows):
                                     np.arange(sum(counts)), np.zeros(sum(counts), np.float32))
     look_at = localization._Look(features, bearings, LENS)
     found = localization._places(localization._place(matched, look_at), matched, look_at)
-    return found, sorted(np.round([one.map_from_camera[0, 3] - pose[0, 3] for one in found]))
+    return found, sorted(np.round([place.map_from_camera[0, 3] - pose[0, 3] for place in found]))
 
 
 def test_of_equal_rooms_each_is_a_place_of_its_own():
     found, at_m = places_of(MANY, MANY, MANY)
     assert at_m == [0.0, 10.0, 20.0]
-    assert [one.agreed for one in found] == [40, 40, 40]
+    assert [place.agreed for place in found] == [40, 40, 40]
     most = localization.MOST_PLACES
     assert len(places_of(*[MANY] * (most + 2))[0]) == most
 
 
 def test_few_features_are_a_place_where_there_is_no_other():
-    """Those of two keyframes count once."""
-    assert [one.agreed for one in places_of(WEAK)[0]] == [LEAST_INLIERS - 2]
+    """Points of two keyframes count once."""
+    assert [place.agreed for place in places_of(WEAK)[0]] == [LEAST_INLIERS - 2]
     assert places_of(MANY, WEAK)[1] == [0.0]
     assert places_of(MANY, MANY[:LEAST_INLIERS + 2])[1] == [0.0, 10.0]
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frame after frame of one camera: which frames are fused, and which looks have to agree."""
+"""Successive frames of one camera: which frames are fused, and which looks must agree."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -41,7 +41,7 @@ def frame(seconds, degrees=0.0, metres=0.0, detections=SEEN):
 
 
 class Window:
-    """The frames that are fused, and their stamps [s]."""
+    """The fused frames, and their stamps [s]."""
 
     def __init__(self):
         self.frames = []
@@ -50,7 +50,7 @@ class Window:
         new = frame(seconds, degrees, metres, detections)
         earlier, anchor = instants_to_fuse(self.frames, new, limit, length_s)
         self.frames = [*earlier, KeptInstant((RELOCALIZER.search(new),), anchor)]
-        return [one.stamp_ns / 1e9 for one in self.frames]
+        return [frame.stamp_ns / 1e9 for frame in self.frames]
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_frames_of_a_moving_camera_are_fused(window, step):
 def test_a_camera_that_creeps_moves_away_from_its_anchor(window):
     for number in range(31):
         fused = window.join(number / 10, degrees=0.4 * number)
-    # each as far from the one before as a new frame must be
+    # each is at the least distance of a new frame from the one before
     assert fused == [0.7, 1.5, 2.3, 3.0]
 
 
@@ -82,7 +82,7 @@ def test_of_too_many_frames_those_furthest_apart_remain(window):
         fused = window.join(number / 10, degrees=6.0 * number)
         assert len(fused) <= 5
     assert fused[0] == 0.0 and fused[-1] == 3.0
-    assert np.diff(fused).max() <= 1.6, 'all of the way'
+    assert np.diff(fused).max() <= 1.6, 'the fused frames cover the whole path'
 
 
 def test_old_frames_are_dropped(window):
@@ -105,7 +105,7 @@ def session():
 
 
 def fused(session, observation, run=0):
-    """The number of frames that a session fuses; each is searched with as many samples."""
+    """Return the number of frames that a session fuses; each is searched with as many samples."""
     found = session.answer(Query((observation,), run=run, limit=5, length_s=5.0))
     alone = RELOCALIZER.search(observation).progress.tried
     assert found.tried % alone == 0
@@ -119,7 +119,7 @@ def test_a_session_finds_what_the_relocalizer_finds(session):
     at_once = RELOCALIZER.relocalize(observations)
     np.testing.assert_array_equal(found.map_from_camera, at_once.map_from_camera)
     assert found.covariance == pytest.approx(at_once.covariance)
-    # what the session knows of the camera by now makes it a bit surer
+    # the session's evidence on the camera makes it slightly more certain
     assert found.confidence == pytest.approx(at_once.confidence, abs=1e-6)
     assert found.tried == at_once.tried
 
@@ -144,11 +144,11 @@ def test_a_frame_without_odometry_is_localized_alone(session):
     for number in range(3):
         fused(session, frame(number, 10.0 * number))
     assert fused(session, replace(frame(3.0), odom_from_camera=None)) == 1
-    assert fused(session, frame(4.0, 40.0)) == 4, 'and does not change the session'
+    assert fused(session, frame(4.0, 40.0)) == 4, 'the session is unchanged'
 
 
 def drive(session, seconds, metres, run=0, objects=12):
-    """Localize with a view that never changes, although odometry says that the robot drives."""
+    """Localize with a constant view, although odometry reports motion."""
     seen = SEEN.select(np.arange(objects))
     return session.answer(Query((frame(seconds, metres=metres, detections=seen),), run=run,
                                 length_s=5.0))
@@ -164,7 +164,7 @@ def test_a_pose_that_earlier_looks_contradict_is_refused(session):
 
 
 def test_an_accepted_pose_ends_the_looks(session):
-    """Odometry drifts between requests: what was accepted a while ago contradicts nothing."""
+    """Odometry drifts between requests, so an older accepted pose contradicts nothing."""
     for number in range(35):
         found = drive(session, 60.0 * number, 1.0 * number)
         assert found.accepted, f'request {number}: {found.reason}'
@@ -172,7 +172,7 @@ def test_an_accepted_pose_ends_the_looks(session):
 
 
 def test_looks_that_led_to_no_accepted_pose_persist_while_odometry_links_them(session):
-    """Frames are dropped after five seconds, looks are not."""
+    """Frames are dropped after five seconds, but looks are kept."""
     for number in range(4):
         drive(session, number, 3.0 * number, objects=3)
     assert not drive(session, 1000.0, 12.0).accepted
@@ -191,13 +191,13 @@ def test_the_same_frame_again_is_no_further_look(session):
 
 
 class Camera:
-    """Takes looks that need no search."""
+    """A camera whose looks need no search."""
 
     def __init__(self):
         self.looks = Looks()
 
     def look(self, seconds, x_m, yaw_deg=0.0, degrees=0.0, metres=0.0, confidence=1.0, way_m=0.0):
-        """Return the mean confidence of all looks in one that finds the camera at x_m, yaw_deg."""
+        """Return the mean confidence of all looks in a pose at x_m, yaw_deg."""
         observation = replace(frame(seconds, degrees, metres), odom_way_m=way_m)
         earlier = self.looks.confidences_in(observation, pose(yaw_deg, x_m))
         self.looks = self.looks.with_look(Look(observation, pose(yaw_deg, x_m), confidence))
@@ -230,12 +230,12 @@ def test_odometry_carries_the_looks(camera, turned_deg, driven_m):
         assert camera.look(number / 10, metres, degrees, degrees, metres) == 1.0
     stuck = [camera.look(1.0 + number / 10, 0.0, 0.0, 4.0 * number, 8.0 + number)
              for number in range(1, 10)]
-    assert max(stuck) < 0.5, 'poses that do not move although the robot does'
+    assert max(stuck) < 0.5, 'constant poses of a moving robot'
 
 
 @pytest.mark.parametrize(('way_m', 'agrees'), [(0.0, False), (10.0, False), (33.0, True)])
 def test_the_further_a_robot_drove_the_less_exactly_looks_have_to_agree(camera, way_m, agrees):
-    """After 33 m, odometry that drifts by 3 % is wrong by 1 m; the robot is back at its start."""
+    """After 33 m, odometry with 3 % drift is off by 1 m; the robot is back at its start."""
     camera.look(0.0, 0.0)
     assert (camera.look(60.0, 1.0, way_m=way_m) == 1.0) == agrees
 
@@ -304,7 +304,7 @@ def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     assert alone.source == 'keyframes'
     np.testing.assert_array_equal(session.covariance_for_filter(alone), fine)
     assert localize(4, by_keyframes=False).source == 'objects'
-    assert localize(5, deadline=0.0).source == 'objects', 'no time is left'
+    assert localize(5, deadline=0.0).source == 'objects', 'no time remains'
     assert not session.query.by_keyframes
 
 
@@ -314,7 +314,7 @@ OPTIONS = RelocalizerOptions(matching='class')
 
 
 def see(room, map_from_camera, rows=None):
-    """An observation of some landmarks, whose odometry has no error."""
+    """Return an observation of some landmarks, with error-free odometry."""
     rows = np.arange(len(room)) if rows is None else np.asarray(rows, dtype=np.int64)
     seen = Detections(boxes_of(room, map_from_camera)[rows],
                       tuple(room.class_ids[row] for row in rows), np.full(len(rows), 0.9))
@@ -322,7 +322,7 @@ def see(room, map_from_camera, rows=None):
 
 
 def moved(map_from_camera, metres, degrees):
-    """A camera that went on and turned about its vertical axis."""
+    """Return the pose of a camera that moved on and turned about its vertical axis."""
     turn = Rotation.from_euler('y', degrees, degrees=True).as_matrix()
     return map_from_camera @ make_transform(turn, np.array([metres, 0.0, 0.5 * metres]))
 
@@ -333,24 +333,25 @@ def walk():
 
 
 def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
-    """No frame alone shows three objects that can be told apart."""
+    """No single frame shows three distinguishable objects."""
     shares = [[0, 4, 8], [3, 7], [2, 11, 9], [1, 5]]
     frames = [see(room, pose, rows) for pose, rows in zip(walk, shares, strict=True)]
     relocalizer = Relocalizer(room, OPTIONS)
-    assert not any(relocalizer.relocalize([one]).accepted for one in frames)
+    assert not any(relocalizer.relocalize([frame]).accepted for frame in frames)
     found = relocalizer.relocalize(frames)
     assert found.accepted, found.reason
     assert pose_error(found.map_from_camera, walk[-1]) < (0.01, 0.2)
-    # of the last frame alone
+    # from the last frame only
     assert [match.detection for match in found.matches] == [0, 1]
     assert [match.landmark for match in found.matches] == shares[-1]
     # with a known vertical, two objects suffice to check their camera
-    upright = relocalizer.relocalize([knowing_up(*one) for one in zip(frames, walk, strict=True)])
+    upright = relocalizer.relocalize([knowing_up(frame, pose)
+                                      for frame, pose in zip(frames, walk, strict=True)])
     assert (len(found.cameras), len(upright.cameras)) == (2, 4)
 
 
 def test_the_odometry_of_a_camera_that_looks_into_a_mirror_is_mirrored(room):
-    """From behind, things on a wall look as in a mirror, however the camera moves."""
+    """From behind, objects on a wall look mirrored, however the camera moves."""
     wall = replace(room, centers=room.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 4.0],
                    semi_axes=np.full((len(room), 3), 0.2))
     walk = [moved(MAP_FROM_CAMERA, 0.2 * step, 4.0 * step) for step in range(4)]
@@ -362,7 +363,7 @@ def test_the_odometry_of_a_camera_that_looks_into_a_mirror_is_mirrored(room):
 
 @pytest.mark.filterwarnings('error')
 def test_last_frames_without_objects_take_no_confidence(room):
-    """The test for mirror images goes back to frames that show something."""
+    """The test for mirror images uses earlier frames that show objects."""
     walk = [moved(MAP_FROM_CAMERA, 0.05 * step, 2.0 * step) for step in range(6)]
     relocalizer = Relocalizer(room, OPTIONS)
     confidences = [
@@ -402,20 +403,20 @@ def knowing_up(frame, map_from_camera):
 
 
 def tilt_deg(found):
-    """Standard deviation of the tilt that a covariance states."""
+    """Return the standard deviation of the tilt in a covariance."""
     return np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[3:5, 3:5]).max()))
 
 
 @pytest.mark.parametrize('deviation_deg', [0.1, 0.5])
 def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room):
-    """They come from one sensor on one mount, so its error does not average out."""
+    """The verticals come from one sensor on one mount, so their error does not average out."""
     relocalizer = Relocalizer(room, replace(OPTIONS, vertical_deviation_deg=deviation_deg))
     at_once, one_by_one = [[0, 1, 3, 8, 7]], [[0, 1], [3], [8], [7]]
     one, four = (tilt_deg(relocalizer.relocalize([
         knowing_up(see(room, MAP_FROM_CAMERA, rows), MAP_FROM_CAMERA) for rows in shares]))
         for shares in (at_once, one_by_one))
     print(f'\ntilt: the same objects in one frame {one:.3f} deg, in four {four:.3f} deg')
-    # refinement trusts four verticals more than one, and the boxes less
+    # refinement gives four verticals more weight than one, and the boxes less
     assert four == pytest.approx(one, rel=0.06)
     assert four >= 0.95 * one
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Places that look alike, found in the map, and what tells them apart."""
+"""Places that look alike: finding them in the map, and distinguishing them."""
 
 
 import numpy as np
@@ -47,7 +47,7 @@ def one_room(seed=1, count=12):
 
 
 def two_rooms(turn_deg=0.0, missing=0, noise_m=0.0, seed=1):
-    """Return a map of two equal rooms, and the pose in the second one that matches the origin."""
+    """Return a map of two equal rooms, and the pose in the second room that matches the origin."""
     room, classes = one_room(seed)
     move = move_of(turn_deg, (9, 3, 0))
     twin = moved(room, move) + noise_m * np.random.default_rng(seed).normal(size=room.shape)
@@ -116,7 +116,7 @@ def test_each_landmark_makes_pairs_with_its_nearest_ten(count, pairs):
 
 @pytest.mark.parametrize(('place', 'turn_deg'), [(PILE, 0.0), (RING, 90.0)])
 def test_poses_that_a_search_met_are_compared_too(place, turn_deg):
-    """Landmarks above each other have no pairs with a direction, those far apart none at all."""
+    """Landmarks above each other have no pairs with a direction; distant ones have no pairs."""
     there = move_of(turn_deg, (20, 0, 0))
     places = make_map(np.concatenate([place, moved(place, there)]), 'abcdef' * 2)
     assert len(find_repeats(places.pairs, np.arange(6)).votes) == 0
@@ -128,7 +128,7 @@ def test_poses_that_a_search_met_are_compared_too(place, turn_deg):
 
 
 def test_what_was_matched_must_look_alike_too():
-    """A part of a room has a twin; the camera saw the rest, which may have moved there."""
+    """Part of a room has a twin; the camera saw the other part, where objects may have moved."""
     for missing, is_twin in ((7, False), (6, True)):
         rooms, move = two_rooms(missing=missing)
         seen = find_twins(rooms, np.eye(4), np.arange(missing, 12), NOWHERE)[0]
@@ -138,7 +138,7 @@ def test_what_was_matched_must_look_alike_too():
 
 
 def seen(differing=0):
-    """What a camera sees in the first of two rooms, of which some labels differ."""
+    """Return the observation in the first of two rooms with some different labels."""
     similarities = np.full((12, 24), 0.2, dtype=np.float32)
     similarities[np.arange(12), np.arange(12)] = 0.3
     similarities[np.arange(differing, 12), np.arange(12 + differing, 24)] = 0.3
@@ -149,22 +149,22 @@ def test_two_identical_rooms_are_refused_until_labels_differ():
     relocalizer = Relocalizer(doubled_room(shift_along(10.0)),
                               RelocalizerOptions(min_confidence=0.99))
     found = [relocalizer.relocalize([seen(differing)]) for differing in (0, 1, 2, 6)]
-    assert [one.accepted for one in found] == [False, False, False, True]
+    assert [result.accepted for result in found] == [False, False, False, True]
     first = found[0]
     assert first.evidence.distinct == pytest.approx(0.5, abs=0.01)
     places = sorted([first.evidence.place[0], first.evidence.twin[0]])
     assert places == pytest.approx([0.3, 10.3], abs=0.05)
     for x_m in places:
         assert f'({x_m:.1f}, ' in first.reason
-    distinct = [one.evidence.distinct for one in found]
+    distinct = [result.evidence.distinct for result in found]
     assert distinct == sorted(distinct)
-    for one in found[1:]:
-        assert pose_error(one.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
+    for result in found[1:]:
+        assert pose_error(result.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
 
 
 @pytest.mark.parametrize('offset_m', [0.0, 0.01])
 def test_a_room_with_every_landmark_doubled_is_still_accepted(offset_m):
-    """Duplicates count as one object, and a pose is not its own rival."""
+    """Duplicates count as one object, and a pose is not a rival of itself."""
     doubled = doubled_room(shift_along(offset_m))
     assert doubled.objects.max() == 11
     found = Relocalizer(doubled, RelocalizerOptions()).relocalize([seen()])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps, their embeddings and several maps in one: what is read, written and refused."""
+"""Maps, their embeddings and several maps in one: reading, writing and refusing."""
 
 import os
 from dataclasses import fields, replace
@@ -79,7 +79,7 @@ def test_a_link_stays_and_the_file_it_leads_to_keeps_its_mode(tmp_path):
     (tmp_path / 'maps').mkdir()
     there, link = tmp_path / 'maps/office.yaml', tmp_path / 'map.yaml'
     link.symlink_to('maps/office.yaml')
-    write_map(link, make_room())  # a link may lead to a file that is yet to be made
+    write_map(link, make_room())  # a link may lead to a file that does not exist yet
     there.chmod(0o640)
     there.write_text('old')
     write_map(link, make_room())
@@ -266,7 +266,7 @@ def unit_rows(count, seed):
 
 @pytest.fixture
 def embeddings():
-    """Return three landmarks: two medoids, none and unknown, one."""
+    """Return three landmarks: with two medoids, with none and unknown, and with one."""
     means = unit_rows(3, 0)
     means[1] = 0.0
     return LandmarkEmbeddings('tiny:gelu:1234', ('mug_1', 'mug_2', 'book_1'), means,
@@ -331,14 +331,14 @@ OPTIONS = RelocalizerOptions(matching='class')
 
 
 def floor(name, seed=0):
-    """Return twelve objects near the camera as a map of this name; seeds place them."""
+    """Return a map with this name of twelve objects near the camera, placed by seed."""
     rng = np.random.default_rng(seed)
     return replace(make_room(), frame_id=name, centers=np.c_[
         rng.uniform(-1.2, 1.2, (12, 2)), rng.uniform(1.5, 4, 12)])
 
 
 def join(*maps):
-    return join_maps(maps, [f'{one.frame_id}.yaml' for one in maps])
+    return join_maps(maps, [f'{landmark_map.frame_id}.yaml' for landmark_map in maps])
 
 
 def localize(landmark_map, seen, options=OPTIONS, similarities=None):
@@ -349,7 +349,7 @@ def localize(landmark_map, seen, options=OPTIONS, similarities=None):
 
 @pytest.mark.parametrize('place', [0, 1, 7])
 def test_the_right_one_of_different_floors_is_accepted(place):
-    """The pose is that of a search in this map alone, in the coordinate frame of this map."""
+    """The pose is the same as in a search of this map alone, and in its coordinate frame."""
     maps = [floor(f'floor_{number}', seed=number) for number in range(8)]
     found, part = localize(join(*maps), maps[place])
     alone, _ = localize(maps[place], maps[place])
@@ -370,7 +370,7 @@ def test_equal_floors_are_refused_and_both_are_named(turned):
 
 
 def test_the_twin_of_a_place_is_given_in_its_own_map():
-    """One of two equal maps lacks an object: the pose in the other map wins, but has a twin."""
+    """One of two equal maps lacks an object: the pose in the other map leads, but has a twin."""
     whole = floor('floor_1')
     lacking = replace(whole.select(range(11)), frame_id='floor_2',
                       centers=whole.centers[:11] + np.array([500.0, -3.0, 0.0]))
@@ -381,7 +381,7 @@ def test_the_twin_of_a_place_is_given_in_its_own_map():
 
 
 def test_many_floors_get_equal_shares_of_the_candidates():
-    """Twenty equal floors, one hypothesis for each of them at least: none is left out."""
+    """Twenty equal floors give at least one hypothesis each: none is left out."""
     maps = [floor(f'floor_{number}') for number in range(20)]
     rows = np.full((12, 12), 0.2) + 0.2 * np.eye(12)
     found, _ = localize(join(*maps), maps[0], RelocalizerOptions(), np.tile(rows, 20))
@@ -390,7 +390,7 @@ def test_many_floors_get_equal_shares_of_the_candidates():
 
 
 def test_a_search_too_short_for_all_maps_is_refused():
-    """The least number of samples is that of each map: one map alone has enough of them."""
+    """The least number of samples applies to each map: each of them gets enough."""
     maps = [floor(f'floor_{number}', seed=number) for number in range(10)]
     rows = np.full((12, 12), 0.2) + 0.2 * np.eye(12)
     short = RelocalizerOptions(iterations=600)

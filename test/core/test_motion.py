@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Two looks and odometry between them: a room moves as odometry says, a picture of it does not."""
+"""Two looks with odometry between them: a room moves as odometry predicts, a picture does not."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from cliploc_ros.core.keyframes.layer import FROM_DEPTH
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
-#: What a pose of keyframes has at least.
+#: Least score of a pose from keyframes.
 SHARED = np.diag([0.012**2] * 3 + [np.radians(0.45)**2] * 3)
 SURE = chi2.isf(1e-3, 6)
 
@@ -35,7 +35,7 @@ MOTIONS = {'side': driven(x=0.2), 'oblique': driven(0.15, 0.15),
 
 @pytest.fixture
 def room():
-    """Points 1.5 to 5 m in front of a camera, and where it sees them."""
+    """Return points 1.5 to 5 m in front of a camera, and their bearings."""
     rng = np.random.default_rng(1)
     bearings = rng.uniform((-0.6, -0.45), (0.6, 0.45), (300, 2))
     pose = make_transform(Rotation.from_rotvec([0.5, -1.0, 0.3]).as_matrix(),
@@ -58,7 +58,7 @@ def on_picture(bearings, first_from_second, away_m):
 
 
 def look(points, bearings, rng, keyframe=0, wrong=None):
-    """Return the place where such an image is recognized, in keyframes whose pose is wrong."""
+    """Return the place where such an image is recognized, in keyframes with a wrong pose."""
     noise = rng.normal(0.0, 0.5 / 525.0, bearings.shape)
     found = find_pose(points, bearings + noise)
     pose = found.map_from_camera if wrong is None else wrong @ found.map_from_camera
@@ -112,7 +112,7 @@ def test_a_picture_that_the_camera_passes_is_not_seen_again(room):
 
 
 def test_what_looks_at_the_same_keyframes_share_does_not_count(room):
-    """A wrong pose of the keyframe moves both poses alike; those of two keyframes differ."""
+    """A wrong keyframe pose moves both poses alike; errors of two keyframes differ."""
     pose, points = room
     rng, motion = np.random.default_rng(4), driven(x=0.2)
     wrong = make_transform(Rotation.from_rotvec([0.0, 0.0, np.radians(1.2)]).as_matrix(),

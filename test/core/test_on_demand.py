@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Crops on demand: which crops come first, when they end, and what that costs."""
+"""Crops on demand: their order, when comparing stops, and its cost."""
 
 from dataclasses import replace
 
@@ -61,14 +61,14 @@ def test_the_crops_that_say_most_come_first():
     lone = replace(ROOM, class_ids=('a', *'b' * 11))
     boxes = np.array([[0, 0, 90, 90], [0, 0, 90, 90], [0, 0, 40, 40], [0, 0, 99, 99.0]])
     seen = Observation(CAMERA, Detections(boxes, ('a', 'b', 'b', 'unknown'), np.ones(4)))
-    # many landmarks of its class, and large; a class that the map lacks tells nothing apart
+    # classes with many landmarks and large boxes come first; an unmapped class does not help
     assert informative_first(lone, seen).tolist() == [1, 2, 0, 3]
 
 
 def test_each_stage_has_more_crops_and_the_last_one_all():
     stages = searches(Crops(lambda rows: SURE[rows], np.array([5])))
     assert [len(stage.compared) for stage in stages] == [1, 1 + BATCH, 1 + 2 * BATCH, len(SEEN)]
-    assert stages[0].compared.tolist() == [5], 'what is known costs nothing'
+    assert stages[0].compared.tolist() == [5], 'known similarities cost nothing'
     assert sorted(stages[-1].compared) == list(range(len(SEEN)))
     for stage in stages:
         assert np.array_equal(stage.similarities, SURE[stage.compared])
@@ -80,7 +80,7 @@ def test_each_stage_has_more_crops_and_the_last_one_all():
 def test_crops_end_when_there_is_no_room():
     rooms = iter([3, 0])
     stages = searches(Crops(lambda rows: SURE[rows], room=lambda: next(rooms)))
-    assert [len(one.compared) for one in stages] == [0, 3]
+    assert [len(stage.compared) for stage in stages] == [0, 3]
     none = Observation(CAMERA, SEEN.select(np.array([], dtype=np.int64)))
     (stage,) = searches(Crops(lambda rows: SURE[rows]), none)
     assert len(stage.compared) == 0
@@ -88,7 +88,7 @@ def test_crops_end_when_there_is_no_room():
 
 @pytest.mark.parametrize('embedded', [False, True])
 def test_no_crop_is_class_matching_and_all_crops_are_hybrid(embedded):
-    """Of an array and of embeddings."""
+    """Similarities are those of an array, or of embeddings."""
     unit = np.eye(len(ROOM), dtype=np.float32)
     labels = LabelEmbeddings.of(unit)
     *_, last = stages = searches(Crops(lambda rows: CropSimilarities(
@@ -110,7 +110,7 @@ def test_classes_that_suffice_take_no_crop():
 
 
 def test_an_early_stop_is_surer_than_the_last_one():
-    """A pose that classes alone accept, but not surely, is compared with all crops."""
+    """A pose that is accepted by class, but with doubt, is compared with all crops."""
     sure = localize(OPTIONS)[1].confidence
     asked = replace(OPTIONS, min_confidence=1.0 - 3.0 * (1.0 - sure))
     frame, found = localize(asked)
@@ -126,6 +126,6 @@ def test_without_time_for_all_crops_a_pose_must_be_as_sure():
     options = replace(OPTIONS, min_confidence=1.0 - 3.0 * (1.0 - sure))
     crops = Crops(lambda rows: SURE[rows], room=lambda: 0)
     _, found = localize_on_demand(Relocalizer(ROOM, options), (), VIEW, crops)
-    # one camera: all crops do not change what is known of it, but for rounding
+    # one camera: comparing all crops does not change its evidence, except for rounding
     assert found.confidence == pytest.approx(sure, abs=1e-7) and sure > options.min_confidence
     assert not found.accepted and found.refusal_kind == 'not_all_crops'

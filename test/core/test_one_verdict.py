@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One verdict from objects and keyframes: which pose leads, and what either cannot override."""
+"""One verdict from objects and keyframes: which pose leads, and what neither can override."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def moved(x, pose=MAP_FROM_CAMERA):
 
 
 def place(x=0.0, inliers=200, confirmed=0.9, reach=1.0, **fields):
-    """Points all over the middle of the image, a share of its width and height."""
+    """Return points over the middle of the image, within a share of its width and height."""
     rng, size = np.random.default_rng(0), np.array([CAMERA.width, CAMERA.height])
     pixels = size * (0.5 + reach * rng.uniform(-0.55, 0.55, (inliers, 2)))
     return RecognizedPlace(moved(x), FINE, 0.5 * FINE, inliers, confirmed, 0.9, (40, 44),
@@ -80,11 +80,11 @@ def test_many_points_accept_what_objects_could_not():
 
 
 def test_points_of_a_thorough_search_count_less():
-    """It finds several times as many, and so do things that look alike."""
-    fast, thorough = (ask(Says(place(3.0, inliers=50, confirmed=0.5, is_thorough=one)), objects=0)
-                      for one in (False, True))
+    """The thorough pass finds several times as many points, and so do places that look alike."""
+    fast, thorough = (ask(Says(place(3.0, inliers=50, confirmed=0.5, is_thorough=is_thorough)),
+                          objects=0) for is_thorough in (False, True))
     assert fast.accepted and not thorough.accepted
-    assert ask(Says(place(3.0, is_thorough=True)), objects=0).accepted, 'enough of them do'
+    assert ask(Says(place(3.0, is_thorough=True)), objects=0).accepted, 'more points suffice'
 
 
 def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
@@ -92,11 +92,11 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     assert strong.accepted and weak.accepted
     assert strong.source == weak.source == 'both'
     assert error_m(strong, 0.05) < 1e-12
-    assert error_m(weak) < 0.02, 'a few points hardly move the pose of objects'
-    assert [len(one.cameras) for one in (strong, weak)] == [0, 1], \
-        'only a pose that rests on boxes checks their camera'
+    assert error_m(weak) < 0.02, 'a few points hardly change the pose from objects'
+    assert [len(seen.cameras) for seen in (strong, weak)] == [0, 1], \
+        'only a pose from boxes checks the camera'
     points = ask(Says(place(0.05, inliers=9)), objects=0)
-    assert weak.evidence.by_points <= points.evidence.by_points, 'objects say no more for points'
+    assert weak.evidence.by_points <= points.evidence.by_points, 'objects add no more evidence'
 
 
 @pytest.mark.parametrize('cause', ['too few objects', 'a search cut short', 'earlier looks'])
@@ -133,9 +133,10 @@ def test_a_place_that_moves_otherwise_than_odometry_says_is_no_room():
     second = replace(first, stamp_ns=10, odom_from_camera=moved(0.3, np.eye(4)))
     looks = Looks().with_look(Look(first, MAP_FROM_CAMERA, 0.99, place()), accepted=True)
     relocalizer = Relocalizer(ROOM, OPTIONS)
-    found = [relocalizer.locate([relocalizer.search(one)], looks=looks, recognizer=Says(place()))
-             for one in (second, replace(second, odom_from_camera=np.eye(4)))]
-    assert [one.accepted for one in found] == [False, True]
+    found = [relocalizer.locate([relocalizer.search(observation)], looks=looks,
+                                recognizer=Says(place()))
+             for observation in (second, replace(second, odom_from_camera=np.eye(4)))]
+    assert [result.accepted for result in found] == [False, True]
 
 
 @pytest.mark.parametrize('inliers', [60, 400])
@@ -150,7 +151,7 @@ def test_a_place_that_the_layer_covers_but_does_not_recognize_loses_confidence()
     covered, elsewhere = ask(Says(covers=1.0), objects=5), ask(Says(covers=0.0), objects=5)
     assert covered.confidence < elsewhere.confidence
     cut = ask(Says(covers=1.0, is_complete=False), objects=5)
-    assert cut.confidence == elsewhere.confidence, 'a search that was cut says nothing'
+    assert cut.confidence == elsewhere.confidence, 'an interrupted search gives no evidence'
 
 
 @pytest.mark.parametrize(('fields', 'kind'), [
@@ -173,7 +174,7 @@ def test_a_picture_refuses_the_objects_in_it_too():
 
 
 def two_rooms(lacking=0):
-    """The room and a copy of it 20 m away, without some of its objects."""
+    """Return the room and a copy of it 20 m away, without some of its objects."""
     return doubled_room(np.array([20.0, 0.0, 0.0])).select(range(2 * len(ROOM) - lacking))
 
 
@@ -194,7 +195,7 @@ def test_keyframes_tell_a_twin_that_they_cover_as_well_apart(covers):
     both = ask(Says(place(), place(20.0, inliers=190), covers=covers), room=two_rooms())
     assert not both.accepted and both.evidence.distinct < 0.6, 'both rooms are recognized'
     weak = ask(Says(place(inliers=8, confirmed=0.0), covers=covers), room=two_rooms())
-    assert weak.source == 'both' and weak.evidence.distinct < 0.6, 'chance points tell nothing'
+    assert weak.source == 'both' and weak.evidence.distinct < 0.6, 'chance points give no evidence'
 
 
 def test_fusing_takes_the_better_pose_of_each_direction():

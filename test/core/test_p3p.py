@@ -12,7 +12,7 @@ from cliploc_ros.core.geometry.minimal_solvers import solve_p3p, two_point
 
 
 def random_problem(rng):
-    """Three points of random bearings and depths in front of a camera at a random pose."""
+    """Return three points at random bearings and depths in front of a camera at a random pose."""
     seen = rng.uniform(-1, 1, (3, 3))
     seen[:, 2] = rng.uniform(0.5, 6.0, 3)
     seen[:, :2] *= seen[:, 2:]
@@ -45,7 +45,7 @@ def test_finds_what_opencv_finds(rng):
             if np.abs(again - bearings).max() > 1e-6:
                 continue  # not a solution: OpenCV's own rounding near a double root
             found += 1
-            # as near as OpenCV 4.6 rounds its own; solutions of one problem differ far more
+            # as near as the rounding of OpenCV 4.6; solutions of one problem differ far more
             assert nearest(rotations, translations, rotation, translation.ravel()) < 1e-3
     assert found > 3_000
 
@@ -80,7 +80,7 @@ UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def solve_two_point(bearings, points, up_in_camera, up_in_map):
-    """Rotations (s, 3, 3) and translations (s, 3) that the kernel finds, s = 0 to 2."""
+    """Return the rotations (s, 3, 3) and translations (s, 3) from the kernel, s = 0 to 2."""
     rotations, translations = np.empty((2, 3, 3)), np.empty((2, 3))
     count = two_point(np.ascontiguousarray(bearings), np.ascontiguousarray(points),
                       np.concatenate([up_in_camera, up_in_map]), rotations, translations)
@@ -88,7 +88,7 @@ def solve_two_point(bearings, points, up_in_camera, up_in_map):
 
 
 def random_pair(rng):
-    """Two points of random bearings and depths in front of a camera at a random pose."""
+    """Return two points at random bearings and depths in front of a camera at a random pose."""
     seen = rng.uniform(-1, 1, (2, 3))
     seen[:, 2] = rng.uniform(0.5, 6.0, 2)
     seen[:, :2] *= seen[:, 2:]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before: a region, a vertical, a height; what they buy, and what wrong ones do."""
+"""Priors (a region, a vertical, a height): their benefit, and the effect of wrong ones."""
 
 import math
 from dataclasses import replace
@@ -91,7 +91,7 @@ def test_a_camera_that_looks_up_has_no_yaw():
 
 
 def test_a_region_decides_between_rooms_that_nearly_look_the_same():
-    """The second room lacks three objects: more than by chance, too little to be sure."""
+    """The second room lacks three objects: more than expected by chance, but not conclusive."""
     alone = ask(LACKING)
     assert alone.refusal_kind == 'look_alike'
     found = ask(LACKING, region=region())
@@ -121,7 +121,7 @@ def test_a_region_of_another_floor_decides_between_equal_floors():
 
 def test_a_confident_wrong_region_accepts_nothing_and_is_named():
     wrong = region(5.0, probability=1.0)
-    assert not ask(region=wrong).accepted, 'neither room is there'
+    assert not ask(region=wrong).accepted, 'neither room is recognized'
     refused = ask(make_room(), 3, region=wrong)
     assert refused.confidence < ask(make_room(), 3).confidence
     assert 'prior' in refused.reason
@@ -141,7 +141,7 @@ def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
 
 
 UP_IN_CAMERA = MAP_FROM_CAMERA[2, :3]
-LEVEL = np.s_[3:5, 3:5]  # of a covariance: turns about level axes
+LEVEL = np.s_[3:5, 3:5]  # covariance of turns about level axes
 
 
 def with_vertical(room, up=UP_IN_CAMERA):
@@ -150,7 +150,7 @@ def with_vertical(room, up=UP_IN_CAMERA):
 
 @pytest.mark.parametrize('tilt_deg', [90.0, 180.0])
 def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observe):
-    """As by a wrong mount: what boxes say without it is among the rivals."""
+    """As with a wrong mount: the pose from boxes without the vertical is among the rivals."""
     relocalizer, rng = Relocalizer(office_map, RelocalizerOptions()), np.random.default_rng(0)
     accepted, wrong = 0, 0
     for frame in queries.main_frames():
@@ -173,7 +173,7 @@ def test_the_right_pose_is_the_rival_of_one_by_a_wrong_vertical(room):
 
 
 def test_two_objects_and_the_vertical_fix_a_pose(room):
-    """But are refused, for four are asked; and without a vertical there is none."""
+    """The pose is refused, since four objects are required; without a vertical there is none."""
     options = RelocalizerOptions(matching='class')
     pair = np.array([0, 1])
     observation = with_vertical(room)
@@ -207,7 +207,7 @@ def test_a_height_that_is_wrong_leaves_no_pose_outside(room):
 
 
 def test_the_papers_algorithms_ask_for_no_vertical(room):
-    """Where the paper's own configuration is asked for, exactly that runs."""
+    """If the paper's configuration is requested, exactly that configuration runs."""
     paper = RelocalizerOptions(matching='class', algorithm='bf', refine=False)
     found = [Relocalizer(room, paper).relocalize([with_vertical(room, up)])
              for up in (UP_IN_CAMERA, None)]

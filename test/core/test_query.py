@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A case of queries repeats its answer bit by bit from its file; broken files are named."""
+"""A case of queries repeats its answer bit by bit from its file; damaged files are reported."""
 
 import json
 from dataclasses import asdict, replace
@@ -87,7 +87,7 @@ def test_crops_end_where_time_ended(tmp_path):
 
 
 def test_another_map_has_labels_of_its_own(tmp_path):
-    """A case is answered with a part of its map, too."""
+    """A case is also answered with a part of its map."""
     options = RelocalizerOptions(min_confidence=1.0, k=2)
     localizer = Localizer(Relocalizer(ROOM, options))
     localizer.answer(query(), Observer(Encoder(), LABELS))
@@ -98,7 +98,7 @@ def test_another_map_has_labels_of_its_own(tmp_path):
                    Observer(encoder, labels))
     assert encoder.count == 0
     assert pose_error(again.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
-    # similarities that are given need no crops
+    # given similarities need no crops
     given = query(similarities=np.eye(12, dtype=np.float32))
     Localizer(Relocalizer(ROOM, options)).answer(given, Observer(encoder, LABELS))
     assert encoder.count == 0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement of one frame and of several, its covariance, and which poses stand for a place."""
+"""Refinement of one and several frames, its covariance, and which poses represent a place."""
 
 from dataclasses import replace
 
@@ -40,13 +40,13 @@ from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 
 def refine(scene, rotation, translation, vertical):
-    """One frame alone is a rig of one."""
+    """A single frame is a rig of one camera."""
     rig = make_rig([scene], np.eye(4)[None], vertical[None], np.zeros(len(scene.centers)))
     return refine_rig(rig, rotation, translation)
 
 
 def shaken(rng, metres, degrees):
-    """The true camera_from_map, its camera moved and turned at random."""
+    """Return the true camera_from_map, randomly moved and turned."""
     pose = MAP_FROM_CAMERA.copy()
     turn = rng.normal(size=3)
     turn *= np.radians(degrees) / np.linalg.norm(turn)
@@ -86,7 +86,7 @@ def test_it_is_nearer_the_truth_than_before_and_hardly_ever_scores_less(room, rn
         after.append(error_of(found.rotation, found.translation)[0])
     print(f'\nshaken by {np.median(before):.2f} m, boxes by 3 px: '
           f'{np.median(after):.3f} m off afterwards (median)')
-    # three pixels leave so much, wherever one starts
+    # errors of three pixels leave this error, whatever the start
     assert np.median(after) < 0.45 * np.median(before)
 
 
@@ -122,7 +122,7 @@ FRAMES = 4
 
 @pytest.fixture
 def walk(rng):
-    """Poses of a camera that walks and turns; the last is the reference."""
+    """Return poses of a camera that walks and turns; the last is the reference."""
     poses = [MAP_FROM_CAMERA]
     for _ in range(FRAMES - 1):
         step = make_transform(Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix(),
@@ -153,14 +153,14 @@ def test_the_score_is_the_sum_of_the_frames_scores(room, walk, rng):
     rig = rig_of(room, walk)
     shift = invert_transform(walk[-1]) @ nearby(walk[-1], rng, 0.03, 0.5)
     alone = []
-    for pose in walk:  # the rig moves as one
+    for pose in walk:  # the rig moves rigidly
         moved = walk[-1] @ shift @ invert_transform(walk[-1]) @ pose
         alone.append(verify(scene_of(room, pose), *split(moved)))
-    assert min(one.score for one in alone) > 1.0
+    assert min(result.score for result in alone) > 1.0
     found = verify_rig(rig, *split(walk[-1] @ shift))
-    assert found.score == pytest.approx(sum(one.score for one in alone), abs=1e-9)
+    assert found.score == pytest.approx(sum(result.score for result in alone), abs=1e-9)
     np.testing.assert_array_equal(found.landmarks,
-                                  np.concatenate([one.landmarks for one in alone]))
+                                  np.concatenate([result.landmarks for result in alone]))
     np.testing.assert_allclose(found.ious, np.concatenate([one.ious for one in alone]), atol=1e-9)
 
 
@@ -218,7 +218,7 @@ def boxes_at(map_from_camera, noise_px=0.0, rng=None):
 
 def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=None,
            wrong_share=0.0, camera=CAMERA, deviations=EXACT):
-    """The pose of the last camera in a map with these centres, and its covariance."""
+    """Return the pose of the last camera in a map with these centres, and its covariance."""
     scenes = [make_scene(camera.normalize_bboxes(boxes_at(pose, noise_px, rng)), centers,
                          ROOM.shapes, np.eye(len(ROOM), dtype=bool), np.empty((0, 2), int), 0.05)
               for pose in poses]
@@ -242,7 +242,7 @@ def move_landmarks(rng, pose):
 
 
 def move_map(rng, pose):
-    """About the camera: all landmarks share an error of 5 cm and 2 degrees."""
+    """The error is about the camera: 5 cm and 2 degrees, common to all landmarks."""
     turn = Rotation.from_rotvec(rng.normal(0, np.radians(2.0), 3)).as_matrix()
     return {'centers': (ROOM.centers - pose[:3, 3]) @ turn.T + pose[:3, 3]
             + rng.normal(0, 0.05, 3)}
@@ -258,7 +258,8 @@ def change_camera(rng, pose):
         fy=CAMERA.fy * np.exp(focal - aspect / 2), cy=CAMERA.cy + 500 * y)}
 
 
-# What is wrong, what the map or the camera states of it, and the greatest share without that.
+# For each error: the disturbance, arguments with and without its stated deviation, and the
+# greatest share in the ellipsoids without it.
 STATED = {
     'landmarks': (move_landmarks, {'sigma': 0.1}, {'sigma': DEFAULT_SIGMA_M}, 0.6),
     'the map': (move_map, {'shared': np.tile([0.05, np.radians(2.0)], (len(ROOM), 1))}, {}, 0.5),
@@ -298,14 +299,14 @@ def test_the_covariance_holds_the_chance_that_an_object_is_wrong():
         fitted([MAP_FROM_CAMERA], ROOM.centers, 0.02)[1][:3, :3])
     displaced = ROOM.centers.copy()
     displaced[4] += [0.06, 0.04, 0.0]
-    # the pose would step back without this object
+    # without this object the pose would step back
     step = pose_difference(MAP_FROM_CAMERA, fitted([MAP_FROM_CAMERA], displaced, 0.02)[0])[:3]
     more = (added_in(displaced) - added)[:3, :3]
     assert step @ more @ step > 0.07 * (step @ step) ** 2 > 0.0
 
 
 def test_odometry_is_a_walk_through_the_frames_in_order_of_time():
-    """The reference first, last or between: steps add up outwards from it."""
+    """The reference is first, last or in between: steps add up outwards from it."""
     way = [MAP_FROM_CAMERA @ make_transform(np.eye(3), np.array([0.3 * step, 0.0, 0.0]))
            for step in (0, 1, 2, 1)]
     middle = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 3, 2])[1]
@@ -329,9 +330,9 @@ def test_a_map_states_what_its_landmarks_share():
     assert not stated.shared_sigmas[1:].any()
     frame = Observation(CAMERA, Detections(boxes_at(MAP_FROM_CAMERA), ROOM.class_ids,
                                            np.ones(len(ROOM))))
-    plain, shared = (Relocalizer(one, BY_CLASS).relocalize([frame]).covariance for one in (
+    plain, shared = (Relocalizer(each, BY_CLASS).relocalize([frame]).covariance for each in (
         ROOM, replace(ROOM, details=(stated.details[0],) * len(ROOM))))
-    # it does not shrink with the number of landmarks
+    # the covariance does not shrink with the number of landmarks
     np.testing.assert_allclose(np.diag(shared - plain), [0.01] * 3 + [np.radians(3.0) ** 2] * 3,
                                rtol=0.1)
 

@@ -13,7 +13,7 @@ from cliploc_ros.errors import OptionsError
 
 @pytest.fixture
 def observation(room) -> Observation:
-    """What a perfect detector and a good encoder see of the room."""
+    """Return the observation of a perfect detector and a good encoder in the room."""
     similarities = np.full((len(room), len(room)), 0.2, dtype=np.float32)
     np.fill_diagonal(similarities, np.linspace(0.3, 0.4, len(room)))
     return Observation(CAMERA, see_room(room), similarities, 123)

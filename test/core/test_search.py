@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which samples are drawn and tried, and the search kernel against the plain reference."""
+"""The samples of each strategy, and the search kernel compared with the plain reference."""
 
 from math import comb, radians
 
@@ -91,7 +91,7 @@ def test_the_range_holds_every_distance(rng):
 
 
 def test_all_that_is_within_reach_is_found(room, rng):
-    """Landmarks along a corridor: the sweep leaves out only what no distance allows."""
+    """With landmarks along a corridor, the sweep skips only samples that no distance allows."""
     seen = see_room(room)
     centers = rng.uniform(-1.0, 1.0, (60, 3)) * [40.0, 3.0, 3.0]
     pairs = np.column_stack([rng.integers(len(seen), size=200), rng.integers(60, size=200)])
@@ -232,11 +232,11 @@ def test_leaders_are_those_of_scoring_every_sample(scene, rng):
     (Constraint(tuple(-UP_IN_CAMERA), tuple(UP_IN_MAP), max_tilt=radians(10)), False),
 ])
 def test_a_constraint_rules_poses_out(scene, constraint, remains):
-    search = (search_exhaustively, lambda *given: search_progressively(
+    searches = (search_exhaustively, lambda *given: search_progressively(
         scene, compatible_pairs(scene), *given[1:]))
-    for one in search:
+    for search in searches:
         leaders = Leaders.none_yet()
-        *_, progress = one(scene, leaders, constraint)
+        *_, progress = search(scene, leaders, constraint)
         assert progress.coverage == 1.0
         near = False
         for row in leaders.ranked():

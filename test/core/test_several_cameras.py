@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Several cameras of one robot, which look at one instant in different directions."""
+"""Several cameras of one robot, which look in different directions at the same instant."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def test_together_they_see_enough(rng):
 
 
 def test_cameras_of_one_instant_have_no_odometry_between_them(rng):
-    """Whatever their names say, equal names are frames of one camera that moved."""
+    """Frames with equal names are from one camera that moved."""
     relocalizer = Relocalizer(MAP, replace(OPTIONS, mount_deviation=(0.0, 0.0)))
     frames = look(rng, objects=5)
     rigid, moving = (relocalizer.relocalize([replace(frame, camera_name=name) for frame, name in
@@ -57,10 +57,11 @@ def test_the_covariance_holds_the_errors_of_mounts(rng):
             np.radians(deviation[1]) * rng.normal(size=3)).as_matrix(),
             deviation[0] * rng.normal(size=3)) for mount in MOUNTS[:-1]]
         frames = look(rng, objects=5, mounts=[*wrong, MOUNTS[-1]])
-        found = [one.relocalize(frames) for one in (stated, ignored)]
-        if all(pose_error(one.map_from_camera, MOUNTS[-1])[0] < 1.0 for one in found):
-            squares.append([normalized_square(one.map_from_camera, one.covariance, MOUNTS[-1])
-                            for one in found])
+        found = [relocalizer.relocalize(frames) for relocalizer in (stated, ignored)]
+        if all(pose_error(result.map_from_camera, MOUNTS[-1])[0] < 1.0 for result in found):
+            squares.append([
+                normalized_square(result.map_from_camera, result.covariance, MOUNTS[-1])
+                for result in found])
     within = (np.array(squares) < chi2.ppf(0.95, 6)).mean(axis=0)
     print(f'\n{len(squares)} poses, in the 95 % ellipsoids: stated {within[0]:.2f}, ignored '
           f'{within[1]:.2f}')
@@ -75,7 +76,7 @@ def test_instants_are_kept_and_replaced_as_a_whole(rng):
         found = localizer.answer(Query((*others, last), limit=5, length_s=60.0))
         return found, [len(instant.searched) for instant in localizer._instants]
     assert localize(0, np.eye(4))[1] == [4]
-    assert localize(1, np.eye(4))[1] == [4], 'a robot that stands replaces its instant'
+    assert localize(1, np.eye(4))[1] == [4], 'a standing robot replaces its instant'
     assert localize(2, STEP)[1] == [4, 4]
     found, kept = localize(3, STEP @ STEP)
     assert kept == [4, 4]
@@ -103,7 +104,7 @@ def test_a_camera_that_contradicts_the_others_is_named(rng, turned_deg, objects,
     (5, 4, 1, 2, [])])
 def test_a_mount_is_judged_by_what_the_other_cameras_match(rng, instants, objects, matched, others,
                                                            wrong):
-    """Too few instants, too few objects, half of them matched; where others miss half, too."""
+    """Too few instants or objects, half of the objects matched, or other cameras miss half too."""
     check = CameraCheck()
     for _ in range(instants):
         check.add_instant(look(rng), [objects] * 4, [others, matched, others, others])
@@ -120,7 +121,7 @@ def test_a_covered_camera_has_no_wrong_mount(rng):
 
 
 def test_a_map_that_is_out_of_date_is_not_blamed_on_a_mount(rng):
-    """All objects have swapped places. No pose is accepted, so no mount is judged by one."""
+    """All objects have swapped places. No pose is accepted, so no mount is judged."""
     exchanged = replace(MAP, centers=MAP.centers[np.random.default_rng(0).permutation(len(MAP))])
     localizer = Localizer(Relocalizer(exchanged, OPTIONS))
     for _ in range(10):

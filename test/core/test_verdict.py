@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The evidence for a pose, the numbers that weigh it, its covariance, and what a refusal says."""
+"""The evidence for a pose, its confidence and covariance, and the reasons of refusals."""
 
 import importlib.util
 import math
@@ -51,7 +51,7 @@ SURE = Evidence(inliers=9, likely=0.99)
 GENUINE = Signs(math.log(30), 0.8, 0.0, 0.0, 1.0, 0.1)
 SMALL = GENUINE._replace(reach=0.3, unexplained=0.7, confirmed=0.4)
 RECOGNIZED = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 200, 0.9, 0.9)
-# What takes the confidence away, and the kind of refusal that names it.
+# Factors that reduce the confidence, and the kind of refusal that names them.
 WEAK = {
     'rival': ({'likely': 0.5, 'rival': Rival(0.49, (9.0, 9.0, 9.0))}, RefusalKind.AMBIGUOUS),
     'other source': ({'likely': 0.5, 'rival': Rival(0.49, (9.0, 9.0, 9.0), '', True)},
@@ -80,7 +80,7 @@ def test_a_refusal_names_the_evidence_that_decided(what):
     fields, kind = WEAK[what]
     refused = refusal(replace(SURE, **fields), OPTIONS)
     assert refused.kind == kind
-    assert len(f'refused: {refused.reason}') <= 120, 'what services answer is one line'
+    assert len(f'refused: {refused.reason}') <= 120, 'answers of services have one line'
 
 
 def test_keyframes_that_are_sure_replace_what_objects_lack():
@@ -118,7 +118,7 @@ def office_queries(shared_data):
 
 @pytest.mark.parametrize('knows_vertical', [False, True])
 def test_no_pose_is_its_own_look_alike(office_queries, knows_vertical):
-    """Frames 12 and 14, and 3 with a vertical, were: the twin slid back when it was refined."""
+    """Frames 12, 14 and, with a vertical, 3 once failed: refinement moved the twin back."""
     landmark_map, queries = office_queries
     relocalizer = Relocalizer(landmark_map, OPTIONS)
     for number in (3, 12, 14):
@@ -167,7 +167,7 @@ LEVEL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 def turned(axis, degrees):
-    """Poses (m, 4, 4) of a level camera, turned about an axis of its own."""
+    """Return poses (m, 4, 4) of a level camera, turned about one of its axes."""
     poses = np.tile(np.eye(4), (len(degrees), 1, 1))
     poses[:, :3, :3] = LEVEL @ Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     return poses
@@ -177,7 +177,7 @@ def turned(axis, degrees):
 def test_the_more_a_camera_is_tilted_the_more_speaks_against_it(axis):
     against = tilt_handicaps(turned(axis, np.arange(0, 181, 15)[:, None]), 40.0)
     assert (np.diff(against) >= 0.0).all()
-    # handheld and downward cameras lose nothing, cameras upside down all
+    # handheld and downward cameras lose no confidence, cameras upside down all of it
     assert (against[:5] == 0.0).all()
     assert 0.0 < against[6] < 2.0
     assert against[-1] == WRONG_MOUNT
@@ -206,9 +206,9 @@ def test_the_likeliest_hypothesis_leads_and_without_refinement_the_greatest_scor
     differ = 0
     for frame in list(queries.main_frames())[:20:4]:
         found = likeliest.relocalize([observe(frame)]).hypotheses
-        worth = utilities([one.support for one in found])
+        worth = utilities([pose.support for pose in found])
         assert (np.diff(worth) <= 0.0).all()
-        scores = [one.score for one in found]
+        scores = [pose.score for pose in found]
         differ += scores != sorted(scores, reverse=True)
         scores = [one.score for one in greatest.relocalize([observe(frame)]).hypotheses]
         assert scores == sorted(scores, reverse=True)
@@ -217,13 +217,13 @@ def test_the_likeliest_hypothesis_leads_and_without_refinement_the_greatest_scor
 
 @pytest.mark.parametrize('matching', ['hybrid', 'class'])
 def test_another_place_is_hardly_ever_accepted(matching, office_map, queries, thresholds):
-    """The map's own objects, at places that they exchanged: whatever fits is wrong."""
+    """Queries in the map with all objects exchanged: every pose is wrong."""
     asked = make_queries(queries, office_map, every_frame=True)[::3]
     accepted, options = [], RelocalizerOptions(matching=matching)
     for seed in range(2):
         elsewhere, _ = exchange_landmarks(office_map, asked, 1.0, np.random.default_rng(seed))
         relocalizer = Relocalizer(elsewhere, options)
-        accepted += [relocalizer.relocalize([one.observation]).accepted for one in asked]
+        accepted += [relocalizer.relocalize([query.observation]).accepted for query in asked]
     print(f'\n{matching}: {sum(accepted)} of {len(accepted)} accepted in another place')
     assert np.mean(accepted) <= thresholds['trust']['accepted_elsewhere'][matching]
 
@@ -233,7 +233,7 @@ APART = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10]], dtype=n
 
 @pytest.fixture
 def compared(office_map, queries):
-    """A frame whose boxes are three that lie apart and one that nearly repeats the third."""
+    """Return a frame with three separate boxes and one that nearly repeats the third."""
     boxes = np.concatenate([APART, [[201.0, 0.0, 210.0, 10.0]]])
     camera = Camera(640, 480, *queries.intrinsics_fx_fy_cx_cy)
     detections = Detections(boxes, ('chair', *office_map.class_ids[4:5], 'none', 'none'),
@@ -270,7 +270,7 @@ def test_what_no_landmark_explains_counts_against_a_pose(measure, compared, quer
     assert 'chair' in office_map.class_ids and 'none' not in office_map.class_ids
     assert measure([compared], poses[:1], [[Match(0, 3, 0.5), Match(1, 4, 0.5)]]).unexplained == 0
     assert measure([compared], poses[:1], [[Match(1, 4, 0.5), Match(2, 3, 0.5)]]).unexplained == 1
-    # seen twice, missed twice: one object, as are those that are explained twice
+    # seen twice, missed twice: each counts as one object, like objects explained twice
     twice = measure([compared] * 2, poses, [[Match(1, 4, 0.5)]] * 2)
     assert (twice.inliers, twice.unexplained) == (1, 1)
 
@@ -282,7 +282,7 @@ def test_labels_and_classes_support_a_pose(measure, compared, queries, office_ma
     # one of all columns is 1, the others are 0
     assert found.likeness == pytest.approx(np.sqrt(count - 1), rel=1e-4)
     own = office_map.class_ids.count(office_map.class_ids[4])
-    # as common as in any building, which is more than in this map
+    # as common as in a typical building, which is more than in this map
     common = CALIBRATION.common[office_map.class_ids[4]]
     assert common > own / count
     assert (found.rarity, found.unlabelled) == (pytest.approx(-np.log(common)), 0)
@@ -312,7 +312,7 @@ FORTY, ORIGIN = Setting(40), (0.0, 0.0, 0.0)
 
 
 def share(supports, poses, setting):
-    """Return the confidences of poses that objects support."""
+    """Return the confidences of poses with given support of objects."""
     return confidences(utilities(supports), poses, none_right(setting))
 
 
@@ -337,7 +337,7 @@ def test_a_large_map_takes_confidence_and_a_known_vertical_gives_some():
         Setting(20), Setting(2000), Setting(2000, 1.0), Setting(2000, 45.0)))
     assert large < level < small
     assert vague == large
-    # a better vertical than any that the fit has seen says no more than the best of those
+    # a better vertical than in the fit has the same effect as the best one in the fit
     assert (share([fair], poses_at(0), Setting(2000, 0.01))
             == share([fair], poses_at(0), Setting(2000, 0.5)))
 
@@ -355,7 +355,7 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
         supports = [Support(int(rng.integers(0, 9)), rng.uniform(0, 9), rng.uniform(0, 30),
                             rng.uniform(0, 20)) for _ in range(count)]
         found = share(supports, poses_at(*5.0 * np.arange(count)), FORTY)
-        # none is more certain than .9999, so none is less likely than .0001
+        # no landmark is more certain than .9999, so none is less likely than .0001
         assert (found >= 0).all() and found.sum() <= 1.0 + 1e-4 * count
         highest = max(highest, found.sum())
     assert highest > 0.99, 'some of them are nearly certain'
@@ -394,7 +394,7 @@ def test_refusal_names_its_reason(evidence, options, reason):
 
 
 def garbage(rng, kind):
-    """Ten boxes that mean nothing: anywhere, nearly one, five of them twice, or the image."""
+    """Return ten garbage boxes: random, nearly equal, five of them twice, or the whole image."""
     corners = rng.uniform((0, 0), (600, 440), (10, 2))
     boxes = np.concatenate([corners, corners + rng.uniform(10, 200, (10, 2))], axis=1)
     if kind == 'nearly one box':
@@ -439,7 +439,7 @@ def test_a_better_answer_tells_what_it_knows_better():
     assert after.covariance[0, 0] == pytest.approx(0.001, rel=1e-2)
     assert after.covariance[1, 1] == pytest.approx(0.01, rel=1e-2)
     assert given[0, 0] < 0.002 and given[1, 1] > 50.0
-    # nearly all of the way to it
+    # nearly all the way to it
     assert after.map_from_camera[0, 3] == pytest.approx(0.1, abs=0.005)
 
 
@@ -503,13 +503,13 @@ def test_boxes_that_overlap_show_one_thing():
 
 
 def test_one_thing_under_two_class_names_counts_once():
-    """The map has each landmark under a second class, and the image each box."""
+    """The map has each landmark also under a second class, and the image each box."""
     seen = see_room(ROOM)
     renamed = tuple(f'also {name}' for name in ROOM.class_ids)
     both = LandmarkMap('map', (*ROOM.landmark_ids, *(f'{one}_2' for one in ROOM.landmark_ids)),
                        ROOM.labels * 2, ROOM.class_ids + renamed, *(
-                           np.tile(one, (2, 1)) for one in (ROOM.centers, ROOM.semi_axes,
-                                                            ROOM.quats_xyzw)))
+                           np.tile(column, (2, 1)) for column in (
+                               ROOM.centers, ROOM.semi_axes, ROOM.quats_xyzw)))
     alone = support_of(ROOM, seen)
     twice = support_of(both, together(seen, replace(seen, class_ids=renamed)))
     assert (twice.inliers, twice.score) == pytest.approx((alone.inliers, alone.score), abs=0.2)
@@ -517,7 +517,7 @@ def test_one_thing_under_two_class_names_counts_once():
 
 
 def test_a_second_box_of_an_explained_thing_is_not_unexplained():
-    """Its class is another one of the map; a box elsewhere is unexplained."""
+    """Its class is another one in the map; a box elsewhere is unexplained."""
     seen = see_room(ROOM)
     again = replace(seen.select(np.arange(1)), class_ids=(ROOM.class_ids[1],))
     elsewhere = replace(again, bboxes_xyxy=np.array([[2.0, 400.0, 60.0, 470.0]]))
@@ -529,7 +529,7 @@ def test_a_second_box_of_an_explained_thing_is_not_unexplained():
 
 
 def arrangement(off_m):
-    """Things above each other, every second one beside the axis by a distance [m]."""
+    """Return things above each other, with every second one off the axis by a distance [m]."""
     count = 6
     centers = np.c_[off_m * (np.arange(count) % 2) * np.array([1, 1, 1, -1, 1, 1]),
                     np.zeros(count), 0.4 * np.arange(count)]
@@ -540,7 +540,7 @@ def arrangement(off_m):
 
 
 def test_a_turn_about_an_axis_that_all_objects_share_is_a_rival():
-    """Things on one axis fix all but the turn about it; things beside it fix that, too."""
+    """Things on one axis leave the turn about it open; things off the axis determine it."""
     camera = make_transform(UP, np.array([0.0, -2.5, 1.0]))
     on_axis, spread = arrangement(0.06), arrangement(0.8)
     rows = np.arange(6)
@@ -549,18 +549,18 @@ def test_a_turn_about_an_axis_that_all_objects_share_is_a_rival():
     np.testing.assert_allclose(away, np.tile(away[0], (len(turned), 1)), atol=1e-9)
     assert len(turned) >= 7
     assert len(turned_about_axis(ROOM, camera, np.arange(12))) == 0
-    # a camera that is not verified yet lowers the confidence, too
+    # a camera that is not verified yet also lowers the confidence
     options = RelocalizerOptions(matching='class', min_confidence=0.75)
-    found = [Relocalizer(one, options).relocalize(
-        [Observation(CAMERA, see_room(one, camera), up_in_camera=camera[2, :3])])
-        for one in (on_axis, spread)]
-    assert [one.accepted for one in found] == [False, True]
+    found = [Relocalizer(room, options).relocalize(
+        [Observation(CAMERA, see_room(room, camera), up_in_camera=camera[2, :3])])
+        for room in (on_axis, spread)]
+    assert [pose.accepted for pose in found] == [False, True]
     assert found[0].evidence.distinct < 0.8
     assert found[1].evidence.distinct > 0.95
 
 
 def shown(counts, likenesses, first=0):
-    """The support of a pose that explains some boxes, from the first one on."""
+    """Return the support of a pose that explains some boxes, starting with the first."""
     rows = {(0, first + row): np.array([count, count, 0.0, likeness, 0.0, 0.0, 0.0])
             for row, (count, likeness) in enumerate(zip(counts, likenesses, strict=True))}
     return Support(inliers=sum(counts), likeness=sum(likenesses), shown=rows)
@@ -569,11 +569,11 @@ def shown(counts, likenesses, first=0):
 def test_labels_tell_places_apart_and_what_one_place_lacks_does_not():
     pose = shown([1] * 6, [2.0] * 6)
     assert lead_over_twin(pose, pose) == pytest.approx(0.0)
-    # labels of places that are alike err together
+    # labels of places that look alike have common errors
     assert 2.0 < lead_over_twin(pose, shown([1] * 6, [0.0] * 6)) < 2.5
-    # the twin lacks two of the objects: as much as one place of two that is out of date
+    # the twin lacks two of the objects: the same as one place of two that is out of date
     assert 0.0 < lead_over_twin(pose, shown([1] * 4, [2.0] * 4)) < 1.4
-    # a pose elsewhere that explains one of them: each of the others counts as its label says
+    # a pose elsewhere that explains one of them: each other object counts by its label
     assert lead_over_twin(pose, shown([1], [2.0])) == pytest.approx(5 * 0.88, abs=0.01)
-    # the same, but the landmarks around are alike: what the image shows has moved
+    # the same, but the landmarks around look alike: the objects in the image have moved
     assert lead_over_twin(pose, shown([1], [2.0]), 0.7) < 1.4

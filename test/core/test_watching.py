@@ -40,7 +40,7 @@ def poses(count, step_m=0.2):
 
 @pytest.fixture
 def images():
-    """Six different images of boxes and lines."""
+    """Return six different images of boxes and lines."""
     rng, found = np.random.default_rng(0), []
     for _ in range(6):
         image = np.full((240, 320, 3), 120, dtype=np.uint8)
@@ -105,7 +105,7 @@ def test_each_sign_of_a_look_counts_for_or_against_the_pose(changed, sign):
 
 @pytest.fixture(scope='module')
 def room():
-    """Forty objects of eight classes along the walls of a room of 6 m x 6 m."""
+    """Return forty objects of eight classes along the walls of a room of 6 m x 6 m."""
     rng = np.random.default_rng(4)
     along, wall = rng.uniform(0.3, SIDE_M - 0.3, COUNT), np.arange(COUNT) % 4
     x = np.choose(wall, [along, along, 0.0 * along, 0.0 * along + SIDE_M])
@@ -118,21 +118,21 @@ def room():
 
 
 def pose_at(x, y, yaw_deg):
-    """map_from_camera of a level camera, 1 m above the floor."""
+    """Return map_from_camera of a level camera, 1 m above the floor."""
     yaw = np.radians(yaw_deg)
     forward, right = np.array([np.cos(yaw), np.sin(yaw), 0.0]), [np.sin(yaw), -np.cos(yaw), 0.0]
     return make_transform(np.column_stack([right, [0.0, 0.0, -1.0], forward]), np.array([x, y, 1]))
 
 
 def drive(count):
-    """A robot on a circle about the middle that looks outwards, 20 degrees on each time."""
+    """Return poses on a circle about the middle that look outwards, 20 degrees apart."""
     angles = np.radians(20.0 * np.arange(count))
     return [pose_at(3.0 + np.cos(angle), 3.0 + np.sin(angle), np.degrees(angle) + 15.0)
             for angle in angles]
 
 
 def see(landmark_map, pose, number=0, odom=True, rng=None, rows=None):
-    """What a detector finds at a true pose, of some of the landmarks."""
+    """Return the observation of some landmarks at a true pose."""
     boxes = boxes_of(landmark_map, pose, CAMERA)
     shown = np.clip(boxes, 0.0, [CAMERA.width, CAMERA.height] * 2)
     with np.errstate(invalid='ignore'):
@@ -158,7 +158,7 @@ def watch(room):
 
 
 def follow(watch, room, poses, wrong=None, first=0, **seen):
-    """Look from true poses, with wrong_from_right of the localizer; return the reports."""
+    """Look from true poses, with the localizer's error wrong_from_right; return the reports."""
     wrong = np.eye(4) if wrong is None else wrong
     return [watch.look(see(room, pose, first + number, **seen), wrong @ pose)
             for number, pose in enumerate(poses)]
@@ -192,7 +192,7 @@ def test_a_pose_that_jumps_away_is_lost_within_five_looks(watch, room, wrong):
 
 
 def test_a_robot_that_is_carried_away_is_noticed(watch, room):
-    """Neither odometry nor the localizer notice."""
+    """Neither odometry nor the localizer registers the kidnap."""
     poses = drive(20)
     follow(watch, room, poses[:10])
     for number, (there, here) in enumerate(zip(drive(30)[20:], poses[10:], strict=True), 10):
@@ -280,7 +280,7 @@ def test_without_odometry_the_watch_learns_more_slowly(room):
     for odom in (True, False):
         watch = Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
         wrong = moved(np.eye(4), 2.0, 0.5)
-        chances.append([one.probability for one in follow(watch, room, drive(12), wrong,
+        chances.append([report.probability for report in follow(watch, room, drive(12), wrong,
                                                           odom=odom)])
     assert chances[0][3] < chances[1][3]
     assert chances[1][-1] < 0.05
@@ -291,10 +291,10 @@ def test_missing_landmarks_are_named(watch, room):
     there = np.setdiff1d(np.arange(COUNT), gone)
     reports = follow(watch, room, drive(90), rows=there, rng=np.random.default_rng(1))
     assert WatchState.LOST not in {report.state for report in reports}
-    assert not reports[3].missing  # one look does not name any
+    assert not reports[3].missing  # one look names no landmark
     expected = {row for pose in drive(18)
                 for row in expect(room, CAMERA, pose, np.arange(COUNT)).landmarks}
-    named = {room.landmark_ids.index(one) for one in reports[-1].missing}
+    named = {room.landmark_ids.index(landmark) for landmark in reports[-1].missing}
     assert named
     assert named <= set(gone)
     assert named >= set(gone) & expected - {25} or len(named) >= 2
@@ -362,7 +362,7 @@ def things(*centers):
 
 
 def test_what_an_image_should_show():
-    """Camera at the origin, 1 m high, that looks along x."""
+    """The camera is at the origin, 1 m high, and looks along x."""
     some = things((3, 0, 1),  # in view
                   (5, 0, 1),  # behind it
                   (-3, 0, 1),  # behind the camera
@@ -373,7 +373,7 @@ def test_what_an_image_should_show():
     assert found.landmarks.tolist() == [0, 5]
     assert found.was_seen.tolist() == [False, True]
     assert found.in_sight.tolist() == [True, True]
-    # no shown landmark is beside it: a wall may hide it
+    # no visible landmark is beside it, so a wall may hide it
     assert not expect(some, CAMERA, pose_at(0, 0, 0), np.empty(0, dtype=int)).in_sight.any()
 
 
@@ -387,7 +387,7 @@ def test_the_side_of_a_landmark_is_that_from_which_the_camera_looks(yaw_deg, sid
 @pytest.mark.parametrize(('side', 'is_missing'), [(2, True), (3, True), (1, True), (4, False),
                                                   (6, False)])
 def test_a_landmark_is_missed_only_from_where_it_was_seen(side, is_missing):
-    """A television does not show from behind."""
+    """A television cannot be detected from behind."""
     missing, yes = Missing(things((3, 0, 1))), np.array([True])
     for _ in range(10):
         missing.add(Expected(np.array([0]), yes, yes, np.array([2])), 1.0)
@@ -398,7 +398,7 @@ def test_a_landmark_is_missed_only_from_where_it_was_seen(side, is_missing):
 
 @pytest.mark.parametrize('seen', [0, 1, 20])
 def test_what_is_gone_stays_missing(seen):
-    """Years of looks that miss it neither bring it back nor end in an overflow."""
+    """Years of looks that miss it neither bring it back nor cause an overflow."""
     missing, yes = Missing(things((3, 0, 1))), np.array([True])
     for was_seen in [yes] * seen + [~yes] * 20_000:
         missing.add(Expected(np.array([0]), was_seen, yes, np.array([2])), 1.0)
@@ -407,7 +407,7 @@ def test_what_is_gone_stays_missing(seen):
 
 @pytest.mark.parametrize(('seen_every', 'misses', 'is_missing'), [(1, 3, True), (3, 6, False)])
 def test_what_a_detector_finds_now_and_then_is_not_missing_at_once(seen_every, misses, is_missing):
-    """It finds the others in each look, or in every third."""
+    """The detector finds the others in each look, or in every third."""
     missing = Missing(things(*[(3, 0, 1)] * 9))
 
     def look(landmarks, was_seen):
@@ -448,7 +448,7 @@ def test_a_pose_that_is_off_is_aligned_with_what_is_seen(room):
     near, far = (align(look_at(room, see(room, pose), options), moved(pose, 0.0, 0.0, degrees))
                  for degrees in (19.0, 21.0))
     assert near.away_deg == pytest.approx(19.0, abs=0.2)
-    assert far.away_deg < 20.0, 'a localizer is never so far off'
+    assert far.away_deg < 20.0, 'no localizer is that far off'
 
 
 @pytest.mark.parametrize(('similarities', 'matching'), [(False, 'class'), (True, 'hybrid')])

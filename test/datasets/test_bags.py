@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings: written and read back, of several files, compressed, damaged."""
+"""Recordings: write and read back; split, compressed and damaged files."""
 
 import numpy as np
 import pytest
@@ -26,13 +26,13 @@ from cliploc_ros.offline.datasets.bags import (
 from cliploc_ros.ros.conversions import pose_from_msg
 
 STRING = 'std_msgs/msg/String'
-# From ROS's own generator, not computed here.
+# Hashes from ROS's generator, not computed here.
 STRING_HASH = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
 QOS = {'/chatter': RELIABLE_QOS, '/robot_description': LATCHED_QOS, '/status': RELIABLE_QOS}
 
 
 def make_messages(count):
-    """Three topics in turn, the third with the stamp of the second."""
+    """Yield messages of three topics in turn, the third with the stamp of the second."""
     text = typestore().types[STRING]
     return [BagMessage([*QOS][number % 3], 10**18 + (number - (number % 3 == 2)) * 100_000_001,
                        bytes(typestore().serialize_cdr(text(f'message {number}'), STRING)))
@@ -58,15 +58,16 @@ def write_bag(path, storage, parts, compression='NONE'):
         for file in every[-1]['rosbag2_bagfile_information']['relative_file_paths']:
             (part / file).rename(path / file)
     info = every[0]['rosbag2_bagfile_information']
-    for one in (each['rosbag2_bagfile_information'] for each in every[1:]):
-        info['relative_file_paths'] += one['relative_file_paths']
-        info['files'] += one['files']
-        info['message_count'] += one['message_count']
+    for part_info in (each['rosbag2_bagfile_information'] for each in every[1:]):
+        info['relative_file_paths'] += part_info['relative_file_paths']
+        info['files'] += part_info['files']
+        info['message_count'] += part_info['message_count']
         info['duration']['nanoseconds'] = (
-            one['starting_time']['nanoseconds_since_epoch'] + one['duration']['nanoseconds']
+            part_info['starting_time']['nanoseconds_since_epoch']
+            + part_info['duration']['nanoseconds']
             - info['starting_time']['nanoseconds_since_epoch'])
         for topic, more in zip(info['topics_with_message_count'],
-                               one['topics_with_message_count'], strict=True):
+                               part_info['topics_with_message_count'], strict=True):
             topic['message_count'] += more['message_count']
     (path / 'metadata.yaml').write_text(yaml.safe_dump(every[0]))
     return path
@@ -154,7 +155,8 @@ def test_messages_come_back(tmp_path, plugin):
     assert list(info.k) == [53.5, 0, 32.0, 0, 53.9, 24.7, 0, 0, 1]
     assert list(info.p) == [53.5, 0, 32.0, 0, 0, 53.9, 24.7, 0, 0, 0, 1, 0]
     assert list(info.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1]
-    assert [bag_messages.stamp_ns(one) for one in (array, *array.detections)] == [STAMP_NS] * 3
+    stamps_ns = [bag_messages.stamp_ns(message) for message in (array, *array.detections)]
+    assert stamps_ns == [STAMP_NS] * 3
     again = detections_from_msg(array)
     np.testing.assert_array_equal(again.bboxes_xyxy, detections.bboxes_xyxy)
     np.testing.assert_array_equal(again.scores, detections.scores)
@@ -185,7 +187,7 @@ def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
         'liveliness_lease_duration': infinite, 'avoid_ros_namespace_conventions': False,
     }
     latched = offered | {'depth': 1, 'durability': 'transient_local'}
-    topics = [one['topic_metadata'] for one in info['topics_with_message_count']]
+    topics = [topic['topic_metadata'] for topic in info['topics_with_message_count']]
     assert [topic['offered_qos_profiles'] for topic in topics] == [[offered], [latched]]
     assert [topic['serialization_format'] for topic in topics] == ['cdr', 'cdr']
     assert topics[1]['type_description_hash'].startswith('RIHS01_2142741200')
@@ -203,7 +205,7 @@ def test_failure_leaves_nothing(tmp_path, plugin):
     with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', plugin) as bag:
         bag.add_topic('/pose', bag_messages.POSE)
         bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
-        assert not (tmp_path / 'bag').exists()  # built beside its final path
+        assert not (tmp_path / 'bag').exists()  # written beside its final path
         assert len(list(tmp_path.iterdir())) == 1
         _ = 1 / 0
     assert list(tmp_path.iterdir()) == []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of folders end in a message that names what to mend, whatever the bytes are."""
+"""Faults of folders give a message that names the necessary fix, whatever the bytes are."""
 
 import json
 import shutil
@@ -158,7 +158,7 @@ def test_the_first_line_of_stray_scanner_is_its_header(header, shots, tmp_path):
 
 
 def test_the_memory_of_large_photos(tmp_path):
-    """Photos of 12 megapixels: one at a time."""
+    """Photos of 12 megapixels are read one at a time."""
     shot = shots_of()[0]
     photo = tmp_path / 'photo.jpg'
     cv2.imwrite(str(photo), np.zeros((3000, 4000, 3), dtype=np.uint8))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Folders of other programs and devices: the same images, poses and map as of the original."""
+"""Folders of other programs and devices give the same images, poses and map as the original."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ OPTIONS = MappingOptions(min_baseline_deg=5.0, estimate_pose_errors=False)
 
 @pytest.fixture(scope='session')
 def look():
-    """The demo's detector, which looks once at equal pixels."""
+    """Return the demo's detector, which runs once on equal pixels."""
     detect, seen = load_detector(DetectorOptions(model=str(ASSETS / 'yolo.onnx'))).detect, {}
 
     def once(image):
@@ -55,7 +55,7 @@ def look():
 
 @pytest.fixture(scope='session')
 def recorded(look):
-    """What is seen on the walk as a TUM folder."""
+    """Return the detections of the walk as a TUM folder."""
     return record_every_frame(read_folder(WALK, FolderOptions(layout='tum')), look).detections
 
 
@@ -89,7 +89,7 @@ def test_what_is_seen_and_from_where_is_that_of_the_original(layout, shots, look
         assert depths.shape == DEPTH_MM.shape and depths[-1, -1] == 2.0
         # where Polycam's confidence is low
         assert np.isnan(depths[0, 0]) == (layout == 'Polycam')
-    # flat depth is not of this room
+    # flat depth does not match this room
     seen = record_every_frame(frames, lambda raw: look(replace(raw, depth=None))).detections
     assert len(seen.classes) > 200
     np.testing.assert_array_equal(seen.frames, recorded.frames)
@@ -132,7 +132,7 @@ def test_camera_models_project_as_colmap_does(model, values, shots, tmp_path):
 
 
 def test_images_with_their_own_cameras(shots, look, tmp_path):
-    """A phone that focuses, and one image of another size: boxes go over exactly."""
+    """A phone that focuses, and one image of another size: boxes are converted exactly."""
     focus = 1.0 + 0.004 * np.sin(np.arange(len(shots) + 1))
 
     def camera_of(number):
@@ -149,7 +149,7 @@ def test_images_with_their_own_cameras(shots, look, tmp_path):
     np.testing.assert_allclose(
         recorded.detections.cameras[0].normalize_bboxes(recorded.detections.bboxes_xyxy[rows]),
         own.normalize_bboxes(boxes.bboxes_xyxy), atol=1e-9)
-    # an image on its side is a camera of its own, in the file as well
+    # a rotated image has a separate camera, in the file as well
     image = folder / 'images/walk' / shots[0].path.name
     cv2.imwrite(str(image), np.zeros((640, 480, 3), dtype=np.uint8))
     other = write_colmap(tmp_path / 'other', shots, camera_of=lambda number: (
@@ -175,7 +175,7 @@ def test_a_video_is_read_image_by_image(shots, tmp_path):
         video.write(np.full((480, 640, 3), 40 * number, dtype=np.uint8))
     video.release()
     frames = read_folder(tmp_path)
-    assert [round(float(one.image_rgb.mean()) / 40) for one in frames.read()] == [*range(6)]
+    assert [round(float(frame.image_rgb.mean()) / 40) for frame in frames.read()] == [*range(6)]
     one, = frames.select([2]).read()  # back
     assert round(float(one.image_rgb.mean()) / 40) == 2
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of other systems: what is read, what is left out, and what is refused."""
+"""Maps of other systems: what is read, left out and refused."""
 
 import json
 from dataclasses import replace
@@ -109,7 +109,7 @@ def test_oaslam_saved_map(true_map, tmp_path):
 
 
 def test_msgloc(true_map, tmp_path):
-    """Quaternions are w, x, y, z, signs of radii mean nothing, and shares are not likelihoods."""
+    """Quaternions are w, x, y, z; signs of radii mean nothing; shares are not likelihoods."""
     imported = import_all(read_msgloc(write(tmp_path / 'm.json', msgloc_text(true_map)), COCO))
     check_equal(imported, true_map)
     assert imported.landmark_map.details[1].class_weights == (('book', 0.75), ('vase', 0.25))
@@ -202,7 +202,7 @@ def test_a_map_of_msgloc_as_published(shared_data, tmp_path):
     print(f'MSG-Loc sample: {len(found)} landmarks, {len(imported.left_out)} left out, '
           f'{sum(one.class_weights is not None for one in found.details)} of several classes')
     assert len(found) == 116 and len(imported.left_out) == 16
-    assert all('semi-axes are' in one.reason for one in imported.left_out)
+    assert all('semi-axes are' in entry.reason for entry in imported.left_out)
     row = found.landmark_ids.index('wine_glass_0')
     np.testing.assert_allclose(found.centers[row], [2.07811, 0.40396, -0.48006], atol=1e-5)
     np.testing.assert_allclose(found.quats_xyzw[row], [-.48684, .39502, -.52906, .57188],

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fields that say what a value means are read, or contradict the images and are named.
+"""Fields that define the meaning of a value are read; contradictions to the images are reported.
 
-Recordings are real images and poses, or the demo's walk, with one field altered.
+Recordings are real images and poses or the demo's walk, with one field altered.
 """
 
 import json
@@ -40,7 +40,7 @@ def shots():
 
 @pytest.fixture(scope='module')
 def room(shared_data):
-    """Real images (48 of them) with their poses and camera, as (stamp, image, pose, camera)."""
+    """Return 48 real images with their poses and camera, as (stamp, image, pose, camera)."""
     frames = read_folder(shared_data / 'rooms/hololens_office', FolderOptions(layout='tum'))
     return [(START + 100 * MS * place, one.image_rgb, one.map_from_camera, one.camera)
             for place, one in enumerate(frames.select(range(48)).read())]
@@ -72,7 +72,7 @@ def odometry_message(stamp, child, pose):
 
 def write_bag(path, room, *, frame='camera', pose=lambda pose: pose, info=lambda message: message,
               image=lambda pixels: pixels, stamp=lambda stamp: stamp, more=(), poses=True):
-    """Images, camera_info and /ground_truth of a room, each changed by a function."""
+    """Write images, camera_info and /ground_truth of a room, each changed by a function."""
     recorded = [*more]
     for at, pixels, true_pose, camera in room:
         recorded += [
@@ -148,7 +148,7 @@ def test_the_order_of_colours_of_compressed_images(text, red_first):
 
 
 def test_each_image_has_the_camera_info_of_its_time(room, tmp_path):
-    """A zoom; the same without stamps."""
+    """The lens zooms; once with stamps, once without."""
     half = room[len(room) // 2][0]
 
     def zoomed(message):
@@ -186,12 +186,12 @@ def test_a_few_bad_messages_are_left_out_and_counted(room, tmp_path):
     assert '3 of 48 messages of /camera_info left out' in notes
     assert '1 of 48 messages of /ground_truth left out' in notes
     assert sum(frame.map_from_camera is not None for frame in frames.read()) == 47
-    bad = {one[0] for one in room[:20]}
+    bad = {message[0] for message in room[:20]}
     refuses('/camera_info: 10 messages', write_bag(tmp_path / 'many', room, info=info))
 
 
 def test_rectified_images_beside_a_distortion(room, tmp_path):
-    """Found by the images, whatever the topic is called."""
+    """It is detected from the images, whatever the name of the topic is."""
     camera = room[0][3]
     lens = replace(camera, fx=camera.fx / 0.95, fy=camera.fy / 0.95, cx=camera.cx + 4.0,
                    distortion_model='plumb_bob', distortion=(-0.3, 0.1, 0.0, 0.0, 0.0))
@@ -210,7 +210,7 @@ def test_rectified_images_beside_a_distortion(room, tmp_path):
 
 
 def distorted(pixels, pinhole, lens):
-    """Return the image that a lens makes of what a pinhole shows."""
+    """Return the distorted image of a lens from an image of a pinhole camera."""
     grid = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1)
     places = cv2.undistortPoints(grid.reshape(-1, 1, 2).astype(np.float32), lens.matrix,
                                  np.array(lens.distortion), P=pinhole.matrix)
@@ -234,7 +234,7 @@ def test_whose_poses_they_are_and_in_which_frame_depth_is(room, tmp_path):
                           np.zeros(3))
     refuses('fit as ros .*`mount` 0 0 0 -0.5 0.5 -0.5 0.5', write_bag(
         tmp_path / 'c', room, pose=lambda pose: pose @ invert_transform(body)))
-    # depth of another camera: by its camera_info and tf, or not at all
+    # depth of another camera needs its camera_info and tf
     depth_from = make_transform(np.eye(3), np.array([0.05, 0.0, 0.0]))
     depths = [(at, '/depth/image', bag_messages.IMAGE, depth_message(at, 'depth'))
               for at, *_ in room]
@@ -277,7 +277,7 @@ def test_columns_of_trajectories(header, row, tmp_path):
 
 
 def test_all_stamps_of_a_trajectory_have_one_unit(tmp_path):
-    """Those of a clock that begins at 0 would be seconds, milliseconds and microseconds alone."""
+    """Stamps of a clock that begins at 0 would be ambiguous between s, ms and us."""
     path, stamps = tmp_path / 'poses.txt', [0, 10**9, 10**12, 10**16]
     path.write_text(''.join(f'{stamp} 0 0 0 0 0 0 1\n' for stamp in stamps))
     assert read_tum_trajectory(path).stamps_ns.tolist() == stamps
@@ -294,7 +294,7 @@ def test_columns_that_are_no_trajectory(row, expected, tmp_path):
 
 
 def test_another_order_of_a_quaternion_is_seen_in_the_images(shared_data, tmp_path):
-    """Without a line that names the columns; with it, it is read."""
+    """A file without a line of column names is refused; with that line it is read."""
     folder = shared_data / 'rooms/bonsai_room'
     for name in ('rgb.txt', 'camera.json', 'images'):
         (tmp_path / name).symlink_to(folder / name)
@@ -305,13 +305,13 @@ def test_another_order_of_a_quaternion_is_seen_in_the_images(shared_data, tmp_pa
     with pytest.raises(DatasetError, match=r'quaternions w x y z .*name the columns'):
         read_folder(tmp_path)
     (tmp_path / 'groundtruth.txt').write_text(f'# timestamp tx ty tz qw qx qy qz\n{other}')
-    ours, theirs = (next(read_folder(one).read_raw(lambda *_: True)).map_from_camera
-                    for one in (tmp_path, folder))
+    ours, theirs = (next(read_folder(folder_).read_raw(lambda *_: True)).map_from_camera
+                    for folder_ in (tmp_path, folder))
     np.testing.assert_allclose(ours, theirs, atol=1e-9)
 
 
 def test_exif_orientation(shared_data, tmp_path):
-    """A camera of the turned size: read. Of the same size: the images contradict, and say so."""
+    """Images turned to the camera's size are read; at equal sizes, a contradiction is named."""
     folder = shared_data / 'rooms/bonsai_room'
     for name in ('rgb.txt', 'groundtruth.txt'):
         shutil.copy(folder / name, tmp_path)
@@ -320,7 +320,7 @@ def test_exif_orientation(shared_data, tmp_path):
     for orientation, turn, expected in ((3, cv2.ROTATE_180, 'turned by EXIF .*auto-orient'),
                                         (6, cv2.ROTATE_90_COUNTERCLOCKWISE, None)):
         for path in sorted((folder / 'images').iterdir()):
-            # as a phone stores it: the sensor's pixels, and how to turn them
+            # as a phone stores it: the pixels of the sensor, and their orientation
             stored = cv2.rotate(cv2.imread(str(path)), turn)
             data = cv2.imencode('.jpg', stored, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
             exif = b'Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01' + bytes(
@@ -354,7 +354,7 @@ def test_messages_of_two_cameras_or_bodies_on_one_topic(room, tmp_path):
 
 
 def test_models_of_splatting_are_those_below_the_folder(shots, tmp_path):
-    """Not those of a folder that itself lies in one called distorted."""
+    """A parent folder named distorted has no effect."""
     folder = write_colmap(tmp_path / 'distorted/scan', shots)
     shutil.copytree(folder / 'images', folder / 'input')
     first = next(read_folder(folder, METRES).read_raw(lambda *_: True))
@@ -363,7 +363,7 @@ def test_models_of_splatting_are_those_below_the_folder(shots, tmp_path):
 
 
 def test_coordinate_frames_with_a_slash(room, tmp_path):
-    """Of recordings that come from ROS 1; tf has them without."""
+    """Recordings converted from ROS 1 have leading slashes; tf does not."""
     odometry = [(at, '/ground_truth', ODOMETRY, odometry_message(at, '/base', pose))
                 for at, _, pose, _ in room]
     static = [(START, '/tf_static', TF, transform_message(START, 'base', 'camera', np.eye(4)))]
@@ -394,7 +394,7 @@ def test_stamps_that_begin_again(room, tmp_path):
     bag = write_bag(tmp_path / 'bag', room,
                     stamp=lambda at: at - (half - START if at >= half else 0))
     refuses('the stamps jump back: .*ros2 bag convert', bag)
-    # images alone, as of a camera whose clock starts again
+    # images only, from a camera whose clock restarts
     later = [(at + 10**9, '/ground_truth', bag_messages.POSE,
               bag_messages.pose_message(at, 'map', pose)) for at, _, pose, _ in room]
     bag = write_bag(tmp_path / 'images', room, more=later, poses=False,
@@ -476,7 +476,7 @@ def test_tf_under_the_name_of_a_robot_and_a_way_out_of_bad_drivers(room, tmp_pat
             poses_of_tf('map', None, 0))
     frames = reads(bag, None, poses_of_tf('map', None, 0, '/robot2/tf'))
     assert next(frames.read()).map_from_camera is not None
-    # no calibration at all: a file instead
+    # no calibration: use a file instead
     bag = write_bag(tmp_path / 'zero', room, info=lambda message: replace(
         message, k=np.zeros(9), p=np.zeros(12)))
     refuses('camera_info', bag)
@@ -494,7 +494,7 @@ def test_tf_under_the_name_of_a_robot_and_a_way_out_of_bad_drivers(room, tmp_pat
 
 
 def test_names_tell_nothing_of_the_order_of_images(shots, tmp_path):
-    """Folders and umlauts mix the order of the images: no alarm where they do not overlap."""
+    """Folders and umlauts change the order of the images: no alarm if they do not overlap."""
     folder = write_colmap(tmp_path, shots)
     model = folder / 'sparse/0'
     import pycolmap

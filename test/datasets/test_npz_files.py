@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Query files, observation files and what a map was built from: read, refused and written."""
+"""Query files, observation files and records of a map's origin: read, refused and written."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 
 def frame_arrays() -> dict[str, np.ndarray]:
-    """Three frames, the second of them without a box."""
+    """Return three frames, the second without boxes."""
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[1, :3, 3] = [1, 2, 3]
     return {
@@ -41,7 +41,7 @@ def frame_arrays() -> dict[str, np.ndarray]:
 
 
 def query_arrays() -> dict[str, np.ndarray]:
-    """Two groups and three landmarks."""
+    """Return observations of two groups and three landmarks."""
     return frame_arrays() | {
         'landmark_ids': np.array(['cup_1', 'cup_2', 'tv_1']),
         'similarities': np.arange(9, dtype=np.float32).reshape(3, 3) / 10,
@@ -62,7 +62,7 @@ KINDS = {'query': (query_arrays, load_queries, save_queries),
 
 @pytest.fixture(params=KINDS)
 def kind(request):
-    """Arrays of a valid file, and what loads and saves such files."""
+    """The arrays of a valid file, and the functions that load and save such files."""
     return KINDS[request.param]
 
 
@@ -203,7 +203,7 @@ def test_embeddings_stay_in_the_file(tmp_path):
     assert (load_observations(tmp_path / 'compressed.npz').embeddings == rows).all()
 
     content = bytearray((tmp_path / 'large.npz').read_bytes())
-    content[content.index(rows[1].tobytes()[:50]) + 20] ^= 1  # as a failing disk does
+    content[content.index(rows[1].tobytes()[:50]) + 20] ^= 1  # as on a failing disk
     (tmp_path / 'large.npz').write_bytes(content)
     with pytest.raises(DatasetError, match=r'embeddings.*CRC'):
         load_observations(tmp_path / 'large.npz')
@@ -211,7 +211,7 @@ def test_embeddings_stay_in_the_file(tmp_path):
 
 @pytest.fixture
 def built(tmp_path):
-    """Return a map file, whose observations are scaled and turned, and their poses."""
+    """Return a map file with scaled and turned observations, and their poses."""
     folder = tmp_path / 'here'
     (folder / 'drive').mkdir(parents=True)
     poses = np.tile(np.eye(4), (2, 1, 1))

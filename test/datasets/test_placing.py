@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Camera axes by the images, and the vertical by the tilt of the cameras."""
+"""Find camera axes from the images, and the vertical from the tilt of the cameras."""
 
 import itertools
 
@@ -34,10 +34,10 @@ def shots():
 @pytest.mark.parametrize('folder', ['seven_scenes_kitchen', 'tum_fr3_office',
                                     'rooms/hololens_office', 'rooms/tum_fr1_rpy'])
 def test_real_images_tell_the_axes(folder, shared_data, monkeypatch):
-    """Real poses pass; each wrong choice of axes is found, and the right one named."""
+    """Real poses pass; each wrong choice of axes is detected, and the correct one named."""
     folder = shared_data / folder
     capture = find_layout(folder).read(folder, FolderOptions())
-    # each image is looked at once; looking is most of the time
+    # each image is processed once, since that takes most of the time
     monkeypatch.setattr(agreement, 'extract', lru_by_pixels(agreement.extract))
     for stored_as, given in itertools.product(AXES, AXES):
         stored = [file._replace(pose=STORED[stored_as](file.pose)) for file in capture.files

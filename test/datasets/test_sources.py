@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames with poses and depth, out of recordings made here."""
+"""Read frames with poses and depth from recordings made here."""
 
 import pickle
 import struct
@@ -72,7 +72,7 @@ def depth_message(stamp, values):
 
 
 def compressed_depth(stamp, encoding, values, a=0.0, b=0.0):
-    """A message of compressed_depth_image_transport: uint16 values (h, w), a and b."""
+    """Make a message of compressed_depth_image_transport: uint16 values (h, w), a and b."""
     png = cv2.imencode('.png', values)[1].tobytes()
     data = np.frombuffer(struct.pack('<iff', 0, a, b) + png, dtype=np.uint8)
     return make(COMPRESSED, header=header(stamp, 'camera'), data=data,
@@ -97,7 +97,7 @@ def write_bag(path, images_ms, messages):
 
 
 def drive(stamps_ms=range(0, 1001, 100), offset_ns=0):
-    """Poses of a body that drives 1 m in 1 s, as PoseStamped."""
+    """Return poses of a body that drives 1 m in 1 s, as PoseStamped."""
     return [(t, '/pose', bag_messages.POSE, bag_messages.pose_message(
         START + offset_ns + t * MS, 'map', pose_at(t / 1000))) for t in stamps_ms]
 
@@ -115,7 +115,7 @@ def test_poses_are_interpolated_within_a_gap(tmp_path):
     assert positions(bag_frames(bag, BagTopics(), poses_of_topic('/pose'))) == [None] * 4
     assert frames.count == 4
     raw = list(frames.read_raw(lambda place, stamp, pose: pose is not None and place > 0))
-    assert [one.place for one in raw] == [1]
+    assert [frame.place for frame in raw] == [1]
     # another process decodes it
     decoded = pickle.loads(pickle.dumps(raw[0])).decode()
     assert (decoded.image_rgb == 500 % 200).all() and decoded.camera.fx == 50.0
@@ -128,7 +128,7 @@ def test_poses_are_interpolated_within_a_gap(tmp_path):
     (replace(CAMERA, cx=42.0), 'camera', '/image', None, '84x47 px'),
     (CAMERA, 'other', '/image', None, "'other'"), (CAMERA, 'camera', '/image_rect', None, None)])
 def test_what_contradicts_itself_in_a_recording(tmp_path, camera, frame_id, topic, error, note):
-    """By the functions of the node: refused, or noted."""
+    """The node's functions check them: refused, or reported in a note."""
     image = bag_messages.image_message(START, 'camera', np.zeros((48, 64, 3), dtype=np.uint8))
     info = bag_messages.camera_info_message(START, frame_id, camera)
     with BagWriter(tmp_path / 'bag') as bag:
@@ -180,7 +180,7 @@ def test_odometry_and_covariance_with_a_mount(tmp_path):
     mount = mount_from_numbers([0.3, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
     frame, = bag_frames(bag, BagTopics(), poses_of_topic('/amcl_pose', 200 * MS, mount)).read()
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.05, 0.3, 0.5], atol=1e-9)
-    # they are of 'base', as child_frame_id says
+    # they are poses of 'base', as child_frame_id states
     with pytest.raises(DatasetError, match=r"of 'base' .*`mount`"):
         bag_frames(bag, BagTopics(), poses_of_topic('/odom', 200 * MS))
     known = write_bag(tmp_path / 'with_tf', [50], [*odometry, (
@@ -191,7 +191,7 @@ def test_odometry_and_covariance_with_a_mount(tmp_path):
 
 
 def tf_messages(*, static=True, parent='odom'):
-    """The map corrected once a second, odometry at 10 Hz, the camera 0.2 m ahead."""
+    """Write a map corrected at 1 Hz, odometry at 10 Hz, and a camera 0.2 m ahead."""
     moving = [(t, '/tf', TF, make(TF, transforms=[transform_message(
         START + t * MS, 'map', 'odom', pose_at(0.0, 90.0 * t / 1000))]))
         for t in (0, 1000)] if parent == 'odom' else []
@@ -208,7 +208,7 @@ def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
     frame, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 1000 * MS)).read()
     expected = pose_at(0.0, 90.0 * 0.45) @ pose_at(0.45) @ pose_at(0.2)
     np.testing.assert_allclose(frame.map_from_camera, expected, atol=1e-9)
-    # the correction comes too rarely for a smaller gap
+    # the corrections are too infrequent for a smaller gap
     frame, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 500 * MS)).read()
     assert frame.map_from_camera is None
     # a map that is a leaf of the tree
@@ -219,7 +219,7 @@ def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
 def test_odometry_is_read_from_tf(tmp_path):
     bag = write_bag(tmp_path / 'bag', [450], tf_messages())
     odometry = bag_odometry(bag, '/image', poses_of_tf('odom', None, 200 * MS))
-    # map -> odom moves, and is no part of it
+    # map -> odom changes, and is not included
     np.testing.assert_allclose(odometry.pose_at(START + 450 * MS), pose_at(0.65), atol=1e-9)
     assert odometry.pose_at(START + 1200 * MS) is None
     other = write_bag(tmp_path / 'other', [0, 900], drive(offset_ns=-1_699_999_000 * 10**9))
@@ -255,7 +255,7 @@ def test_depth_is_paired_with_the_nearest_image(tmp_path):
 
 
 def test_compressed_depth(tmp_path):
-    """Counts as they are; floats as inverse depth, quantized as the transport does it."""
+    """Counts are read as they are; floats as quantized inverse depth, as the transport does."""
     counts = np.array([[0, 700], [1500, 65535]], dtype=np.uint16)
     depths = np.array([[0.7, 1.5], [4.0, 9.0]])
     quantization, farthest_m = 100.0, 10.0

@@ -30,7 +30,7 @@ MS = 1_000_000
 
 @pytest.fixture
 def sequence_folder(tmp_path):
-    """A TUM sequence_folder of three placeholder images."""
+    """Write a TUM sequence folder of three placeholder images."""
     path = tmp_path / 'rgbd_dataset_freiburg2_desk'
     (path / 'rgb').mkdir(parents=True)
     lines = ['# color images', '# timestamp filename']
@@ -97,7 +97,7 @@ def test_malformed_files_are_named(sequence_folder, name, text, message):
     (None, 'groundtruth.txt is missing; give a `trajectory`'),
     ('9000 0 0 0 0 0 0 1\n', 'different clocks')])
 def test_images_alone_need_no_poses(sequence_folder, truth, message):
-    """The studio shows the images of a map that was made with a trajectory of its own."""
+    """The studio shows the images of a map that was built with a separate trajectory."""
     for path in (sequence_folder / 'rgb').iterdir():
         cv2.imwrite(str(path), np.full((480, 640, 3), 7, dtype=np.uint8))
     poses = sequence_folder / 'groundtruth.txt'
@@ -189,7 +189,7 @@ def test_numbers_of_a_mapping():
 
 @pytest.mark.parametrize('number', [1e200, 1e308, 1e-320, 2.0])
 def test_quaternions_of_any_numbers_are_refused(number, tmp_path):
-    """Squares of the largest overflow: no warning says so, and no pose is made of them."""
+    """Squares of the largest values overflow: there is no warning, and no pose."""
     sample = [0.0, 0.0, 0.0, number, number, number, number]
     file = tmp_path / 'trajectory.txt'
     file.write_text('1.0 ' + ' '.join(map(str, sample)))
@@ -206,7 +206,7 @@ NO_OPTIONS = FolderOptions()
 
 
 def write_scene(folder, poses, depth_mm=2000):
-    """A 7-Scenes folder: every 10th frame, black images, flat depth."""
+    """Write a 7-Scenes folder: every 10th frame, black images, flat depth."""
     for number, pose in enumerate(poses):
         stem = folder / f'frame-{10 * number:06d}'
         cv2.imwrite(f'{stem}.color.jpg', np.zeros((480, 640, 3), dtype=np.uint8))
@@ -222,7 +222,7 @@ def test_seven_scenes(tmp_path):
     lost = np.full((4, 4), np.inf)
     frames = rgbd_frames(write_scene(tmp_path, [pose, lost, None]), NO_OPTIONS)
     first, second, third = frames.read()
-    # the poses are the depth camera's, and the colour camera sits 25 mm beside it
+    # the poses are those of the depth camera; the colour camera is 25 mm beside it
     np.testing.assert_allclose(first.map_from_camera[:3, 3], [1.025, 0.0, 0.0])
     assert second.map_from_camera is None and third.map_from_camera is None
     assert second.stamp_ns == 333_333_333
@@ -259,7 +259,7 @@ def test_tum_rgbd(tmp_path):
     first, second = rgbd_frames(tmp_path, FolderOptions('fr3')).read()
     assert np.isnan(first.depth.depths_m[0, 0]) and first.depth.depths_m[1, 1] == 1.0
     assert second.depth is None
-    # the pictures may be cut out of larger ones: a note
+    # the images may be crops of larger ones: a note reports it
     (tmp_path / 'camera.json').write_text(
         '{"width": 640, "height": 480, "fx": 1000, "fy": 1000, "cx": 640, "cy": 480}')
     assert rgbd_frames(tmp_path, FolderOptions('fr3')).notes[1:] == (

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 # Import this before anything renders: PyTorch's Triton and Mesa's software renderer each load an
-# LLVM, and the opposite order crashes the process. The programs render and train in separate ones.
+# LLVM, and the opposite order crashes the process. The programs render and train in separate
+# processes.
 if importlib.util.find_spec('torchvision'):
     import torchvision  # noqa: F401
 

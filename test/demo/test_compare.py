@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's table and growing classes in the demo's world, with its networks."""
+"""The paper's table and growing classes in the demo's world, with the demo's networks."""
 
 import csv
 import re

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo as a user runs it, to its end or to Ctrl-C."""
+"""Run the demo as a user does, to its end or to Ctrl-C."""
 
 import os
 import re
@@ -81,14 +81,14 @@ def test_a_disk_that_fills_up_is_named_in_one_line(tmp_path):
                     done.stderr.splitlines()[-1]), done.stderr
 
 
-@pytest.mark.clock  # the request takes the cameras whose images come in time
+@pytest.mark.clock  # a request uses the cameras whose images arrive in time
 def test_four_cameras_need_not_turn(tmp_path):
     code, output, errors = run('--out', tmp_path, '--cameras', 4)
     assert code == 0, errors
     print(output)
     accepted, places, *alone = run_of_page('--cameras 4')
     assert f'{places:.0f} wake-ups: {accepted:.0f} accepted, 0 refused, none wrong' in output
-    assert any(f'4 cameras; with the first of them alone, {number:.0f} of {places:.0f} would be '
+    assert any(f'4 cameras; with the first camera alone, {number:.0f} of {places:.0f} would be '
                'accepted' in output for number in alone)
     page = (tmp_path / 'index.html').read_text()
     assert page.count(', 4 cameras') == places
@@ -98,7 +98,7 @@ def test_four_cameras_need_not_turn(tmp_path):
     assert height > 0.7 * width, 'two rows of two images'
 
 
-@pytest.mark.clock  # a busy machine leaves looks out
+@pytest.mark.clock  # a busy machine skips looks
 def test_a_kidnapped_robot_is_noticed_stops_and_gets_its_pose_back(tmp_path):
     code, output, errors = run('--out', tmp_path, '--kidnapped', '--method',
                                'class_auto')
@@ -108,7 +108,7 @@ def test_a_kidnapped_robot_is_noticed_stops_and_gets_its_pose_back(tmp_path):
     assert [step for *_, step in steps] == [
         'carried', 'noticed', 'it', 'relocalized', 'delivered', 'the']
     seconds = [float(second) for second, *_ in steps]
-    assert seconds == sorted(seconds), 'nothing is done before it stops'
+    assert seconds == sorted(seconds), 'no pose may be delivered before the robot stops'
     carried_m, most_looks, within_m = run_of_page('--kidnapped')
     assert int(steps[1][1]) <= most_looks
     assert float(re.search('delivered: ([0-9.]+) m', output)[1]) < within_m
@@ -139,7 +139,7 @@ def test_the_page_shows_all_and_says_what_it_does_not(finished):
 
 @pytest.fixture(scope='module')
 def mapped(tmp_path_factory):
-    """Run the demo with a map of its own; return the folder of its pictures and its output."""
+    """Run the demo with a map that it builds; return the folder of its pictures and its output."""
     out = tmp_path_factory.mktemp('demo') / 'mapped'
     code, output, errors = run('--out', out, '--map', '--wake-ups', 1)
     assert code == 0, errors
@@ -191,5 +191,5 @@ def test_no_process_outlives_it(tmp_path, number, expected):
     assert process.returncode == expected
     deadline = time.monotonic() + 10
     while any(Path(f'/proc/{node}').exists() for node in nodes):
-        assert time.monotonic() < deadline, 'a node lives on'
+        assert time.monotonic() < deadline, 'a node is still running'
         time.sleep(0.05)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the demo says of the map it built: found, missed and false objects, and why."""
+"""The demo's report on the map that it built: found, missed and false objects, with reasons."""
 
 from collections import Counter
 
@@ -52,14 +52,14 @@ def test_each_object_has_at_most_one_landmark_of_its_class(review):
     assert len(pairs) == 2
     offsets = {review.objects[one.object_row].object_id: one.offset_m for one in review.found}
     assert offsets['box_1'] == pytest.approx(0.02)
-    assert offsets['mug_1'] == pytest.approx(0.05)  # of the two, the nearer one is found
-    assert [one.size_ratio for one in review.found] == pytest.approx([1.1, 1.1])
+    assert offsets['mug_1'] == pytest.approx(0.05)  # the nearer of the two is found
+    assert [result.size_ratio for result in review.found] == pytest.approx([1.1, 1.1])
 
 
 def test_false_landmarks_say_what_is_there(review):
     ids = review.landmark_map.landmark_ids
     false = {ids[landmark]: text for landmark, text in review.false.items()}
-    assert false == {'mug_b': 'mug_1 a second time', 'mug_c': f'can_1 is there: {HOSTILE}',
+    assert false == {'mug_b': 'a duplicate of mug_1', 'mug_c': f'can_1 is there: {HOSTILE}',
                      'mug_d': 'nothing is there; bowl_1 is 3.00 m away'}
 
 

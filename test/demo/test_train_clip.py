@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Train the demo's CLIP: its loss falls, and its file loads as any CLIP does."""
+"""Train the demo's CLIP: its loss decreases, and its file loads like any CLIP."""
 
 
 import numpy as np

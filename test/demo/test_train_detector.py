@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Train the demo's detector: its file loads as any YOLO does."""
+"""Train the demo's detector: its file loads like any YOLO."""
 
 import re
 

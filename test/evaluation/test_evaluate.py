@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable evaluate, as its users run it."""
+"""Test the executable evaluate as a user runs it."""
 
 import hashlib
 import json
@@ -47,7 +47,7 @@ def evaluate(*arguments, **options):
 
 @pytest.fixture
 def evaluate_here(run_here):
-    """Run it in this process, with one worker unless told."""
+    """Run evaluate in this process, by default with one worker."""
     return partial(run_here, main, '--workers', 1)
 
 
@@ -56,7 +56,7 @@ def small(files, *arguments):
 
 
 def results_of(folder):
-    """Everything in results.json but times."""
+    """Return the content of results.json without times."""
     return [{key: value for key, value in row.items() if key != 'search_ms'}
             for row in json.loads((folder / 'results.json').read_text())]
 
@@ -71,7 +71,7 @@ def assert_error(done, *named):
 
 
 def children_cpu_s():
-    """Processor time of the commands run so far: others may be at work beside them."""
+    """Return the processor time of the commands run so far; other programs do not count."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
@@ -110,7 +110,7 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
 
 
 def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_here):
-    """Six views of each of two places: some are refused alone, all are accepted together."""
+    """Six views of each of two places: some are refused alone, but all are accepted when fused."""
     recorded = changed(files, tmp_path, query_group=np.arange(12) // 6,
                        is_main=np.arange(12) % 6 == 1)
     given = ('--queries', recorded, '--map', files / 'map.yaml', '--methods', 'auto',
@@ -123,7 +123,7 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
     assert len(exact) == 12 and all(row['accepted'] for row in exact)
     errors = [np.median([row['error_m'] for row in rows]) for rows in (exact, noisy)]
     assert errors[0] < errors[1] < 0.2
-    # each trial has noise of its own
+    # each trial has different noise
     first, second = ([row['map_from_camera'] for row in noisy if row['trial'] == trial]
                      for trial in range(2))
     assert first != second and len(first) == len(second) == 2
@@ -168,7 +168,7 @@ def test_options_without_effect_are_refused(files, tmp_path, evaluate_here):
 
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
-    """Every sixth image of the demo's walk, the last without its true pose; also as a bag."""
+    """Return every sixth image of the demo's walk, the last without true pose, also as a bag."""
     folder = tmp_path_factory.mktemp('walk')
     shutil.copytree(ASSETS / 'sequence', folder / 'tum')
     images, truth = folder / 'tum/rgb.txt', folder / 'tum/groundtruth.txt'
@@ -220,7 +220,7 @@ def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag, 
     results = results_of(walk / 'from_bag')
     queries = len(load_queries(walk / 'saved.npz'))
     assert queries == IMAGES - 1
-    assert len(results) == (2 + 1) * queries  # auto draws nothing, and runs one trial
+    assert len(results) == (2 + 1) * queries  # auto draws no samples, and runs one trial
     right = [row for row in results if row['error_m'] is not None and row['error_m'] < 0.5]
     assert len(right) > 0.9 * len(results)
 
@@ -255,7 +255,7 @@ def test_a_map_of_the_same_images_is_noted(walk, evaluated_bag, evaluate_here):
 
 
 def changed(files, tmp_path, **arrays):
-    """A copy of the query file with some arrays changed, or left out where None."""
+    """Return a copy of the query file with some arrays changed; None removes an array."""
     with np.load(files / 'queries.npz') as content:
         everything = dict(content) | arrays
     path = tmp_path / 'changed.npz'

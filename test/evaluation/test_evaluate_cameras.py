@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A recording of several cameras: the images of an instant are localized together."""
+"""A recording of several cameras: images of an instant are localized together."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ CAMERAS = ('front', 'left', 'back')
 
 @pytest.fixture(scope='module')
 def rig_bag(tmp_path_factory):
-    """Three cameras of the demo's rig in one recording."""
+    """Record three cameras of the demo's rig in one bag."""
     return write_rig_bag(tmp_path_factory.mktemp('rig') / 'bag', CAMERAS)
 
 

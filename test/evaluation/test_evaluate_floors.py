@@ -20,7 +20,7 @@ NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip
 
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
-    """The demo's walk, and maps: its floor, the same again, and the same objects elsewhere."""
+    """Return the demo's walk, and maps: its floor, an equal floor, and the objects elsewhere."""
     folder = tmp_path_factory.mktemp('floors')
     shutil.copytree(ASSETS / 'sequence', folder / 'sequence')
     true = LandmarkMap.from_file(ASSETS / 'map.yaml')
@@ -33,15 +33,15 @@ def walk(tmp_path_factory):
 def evaluate(folder, *names):
     """Return the results of six images in some maps."""
     out, maps = folder / '_'.join(names), [folder / f'{name}.yaml' for name in names]
-    assert main([str(one) for one in ('--tum', folder / 'sequence', '--every', 8, *NETWORKS,
-                                      '--map', *maps, '--out', out)]) == 0
+    assert main([str(word) for word in ('--tum', folder / 'sequence', '--every', 8, *NETWORKS,
+                                        '--map', *maps, '--out', out)]) == 0
     return json.loads((out / 'results.json').read_text())
 
 
 def test_the_right_floor_is_found_and_equal_floors_are_refused(walk):
     found = evaluate(walk, 'ground', 'other')
-    accepted = [one for one in found if one['accepted']]
+    accepted = [result for result in found if result['accepted']]
     assert len(found) == 6 and len(accepted) >= 5
-    assert all(one['map'] == 'ground' and one['error_m'] < 1.0 for one in accepted)
+    assert all(result['map'] == 'ground' and result['error_m'] < 1.0 for result in accepted)
     alike = evaluate(walk, 'ground', 'alike')
-    assert not any(one['accepted'] for one in alike)
+    assert not any(answer['accepted'] for answer in alike)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``evaluate`` with a map that has keyframes: what each pose comes from."""
+"""``evaluate`` with a map that has keyframes reports the source of each pose."""
 
 import csv
 import json
@@ -25,7 +25,7 @@ QUICK = ('--trials', 1, '--sweep', '--no-figures', '--workers', 1)
 
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
-    """A folder with the demo's wake-ups, its map, and keyframes of its mapping walk."""
+    """Return a folder with the demo's wake-ups, its map, and keyframes of its mapping walk."""
     folder = tmp_path_factory.mktemp('walk')
     shutil.copytree(ASSETS / 'sequence', folder / 'sequence')
     shutil.copy(ASSETS / 'map.yaml', folder)

@@ -39,7 +39,7 @@ MAPPED, ASKED = range(0, 30, 3), range(1, 30, 6)
 
 @pytest.fixture(scope='module')
 def room(shared_data):
-    """Any map: the tests look at features alone."""
+    """Return any map: these tests use only features."""
     return LandmarkMap.from_file(shared_data / 'tum_fr3_office' / 'map.yaml')
 
 
@@ -61,7 +61,7 @@ def queries(kitchen):
 
 @pytest.fixture(scope='module')
 def layer(kitchen, room, tmp_path_factory):
-    """Ten images of the kitchen, written and read."""
+    """Return ten images of the kitchen as a written and reloaded layer."""
     path = tmp_path_factory.mktemp('layer') / 'kitchen.keyframes.npz'
     save_layer(path, build_layer(kitchen.select(MAPPED), room, EVERY))
     assert path.stat().st_size < 90e3 * len(MAPPED) + 0.2e6  # keyframes and vocabulary
@@ -70,7 +70,7 @@ def layer(kitchen, room, tmp_path_factory):
 
 @pytest.fixture
 def answer(room):
-    """Ask for an image in which no object is detected."""
+    """Request a pose for an image without detections."""
     def relocalize(localizer, image_rgb, camera):
         recognizer = ImageRecognizer(localizer, ImageFeatures(lambda: image_rgb, camera))
         return Relocalizer(room, OPTIONS).relocalize([Observation(camera, NO_OBJECTS)], recognizer)
@@ -101,7 +101,7 @@ def test_a_refused_image_is_searched_thoroughly(layer, kitchen, room):
     assert thorough.recognized.inliers > 1.3 * fast.recognized.inliers
     error_m, _ = pose_error(thorough.map_from_camera, frame.map_from_camera)
     assert error_m < min(0.1, pose_error(fast.map_from_camera, frame.map_from_camera)[0])
-    # a recorded query says how far the search went: the answer comes again
+    # a recorded query states how far the search went, so its answer is repeated
     for found, recorded in ((fast, fast_query), (thorough, thorough_query)):
         again, _ = ask(recorded)
         np.testing.assert_array_equal(again.map_from_camera, found.map_from_camera)
@@ -128,7 +128,7 @@ def test_a_thorough_search_that_time_cuts_short_changes_nothing(layer, kitchen, 
     assert len(reads) == 2
     assert found.keyframe_search == 'fast'
     np.testing.assert_array_equal(found.map_from_camera, expected.map_from_camera)
-    assert not recognizer.begin_thorough(), 'no time is left'
+    assert not recognizer.begin_thorough(), 'no time remains'
 
 
 @pytest.mark.parametrize('name', ['dark and noisy', 'blurred', 'unevenly lit', 'half covered'])
@@ -147,7 +147,7 @@ def test_another_room_is_refused(layer, office, answer):
 
 
 def test_the_watch_hears_keyframes(layer, queries, room):
-    """Images without objects: only keyframes tell."""
+    """In images without objects, only keyframes give poses."""
     localizer = KeyframeLocalizer(layer)
     for shift, state in ((0.0, 'localized'), (3.0, 'lost')):
         watch = Watch(Relocalizer(room, OPTIONS))
@@ -190,7 +190,7 @@ def test_a_poster_of_another_place_is_refused(layer, queries, kitchen, answer):
 
 
 def test_a_search_that_time_cuts_short_gives_no_pose(twins, queries):
-    """It might have missed the same room elsewhere."""
+    """An interrupted search may have missed an equal room elsewhere."""
     localizer, frame = twins, queries[0]
     features = query_features(frame.image_rgb)
     found = []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A recording is compared with a map's labels, images, or both; its networks run once."""
+"""A recording is compared with a map's labels, images or both; its networks run once."""
 
 import shutil
 
@@ -26,7 +26,7 @@ from demo import ASSETS
 
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
-    """The demo's walk and map; the images next to the map are the labels of other landmarks."""
+    """Return the demo's walk and map; the images next to the map are labels of other landmarks."""
     folder = tmp_path_factory.mktemp('walk')
     shutil.copytree(ASSETS / 'sequence', folder / 'sequence')
     shutil.copy(ASSETS / 'map.yaml', folder)
@@ -57,5 +57,5 @@ def test_what_crops_are_compared_with(walk):
     assert len(text) > 5
     assert image == pytest.approx(np.roll(text, 1, axis=1), abs=1e-3)
     share, = np.linalg.lstsq(np.c_[(text - image).ravel()], (both - image).ravel(), rcond=None)[0]
-    assert 0.3 < share < 0.7  # labels and these images spread alike
+    assert 0.3 < share < 0.7  # labels and these images have the same spread
     assert both == pytest.approx(share * text + (1 - share) * image, abs=1e-3)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of methods: on any number of processes, broken off and resumed; their names and figures."""
+"""Runs of methods: with several processes, interrupted and resumed; their names and numbers."""
 
 import csv
 import multiprocessing
@@ -72,7 +72,8 @@ def test_every_method_trial_and_query_is_there(results, methods, questions):
     assert sum(count_trials(method, 3) for method in methods) == 7
     keys = [(result.method, result.trial, result.query) for result in results]
     assert len(set(keys)) == len(keys)
-    assert [one.method for one in summarize(results)] == [method.name for method in methods]
+    assert ([summary.method for summary in summarize(results)]
+            == [method.name for method in methods])
     solved = [result for result in results if result.solved]
     assert solved
     assert len(solved) < len(results)
@@ -83,15 +84,15 @@ def test_every_method_trial_and_query_is_there(results, methods, questions):
 def test_trials_differ_and_repeat(results, room, questions, methods):
     sampled = [result for result in results if result.method == 'class_ransac']
     count = len(questions)
-    assert ([one.score for one in sampled[:count]]
-            != [one.score for one in sampled[count:2 * count]])
+    assert ([result.score for result in sampled[:count]]
+            != [result.score for result in sampled[count:2 * count]])
     again = run_methods(room, methods, questions, trials=3)
     assert without_times(again) == without_times(results)
 
 
 def test_workers_do_not_matter_and_get_the_queries_once(results, room, questions, methods):
     class Counted(list):
-        """Queries that count how often they are sent."""
+        """Queries that count how often they are pickled."""
 
         def __reduce__(self):
             sent.append(1)
@@ -155,21 +156,22 @@ def test_an_unfinished_run_goes_on_if_it_is_the_same(results, tmp_path):
 
 
 def test_crops_on_demand_are_a_part_of_all(room, questions):
-    """The last one sees twelve objects: its classes suffice. The first one sees two."""
+    """The last query sees twelve objects, so classes suffice; the first query sees two."""
     options = replace(PAPER, iterations=2000)
     found = {crops: run_methods(room, parse_methods(['auto'], replace(options, crops=crops),
                                                     len(room)), questions, trials=1)
              for crops in ('all', 'on_demand')}
-    assert {one.crops_share for one in found['all']} == {1.0}
-    shares = [one.crops_share for one in found['on_demand']]
+    assert {result.crops_share for result in found['all']} == {1.0}
+    shares = [result.crops_share for result in found['on_demand']]
     assert shares[0] == 1.0 and shares[-1] == 0.0
-    assert [one.accepted for one in found['on_demand']] == [one.accepted for one in found['all']]
-    assert all(share == 1.0 or one.accepted
-               for share, one in zip(shares, found['on_demand'], strict=True))
+    assert ([result.accepted for result in found['on_demand']]
+            == [result.accepted for result in found['all']])
+    assert all(share == 1.0 or result.accepted
+               for share, result in zip(shares, found['on_demand'], strict=True))
     (summary,) = summarize(found['on_demand'])
     assert summary.crops_share == pytest.approx(np.mean(shares))
-    refused = [one for one in found['on_demand'] if not one.accepted]
-    assert refused and all(one.refusal_kind for one in refused)
+    refused = [result for result in found['on_demand'] if not result.accepted]
+    assert refused and all(result.refusal_kind for result in refused)
     assert sum(summary.refusals.values()) == len(refused)
     kinds = ', '.join(f'{count} {kind}' for kind, count in summary.refusals.items())
     assert f'auto refused: {kinds}.' in notes([summary])
@@ -267,7 +269,7 @@ def test_precision_and_recall():
 
 
 def test_the_interval_of_the_precision_counts_queries():
-    """Trials of one query are not independent, so more trials do not narrow it."""
+    """Trials of one query are not independent, so more trials do not narrow the interval."""
     once = make_summary([0.1] * 10, accepted=[True] * 10)
     often = make_summary([[0.1] * 10] * 5, accepted=[[True] * 10] * 5)
     assert once.precision_interval() == (pytest.approx(0.722, abs=1e-3), 1.0)
@@ -388,7 +390,7 @@ def test_names_do_not_cover_each_other(inches):
     boxes = [name.get_window_extent() for name in names]
     assert not any(first.overlaps(second) for first, second in combinations(boxes, 2))
     assert all(axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 for box in boxes)
-    assert (len(names) == len(room)) == (inches > 2.0), 'a small map has no room for all'
+    assert (len(names) == len(room)) == (inches > 2.0), 'a small figure has no room for all names'
     highest = room.landmark_ids[int(np.argmax(room.centers[:, 2]))]
     assert highest in [name.get_text() for name in names]
     image = cv2.imdecode(np.frombuffer(png_of(figure, 50), np.uint8), cv2.IMREAD_COLOR)

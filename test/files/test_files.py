@@ -147,7 +147,7 @@ def test_what_cannot_be_written_is_named_with_the_remedy(tmp_path, kind, cause, 
 
 @dataclass(frozen=True)
 class Square:
-    """Squares numbers; dies at one of them."""
+    """Squares numbers, and dies at one of them."""
 
     deadly: int = -1
 
@@ -190,7 +190,7 @@ def test_tasks_are_taken_as_workers_become_free():
 
 @dataclass(frozen=True)
 class OneDies:
-    """Task 0 kills its worker once, while task 1 runs; task 1 ends after that."""
+    """Task 0 kills its worker once, while task 1 runs; task 1 ends later."""
 
     folder: Path
 
@@ -234,7 +234,7 @@ def test_a_deadly_task_is_given_up_alone(caplog):
 
 
 def test_without_dask(monkeypatch):
-    monkeypatch.setitem(sys.modules, 'distributed', None)  # as where it is not installed
+    monkeypatch.setitem(sys.modules, 'distributed', None)  # as if it were not installed
     with pytest.raises(OptionsError, match='pip install'):
         results(Square(), scheduler='tcp://127.0.0.1:9')
 
@@ -242,7 +242,7 @@ def test_without_dask(monkeypatch):
 @pytest.mark.parametrize(('mode', 'is_own_group', 'foreign'), [
     (0o755, False, False), (0o775, True, False), (0o775, False, True), (0o777, True, True)])
 def test_what_a_group_of_others_can_write_to_is_foreign(tmp_path, mode, is_own_group, foreign):
-    others = [one for one in os.getgroups() if one not in (0, os.getgid())] or [12345]
+    others = [group for group in os.getgroups() if group not in (0, os.getgid())] or [12345]
     os.chown(tmp_path, -1, os.getgid() if is_own_group else others[0])
     tmp_path.chmod(mode)
     assert is_foreign(tmp_path.stat(), {os.getuid()}) is foreign

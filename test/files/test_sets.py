@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files that belong together, written by processes that are killed or that share a folder."""
+"""Sets of files, written by processes that are killed or that share a folder."""
 
 import fcntl
 import multiprocessing
@@ -41,7 +41,7 @@ from cliploc_ros.offline.studio.document import Document
 PROJECT = Path(__file__).resolve().parents[2]
 
 def read(path):
-    """The numbers that the files of a map tell: one for each of them."""
+    """Return the number in each file of a map."""
     landmark_map = LandmarkMap.from_file(path)
     embeddings = load_embeddings_of_map(path, landmark_map.landmark_ids, landmark_map.map_set)
     number = round(float((landmark_map.centers - ROOM.centers)[0, 0]) / 0.01)
@@ -64,7 +64,7 @@ def write_again_and_again(path, first, begun):
 
 
 def test_a_kill_leaves_one_whole_set(path):
-    """At 150 random times of the writes of build_map."""
+    """The writes of build_map are killed at 150 random times."""
     draw, seen, fork = random.Random(0), set(), multiprocessing.get_context('fork')
     for kill in range(150):
         begun = fork.Event()
@@ -79,11 +79,11 @@ def test_a_kill_leaves_one_whole_set(path):
         assert agree == {True}
         seen.add(number)
     print(f'150 kills, {len(seen)} sets')
-    assert len(seen) > 10, 'the kills come during writes'
+    assert len(seen) > 10, 'the kills happen during writes'
 
 
 def test_files_of_another_set_are_refused(path):
-    """As a copy of a part of a folder leaves them."""
+    """A partial copy of a folder gives such files."""
     others = [path.with_name('b.yaml')]
     write_set(others[0], 5)
     for of in (embeddings_path, layer_path, recording_path):
@@ -121,7 +121,7 @@ def test_an_update_keeps_the_keyframes_and_no_embeddings(path):
 
 
 def test_a_map_by_hand_takes_any_files(path):
-    """One without a set, as those of earlier versions."""
+    """Files without a set are those of earlier versions."""
     path.write_text(''.join(line for line in path.read_text().splitlines(keepends=True)
                             if not line.startswith('# set ')))
     landmark_map = LandmarkMap.from_file(path)
@@ -139,12 +139,12 @@ def test_a_set_that_cannot_be_written_changes_nothing(path):
 
 
 def test_two_writers_at_once_leave_one_whole_set(path):
-    """As build_map in two terminals: the last one wins with all of its files."""
+    """As with build_map in two terminals: the last one wins with all of its files."""
     fork = multiprocessing.get_context('fork')
     for turn in range(20):
-        writers = [fork.Process(target=lambda numbers: [write_set(path, one) for one in numbers],
-                                args=(range(100 * turn + 10 * one, 100 * turn + 10 * one + 10),))
-                   for one in range(2)]
+        writers = [fork.Process(target=lambda numbers: [write_set(path, tag) for tag in numbers],
+                                args=(range(first, first + 10),))
+                   for first in (100 * turn, 100 * turn + 10)]
         for writer in writers:
             writer.start()
         for writer in writers:
@@ -155,7 +155,7 @@ def test_two_writers_at_once_leave_one_whole_set(path):
 
 
 def test_what_a_killed_writer_left_comes_not_into_a_later_set_without_it(path):
-    """As build_map, killed and run again with --no-keyframe-layer: it makes the same landmarks."""
+    """As if build_map were killed and run again with --no-keyframe-layer: equal landmarks."""
     digest = set_digest(made_map(1).landmark_map)
     layer_path(path).rename(path.with_name(f'.{digest}.{layer_path(path).name}'))
     write_made_map(path, replace(made_map(1), layer=None), [],
@@ -166,7 +166,7 @@ def test_what_a_killed_writer_left_comes_not_into_a_later_set_without_it(path):
 
 
 def test_files_of_a_set_stay_private_and_links_stay_links(path, tmp_path):
-    """As replace_file does it: images of keyframes are not for everyone."""
+    """As in replace_file: images of keyframes are private."""
     layer_path(path).chmod(0o600)
     (tmp_path / 'store').mkdir()
     stored = tmp_path / 'store' / 'embeddings.npz'
@@ -186,7 +186,7 @@ def test_a_folder_in_the_place_of_a_file_of_a_set_is_named(path):
 
 
 def test_sets_of_keyframes_alone_are_told_apart(path):
-    """Their maps say the same: nothing. Objects may be drawn into one later."""
+    """Their maps are equal: both are empty. Objects may be drawn into the map later."""
     empty, digests = LandmarkMap.empty('map'), set()
     layer = replace(made_map(0).layer, landmark_ids=(), landmark_centers=np.empty((0, 3), 'f4'))
     for name in ('a', 'b'):
@@ -219,13 +219,13 @@ for _ in range(300):
 
 
 def test_two_processes_of_one_number_share_a_folder(tmp_path):
-    """As those of two containers: no torn file, no refused write, nothing left."""
+    """Writers as in two containers: no torn file, no refused write, no leftovers."""
     path = tmp_path / 'a.embeddings.npz'
     code = SHARED.format(paths=[str(PROJECT)])
     writers = [subprocess.Popen([*own_numbers(), sys.executable, '-c', code,
                                  str(path), str(number)], stdout=subprocess.PIPE, text=True)
                for number in range(2)]
-    assert len({writer.stdout.readline() for writer in writers}) == 1, 'they have one number'
+    assert len({writer.stdout.readline() for writer in writers}) == 1, 'all have the same number'
     reads = 0
     while any(writer.poll() is None for writer in writers):
         if path.exists():
@@ -238,7 +238,7 @@ def test_two_processes_of_one_number_share_a_folder(tmp_path):
 
 
 def test_a_file_whose_names_have_no_ending_misses_its_arrays(path):
-    """Numpy ends each name in .npy; other programs that write zip files may not."""
+    """NumPy adds .npy to each name; other programs that write zip files may not."""
     place = embeddings_path(path)
     with zipfile.ZipFile(place) as archive:
         contents = {name.removesuffix('.npy'): archive.read(name) for name in archive.namelist()}
@@ -261,7 +261,7 @@ def test_a_set_without_end_is_not_printed(path):
 
 
 def test_a_writer_that_keeps_the_others_out_is_named(tmp_path, monkeypatch):
-    """Such as a process that was stopped while it wrote."""
+    """Such as by a process that was stopped while writing."""
     monkeypatch.setattr('cliploc_ros.files.storage._TURN_S', 0.3)
     path = tmp_path / 'office.yaml'
     write_map(path, ROOM)

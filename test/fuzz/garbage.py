@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages that a broken or hostile publisher may send: every field, every value of its type."""
+"""Messages of a broken or hostile publisher: every field with every value of its type."""
 
 import os
 
@@ -22,7 +22,7 @@ from vision_msgs.msg import (
 
 from cliploc_ros.messages import _CHANNELS
 
-#: So many cases a property by default; CLIPLOC_FUZZ_CASES=10000 asks for more.
+#: Default number of cases per property; CLIPLOC_FUZZ_CASES=10000 requests more.
 CASES = settings(max_examples=int(os.environ.get('CLIPLOC_FUZZ_CASES', '200')), deadline=None,
                  derandomize=True)
 
@@ -36,7 +36,7 @@ INFO = {'width': CAMERA.width, 'height': CAMERA.height, 'k': CAMERA.matrix.ravel
 
 
 def or_sound(sound, strategy):
-    """Mostly what is right, so that what lies behind the first check is reached too."""
+    """Draw mostly valid values, so that code after the first check is reached too."""
     return st.one_of(st.just(sound), st.just(sound), strategy)
 
 
@@ -93,7 +93,7 @@ def detections(box=None, most=40):
 
 
 def likely_detections():
-    """Boxes of the right classes and sizes within the image, which mean nothing."""
+    """Draw meaningless boxes with valid classes and sizes within the image."""
     hypothesis = st.builds(ObjectHypothesis, class_id=st.sampled_from('abc'),
                            score=st.floats(0.1, 1.0))
     box = st.builds(
@@ -107,7 +107,7 @@ def likely_detections():
 
 
 def stamped(msg, nanoseconds):
-    """The message, with a stamp; pairing takes nothing without one."""
+    """Set a stamp on the message; pairing accepts no message without one."""
     msg.header = Header(frame_id='camera', stamp=Time(sec=nanoseconds // 10**9,
                                                       nanosec=nanoseconds % 10**9))
     return msg

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of every format, damaged by a disk or made by a hostile hand: the content or an error.
+"""Damaged or hostile files of every format give their content or an error.
 
-Of files with check sums, what is read is what was written, whatever bits have flipped.
+For files with checksums, the content is the written one, whatever bits have flipped.
 """
 
 import io
@@ -48,7 +48,7 @@ def labels(path):
 
 @pytest.fixture(scope='module')
 def sound(tmp_path_factory):
-    """The folder of a sound file of each format."""
+    """Return the folder of valid files, one of each format."""
     folder = tmp_path_factory.mktemp('sound')
     save_observations(folder / 'seen.npz', PosedDetections(
         (CAMERA,), np.tile(np.eye(4), (3, 1, 1)), np.arange(3.0), np.array([0, 2, 2, 3]),
@@ -79,7 +79,7 @@ FORMATS = {
 
 
 def damaged(content, draw):
-    """A content with flipped bits, without a part, or with a part at another place."""
+    """Draw content with flipped bits, without a part, or with a part moved."""
     changed = bytearray(content)
     match draw.randrange(4):
         case 0 | 1:
@@ -95,12 +95,12 @@ def damaged(content, draw):
 
 
 def plain(value):
-    """What a reader returns, as values that can be compared."""
+    """Return a reader's result as values that can be compared."""
     if is_dataclass(value):
         return {name: plain(var) for name, var in vars(value).items() if not name.startswith('_')}
     if isinstance(value, np.ndarray):
         return value.tobytes(), value.shape
-    return [plain(one) for one in value] if isinstance(value, tuple | list) else repr(value)
+    return [plain(item) for item in value] if isinstance(value, tuple | list) else repr(value)
 
 
 @pytest.mark.parametrize('name', FORMATS)
@@ -129,13 +129,13 @@ def test_damage_is_named_or_changes_nothing(sound, tmp_path, name):
 
 # ---- what one file can stop: examples -----------------------------------------------------------
 def bomb(path, shape, compression=zipfile.ZIP_DEFLATED, declared=None):
-    """An observation file whose array of boxes is of zeros, or only says that it is."""
+    """Write an observation file whose array of boxes has, or claims, a huge number of zeros."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {
         'descr': '<f8', 'fortran_order': False, 'shape': declared or shape})
     content = header.getvalue() + bytes(8 * int(np.prod(shape)))
     with zipfile.ZipFile(path) as archive:
-        others = {one: archive.read(one) for one in archive.namelist()}
+        others = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(path, 'w', compression) as archive:
         for one, data in (others | {'boxes_xyxy.npy': content}).items():
             archive.writestr(one, data)
@@ -184,7 +184,7 @@ def holes(path):
     os.mkfifo, lambda path: path.symlink_to('/dev/zero'), Path.mkdir, holes],
     ids=['pipe', 'device', 'folder', 'holes'])
 def test_what_is_no_file_of_any_format_is_named_at_once(sound, tmp_path, make):
-    """A pipe without a writer and a device that has no end among them."""
+    """Includes a pipe without a writer and an endless device."""
     for name, read in FORMATS.items():
         folder = tmp_path / name
         folder.mkdir()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Map files out of a broken editor or a hostile hand: a map that can be, or an error."""
+"""Map files of a broken editor or an attacker give a valid map or an error."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def sound(folder):
 
 
 def read(folder, content):
-    """What reading the content ends in: a sound map, or an error that names the file."""
+    """Read the content: a valid map, or an error that names the file."""
     path = folder / 'map.yaml'
     path.write_bytes(content)
     try:
@@ -64,7 +64,7 @@ def test_trees(folder, content):
 @given(st.data())
 @CASES
 def test_damage(folder, sound, data):
-    """A sound file in which a stretch is replaced."""
+    """Draw a valid file with a replaced part."""
     start = data.draw(st.integers(0, len(sound)))
     end = data.draw(st.integers(start, min(len(sound), start + 200)))
     patch = data.draw(st.one_of(st.binary(max_size=20), st.text(

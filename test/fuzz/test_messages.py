@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Garbage in every field of every message: an error that is named, and no pose."""
+"""Garbage in every field of every message gives a clear error, and no pose."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def values(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def localizer(values):
-    return load_localizer(None, values)  # a map from a file asks no node
+    return load_localizer(None, values)  # a map from a file needs no node
 
 
 def localize(localizer, values, image, info, found):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps built from simulated walks, whose landmarks are known; with depth; of a floor."""
+"""Build maps from simulated walks with known landmarks, with depth, and of a floor."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +63,7 @@ def test_noise_and_missed_boxes_cost_little():
 def test_many_views_leave_an_uncertainty_that_all_share():
     few, many = (build_map(see(make_table(), walk_around(frames), noise_px=3.0)).landmark_map
                  for frames in (20, 180))
-    # errors that are independent in each view would make it a third
+    # with independent errors in each view, it would be a third of that
     assert 0.6 < np.median(many.position_sigmas) / np.median(few.position_sigmas) < 1.0
 
 
@@ -113,7 +113,7 @@ def test_joint_refinement_corrects_poses_and_landmarks():
     joint = build_map(detections, MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 3.0)))
 
     def relative_error(built):
-        """Compare distances between landmarks, which the errors' mean does not touch."""
+        """Compare distances between landmarks, which the mean of the errors does not affect."""
         rows = [np.linalg.norm(built.landmark_map.centers - center, axis=1).argmin()
                 for center in table.centers]
         centers = built.landmark_map.centers[rows]
@@ -136,7 +136,7 @@ def test_joint_refinement_corrects_poses_and_landmarks():
      'check that the poses'),
     (lambda one: one.select_boxes(np.zeros(len(one.classes), dtype=np.bool_)),
      'have no detections'),
-    # a base whose x axis looks forward instead of the camera's z
+    # a base whose x axis points forward like the camera's z axis
     (lambda one: one.with_poses(one.map_from_camera @ np.array(
         [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])),
      'poses and stamps|good enough'),
@@ -216,7 +216,7 @@ def test_labels_are_class_names_where_clip_is_missing(tmp_path):
 
 
 def measure_depth(detections, table, scale=1.0, holes=0.0, seed=0):
-    """Add the depth of the surface of the ellipsoid that each box shows, with errors."""
+    """Add the depth of the ellipsoid's surface in each box, with errors."""
     rng = np.random.default_rng(seed)
     depths = np.full(len(detections.classes), np.nan, dtype=np.float32)
     for row, frame in enumerate(detections.frames):
@@ -262,14 +262,14 @@ def test_depth_in_another_unit_is_refused(scale, factor):
 
 @pytest.fixture(scope='module')
 def floor():
-    """Two tables, 12 m apart."""
+    """Return two tables, 12 m apart."""
     table = make_table()
     return join_maps(table, replace(table, centers=table.centers + AWAY_M))
 
 
 @pytest.fixture(scope='module')
 def seen(floor):
-    """A walk around one table, and then around the other."""
+    """Return a walk around one table, then around the other."""
     there = walk_around()
     there[:, :3, 3] += AWAY_M
     return see(floor, np.concatenate([walk_around(), there]), noise_px=2.0)
@@ -278,7 +278,7 @@ def seen(floor):
 def test_far_landmarks_are_passed_over_without_a_loss(floor, seen):
     views = make_views(seen)
     landmarks = landmarks_of_map(floor, CLASSES)
-    landmarks.classes[7] = -1  # of a class that the recording does not know
+    landmarks.classes[7] = -1  # with a class that the recording does not have
     found = find_overlaps(views, landmarks, 0.2)
     expected = [
         (row, number) for number in range(len(landmarks.centers))

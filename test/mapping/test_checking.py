@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the check of a map finds, on a simulated walk whose landmarks are known."""
+"""Findings of the check of a map, on a simulated walk with known landmarks."""
 
 import json
 import re
@@ -65,7 +65,7 @@ def report(detections):
 
 @pytest.fixture(scope='module')
 def rooms_report():
-    """Of two identical rooms, 10 m apart."""
+    """Return a map of two identical rooms, 10 m apart."""
     other = replace(TABLE, centers=TABLE.centers + np.array([10.0, 0.0, 0.0]))
     return check_map(join_maps(TABLE, other), options=QUICK)
 
@@ -84,7 +84,7 @@ def test_a_true_map_has_no_fault_and_its_frames_are_accepted(report):
     assert len(grid.trials) == 4 * len(grid.positions)
     assert (grid.accepted <= grid.headings).all()
     blind = [trial for trial in grid.trials if trial.landmarks == 0]
-    assert {one.verdict for one in blind} == {'refused'}
+    assert {trial.verdict for trial in blind} == {'refused'}
 
 
 def test_equal_seed_and_input_give_an_equal_report(report, detections):
@@ -126,14 +126,15 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
 def test_a_label_of_another_class_is_a_fault(label, class_id, other):
     ids = ('cup', class_id, 'book', *TABLE.class_ids[3:])
     named = replace(TABLE, class_ids=ids, labels=('a cup', label, 'a book', *TABLE.labels[3:]))
-    faults = {one.landmark_id: one.faults for one in check_landmarks(named, None, [])}
-    assert [f"is labelled '{label}', which names a {other}," in fault for fault in faults.pop(TABLE.landmark_ids[1])
+    faults = {check.landmark_id: check.faults for check in check_landmarks(named, None, [])}
+    own = faults.pop(TABLE.landmark_ids[1])
+    assert [f"is labelled '{label}', which names a {other}," in fault for fault in own
             ] == [True] * (other is not None)
     assert not any(faults.values())
 
 
 def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detections):
-    """The image cuts them on three sides: they fit a landmark anywhere along their rays."""
+    """The image cuts three sides of the boxes, so they fit anywhere along their rays."""
     _, witness = witness_of(TABLE, detections)
     own = np.nonzero(witness.shown == 4)[0]
     boxes = detections.bboxes_xyxy.copy()
@@ -152,9 +153,9 @@ def test_a_shifted_landmark_is_told_its_offset(detections):
     assert worst.landmark_id == 'thing_4'
     assert worst.offset_m == pytest.approx(0.12, abs=0.01)
     assert any('is 12 cm away' in fault for fault in worst.faults)
-    # how uncertain a map is, it says itself
+    # a map states how uncertain it is
     sure = replace(shifted, details=(LandmarkDetails(position_sigma=0.07),) * len(TABLE))
-    assert {one.position_sigma_m for one in check_landmarks(sure, witness, [])} == {0.07}
+    assert {check.position_sigma_m for check in check_landmarks(sure, witness, [])} == {0.07}
 
 
 @pytest.mark.parametrize('turn_deg', [0.0, 35.0, -120.0])
@@ -187,16 +188,16 @@ def test_identical_rooms_fail_the_check(rooms_report):
 def test_a_symmetric_place_is_one_place(report):
     pair = LookAlike((5.7, 3.5, 0.8), (5.8, 3.5, 0.8), (), 6, 1.0, 0, 180.0)
     advice = give_advice(replace(report, look_alikes=(pair,)))
-    assert any('x 5.7, y 3.5' in one.text and '180 degrees' in one.text for one in advice)
+    assert any('x 5.7, y 3.5' in hint.text and '180 degrees' in hint.text for hint in advice)
 
 
 def test_a_robot_that_is_misled_into_the_double_is_advice_on_the_double(rooms_report):
     grid = rooms_report.grid
-    seen = next(one for one in grid.trials if one.landmarks > 3)
+    seen = next(trial for trial in grid.trials if trial.landmarks > 3)
 
     def misled_to(estimate):
         trial = replace(seen, verdict='misled', estimate=np.array(estimate), error_m=10.0)
-        return [one.text for one in give_advice(replace(
+        return [advice.text for advice in give_advice(replace(
             rooms_report, grid=replace(grid, trials=(*grid.trials, trial))))]
 
     side = np.sign(5.0 - seen.position[0])  # to the other room
@@ -232,19 +233,19 @@ def mount(x=0.0, roll=0.0):
      'stamps of the images', -200.0, 5.0),
 ], ids=['focal length', 'principal point', 'mount', 'roll', 'stamps'])
 def test_systematic_errors_are_measured(spoil, name, value, tolerance):
-    # back on another circle: on one circle, a late clock looks like a turned table
+    # back on another circle: on a single circle, a late clock looks like a turned table
     poses = [walk_around(frames=60), walk_around(frames=60, radius=1.6)[::-1]]
     spoilt = spoil(see(TABLE, np.concatenate(poses), noise_px=1.0))
     views, witness = witness_of(TABLE, spoilt)
-    found = {one.name: one for one in find_corrections(spoilt, views, witness.fitted,
+    found = {fix.name: fix for fix in find_corrections(spoilt, views, witness.fitted,
                                                        witness.shown)}
     assert found[name].is_significant
     assert found[name].value == pytest.approx(value, abs=tolerance)
-    # one sensor is blamed, whatever else fits better with its error
-    assert len({one.cause for one in found.values()
-                if one.is_significant and not one.follows}) == 1
-    # a turned mount and a shifted principal point look much the same
-    assert found[name].explained > 0.8 * max(one.explained for one in found.values())
+    # one sensor is blamed, whatever else its error would fit better
+    assert len({result.cause for result in found.values()
+                if result.is_significant and not result.follows}) == 1
+    # a turned mount looks almost like a shifted principal point
+    assert found[name].explained > 0.8 * max(result.explained for result in found.values())
 
 
 def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
@@ -257,14 +258,14 @@ def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
     bare_stamps = detections.stamps_s[bare.frames]
     of_bare = [trial for trial in trials if trial.stamp_s in bare_stamps]
     assert of_bare
-    assert {one.verdict for one in of_bare} == {'refused'}
-    # the other parts tell nothing of the map there
+    assert {trial.verdict for trial in of_bare} == {'refused'}
+    # the other parts have no information on the map there
     assert all(trial.is_judged == (trial.stamp_s not in bare_stamps) for trial in trials)
     assert any(trial.verdict == 'accepted' for trial in trials)
 
 
 def test_a_walk_that_passes_each_object_once_is_judged_by_what_it_can_tell():
-    # each object is detected in one block of 4 s only, so that no other block knows it
+    # each object is detected in one block of 4 s only, so no other block knows it
     detections = see(TABLE, walk_around(frames=120))
     _, witness = witness_of(TABLE, detections)
     once = detections.select_boxes(witness.shown % 6 == detections.frames // 20)
@@ -272,7 +273,7 @@ def test_a_walk_that_passes_each_object_once_is_judged_by_what_it_can_tell():
     assert not report.recording.can_judge_boxes
     assert not any(text.startswith('held-out') for text in report.failures)
     assert any('cannot judge boxes' in note for note in report.notes)
-    # a landmark at a wrong place explains none of its boxes, and is seen as such
+    # a landmark at a wrong place explains none of its boxes, and is reported
     moved = replace(TABLE, centers=TABLE.centers + np.array([0.4, 0.0, 0.0]))
     wrong = check_map(moved, detections, options=QUICK)
     assert wrong.recording.can_judge_boxes and not wrong.passed
@@ -368,11 +369,11 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     named = replace(doubled, frame_id=hostile, labels=(hostile, *doubled.labels[1:]),
                     landmark_ids=(hostile, *doubled.landmark_ids[1:]))
     report = check_map(named, detections, options=QUICK)
-    shown = [0.0, 9.8]  # the images that are at hand
+    shown = [0.0, 9.8]  # the images that are available
 
     def read(stamp_s, camera, pinhole):
         return np.full((480, 640, 3), 128, np.uint8) if min(
-            abs(stamp_s - one) for one in shown) < 1e-6 else None
+            abs(stamp_s - shown_s) for shown_s in shown) < 1e-6 else None
     write_report(tmp_path, hostile, report, draw_pictures(named, report),
                  ViewPainter(named, detections, read))
     page = (tmp_path / PAGE).read_text()
@@ -385,7 +386,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     assert kinds['data:image/png;b'] == 4
     assert kinds['data:image/jpeg;'] >= 5, 'five duplicates are shown'
 
-    assert page.index('What to do first') < page.index('<details>'), 'only the rest is folded'
+    assert page.index('What to do first') < page.index('<details>'), 'only the others are folded'
     assert tags.found['u'] == len(report.measures) == 8, 'each threshold has a bar'
     assert 'http' not in page
     assert json.loads((tmp_path / DATA).read_text())['landmarks'][0]['faults']
@@ -434,11 +435,11 @@ def test_places_without_a_keyframe_are_counted_and_named(room_report):
     assert len(nowhere.as_dict()['positions_without']) == len(grid.positions)
     assert nowhere.as_dict()['recorded_frames_in_reach'] == 0.5
     text = 'no keyframe is'
-    assert any(text in one.text for one in give_advice(replace(room_report, keyframes=nowhere)))
-    assert not any(text in one.text for one in give_advice(replace(room_report, keyframes=full)))
+    assert any(text in hint.text for hint in give_advice(replace(room_report, keyframes=nowhere)))
+    assert not any(text in hint.text for hint in give_advice(replace(room_report, keyframes=full)))
     by_keyframes = replace(room_report, keyframes=full,
                            grid=replace(grid, accepted=0 * grid.accepted))
-    assert any('only keyframes' in one.text for one in give_advice(by_keyframes))
+    assert any('only keyframes' in advice.text for advice in give_advice(by_keyframes))
 
 
 def test_the_report_has_keyframes_only_where_there_are_some(tmp_path, run_here):

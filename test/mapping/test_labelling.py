@@ -33,7 +33,7 @@ def with_crops(detections: PosedDetections, crops) -> PosedDetections:
 
 @pytest.fixture
 def static():
-    """Ten frames at one place, then a frame at each of two others; one box in each."""
+    """Return ten frames at one place, then one at each of two others, with one box each."""
     poses = np.tile(np.eye(4), (12, 1, 1))
     poses[10, 0, 3], poses[11, 0, 3] = 1.0, 2.0
     seen = see(make_table(1), walk_around(12, 90.0))
@@ -42,7 +42,7 @@ def static():
 
 
 def test_crops_of_a_built_map_name_their_phrase():
-    """Each object's crops are its true phrase, another one's, and noise."""
+    """The crops of each object mix its true phrase, another object's phrase, and noise."""
     rng = np.random.default_rng(1)
     table = make_table()
     seen = see(table, walk_around(40))
@@ -93,7 +93,7 @@ def test_frames_of_one_viewpoint_share_the_weight_of_one(static):
 
 
 def test_medoids_stand_for_all_crops(static):
-    """Three sights of an object, one of them once: three crops, each one of the crops."""
+    """Three looks of an object, one of them rare, give three medoids, each of them a crop."""
     axes = np.eye(SIZE)
     crops = unit(axes[[0] * 6 + [1] * 4 + [2, 1]] + 1e-3)
     embeddings = embed_landmarks(['no', 'it'], with_crops(static, crops), np.ones(12, dtype=int))
@@ -103,7 +103,7 @@ def test_medoids_stand_for_all_crops(static):
 
 
 def test_crops_that_say_nothing_leave_the_class_name(static):
-    """Zero rows, crops that cancel out, and a landmark that no box shows."""
+    """Inputs are zero rows, crops that cancel out, and a landmark without boxes."""
     table = make_table(3)
     axes = np.eye(SIZE)
     crops = np.zeros((12, SIZE))
@@ -132,7 +132,7 @@ def test_a_landmark_of_two_classes_takes_phrases_of_both():
 
 
 def test_many_crops_of_one_landmark_take_bounded_memory(static):
-    """40,000 crops would have 12 GB of cosines; those used are spread over all."""
+    """40,000 crops would need 12 GB for their cosines; the crops used are spread over all."""
     count = 40_000
     frames = 12
     offsets = np.linspace(0, count, frames + 1).astype(np.int64)
@@ -142,4 +142,4 @@ def test_many_crops_of_one_landmark_take_bounded_memory(static):
     crops[:count // 2, 0] = crops[count // 2:, 1] = 1.0
     embeddings = embed_landmarks(['it'], with_crops(many, crops), np.zeros(count, dtype=int))
     assert embeddings.medoid_offsets.tolist() == [0, 2]
-    assert embeddings.means[0, 1] > embeddings.means[0, 0] > 0.1  # the last frames weigh more
+    assert embeddings.means[0, 1] > embeddings.means[0, 0] > 0.1  # later frames weigh more

@@ -28,7 +28,7 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.updating import update_map
 from cliploc_ros.offline.mapping.views import make_views, thin_out
 
-#: By name: the camera, and where it looks [deg].
+#: By name: the camera, and its viewing direction [deg].
 RIG = {'front': (CAMERA, 0.0), 'left': (Camera(320, 240, 200.0, 200.0, 160.0, 120.0), 90.0),
        'back': (Camera(800, 600, 450.0, 460.0, 380.0, 310.0), 180.0), 'right': (CAMERA, 270.0)}
 _LEVER_M, _STEP_S = 0.3, 0.5
@@ -56,7 +56,7 @@ ROOM = room()
 
 
 def robot_at(stamps_s):
-    """Return poses of a robot that drives a circle and turns faster than that."""
+    """Return poses of a robot that drives on a circle and also turns relative to it."""
     poses = np.tile(np.eye(4), (len(stamps_s), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler('z', 0.45 * stamps_s[:, None]).as_matrix()
     poses[:, 0, 3] = 1.2 * np.cos(0.15 * stamps_s)
@@ -65,7 +65,7 @@ def robot_at(stamps_s):
 
 
 def drive(*names, noise_px=2.0, move=lambda stamps_s, poses: poses, seconds=50.0, delay_s=0.03):
-    """Return what cameras see, and their true poses; move returns the given poses of the robot."""
+    """Return simulated detections and true poses; move returns the given poses of the robot."""
     seen, true, stamps = [], [], []
     for number, name in enumerate(names):
         stamps.append(np.arange(0.0, seconds, _STEP_S) + number * delay_s)
@@ -73,11 +73,11 @@ def drive(*names, noise_px=2.0, move=lambda stamps_s, poses: poses, seconds=50.0
         camera = RIG[name][0]
         seen.append(see_rows(ROOM, true[-1], noise_px * camera.fx / 500.0, seed=number,
                              camera=camera)[0])
-    joined = {key: np.concatenate([getattr(one, key) for one in seen])
+    joined = {key: np.concatenate([getattr(part, key) for part in seen])
               for key in ('bboxes_xyxy', 'classes', 'scores')}
     given = [move(*pair) @ mount_of(name) for *pair, name in zip(
         stamps, map(robot_at, stamps), names, strict=True)]
-    counts = np.concatenate([np.diff(one.frame_offsets) for one in seen])
+    counts = np.concatenate([np.diff(part.frame_offsets) for part in seen])
     rows = np.repeat(np.arange(len(names)), list(map(len, seen)))
     stamps, true = np.concatenate(stamps), np.concatenate(true)
     order = np.argsort(stamps, kind='stable')
@@ -88,7 +88,7 @@ def drive(*names, noise_px=2.0, move=lambda stamps_s, poses: poses, seconds=50.0
 
 
 def wandering(seed):
-    """Return a function that moves a robot by errors that it shares over seconds."""
+    """Return a function that moves a robot by errors with a correlation time of seconds."""
     rng, times = np.random.default_rng(seed), np.arange(-1.0, 60.0, 0.05)
     errors, kept = rng.normal(size=(len(times), 6)), float(np.exp(-0.05 / ERRORS.correlation_s))
     for row in range(1, len(errors)):
@@ -140,7 +140,7 @@ def test_a_rig_stays_rigid():
 
 
 def test_a_turn_of_the_robot_is_one_error_of_all_cameras():
-    """The levers take the shift out that a turn of the robot gives each camera."""
+    """The levers compensate the shift that a turn of the robot causes in each camera."""
     turn = Rotation.from_rotvec([0.0, 0.0, 0.02]).as_matrix()
 
     def move(stamps_s, poses):
@@ -167,7 +167,7 @@ def test_viewpoints_and_samples_are_those_of_each_camera():
     with pytest.raises(MappingError, match='move it around'):
         build_map(standing.select_frames(standing.every(40)))
     moving = drive(*RIG)[0]
-    for frames in (moving.every(4), sample_frames(moving, 100)):  # four cameras, each fourth frame
+    for frames in (moving.every(4), sample_frames(moving, 100)):  # every fourth of four cameras
         assert np.bincount(moving.frame_cameras[frames]).tolist() == [25] * 4
     assert not any('jump' in note for note in build_map(moving).report.notes)
 
@@ -176,7 +176,7 @@ def test_depth_of_each_camera_has_its_own_scale():
     detections, true = drive('front', 'left')
     depths = np.full(len(detections.classes), np.nan, dtype=np.float32)
     for row, frame in enumerate(detections.frames):
-        # of the object whose box it is
+        # depth of the object in the box
         offsets = ROOM.centers - true[frame, :3, 3]
         ahead = offsets @ true[frame, :3, :3]
         box, camera = detections.bboxes_xyxy[row], detections.camera_of(frame)
@@ -194,7 +194,7 @@ def test_depth_of_each_camera_has_its_own_scale():
 
 
 def test_the_check_names_the_camera_that_is_off():
-    """Its boxes are those of a camera with another focal length."""
+    """Its boxes have the focal length of another camera."""
     detections = drive(*RIG)[0]
     cameras = list(detections.cameras)
     cameras[1] = replace(cameras[1], fx=1.05 * cameras[1].fx, fy=1.05 * cameras[1].fy)
@@ -215,7 +215,7 @@ def test_a_map_is_updated_from_several_cameras():
         np.arange(len(ROOM))[:, None] == 3, [0.0, 0.0, 1.0], 0.0))
     updated = update_map(now, drive(*RIG)[0], MappingOptions(pose_errors=ERRORS))
     assert nearest_errors(updated.landmark_map, ROOM).max() < 0.05
-    assert [one.landmark_id for one in updated.report.moved] == ['thing_3']
+    assert [landmark.landmark_id for landmark in updated.report.moved] == ['thing_3']
 
 
 def test_one_mount_is_corrected_at_a_time():
@@ -229,7 +229,7 @@ def test_the_file_keeps_the_camera_of_each_frame(tmp_path):
     again = load_observations(tmp_path / 'two.npz')
     assert (again.cameras, again.camera_names) == (detections.cameras, ('front', 'left'))
     assert (again.frame_cameras == detections.frame_cameras).all()
-    # a file without names is of one camera, as before
+    # a file without names is from one camera, as before
     save_observations(tmp_path / 'one.npz', replace(
         detections, cameras=detections.cameras[:1], camera_rows=None, camera_names=('',)))
     with np.load(tmp_path / 'one.npz') as arrays:

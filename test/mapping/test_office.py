@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of a real office, held to test/thresholds.yaml."""
+"""Compare maps of a real office with the limits in test/thresholds.yaml."""
 
 import json
 from pathlib import Path
@@ -73,7 +73,7 @@ def test_joint_refinement_makes_up_for_slow_pose_errors(even, even_map, required
                                       np.random.default_rng(0)))
 
     def median_offset(built):
-        """Return how far landmarks lie from those of true poses [m]."""
+        """Return the distances of landmarks to those of true poses [m]."""
         return float(np.median(offsets_m(built.landmark_map, even_map)))
 
     plain = build_map(noisy)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of poses and of the mount, and odometry between frames, in maps of a simulated walk."""
+"""Maps of a simulated walk with errors of poses and mount, and with odometry between frames."""
 
 import re
 from dataclasses import replace
@@ -32,7 +32,7 @@ from cliploc_ros.offline.mapping.pose_noise import (
 from cliploc_ros.offline.mapping.views import Views, make_views
 
 ESTIMATING = MappingOptions(estimate_pose_errors=True)
-#: The camera is 3 cm and 2 degrees away from where the given poses have it.
+#: The camera is 3 cm and 2 degrees away from the given poses.
 MOUNT = make_transform(Rotation.from_rotvec(np.radians([1.2, -1.2, 1.0])).as_matrix(),
                        np.array([0.02, -0.01, 0.02]))
 
@@ -62,7 +62,7 @@ def test_errors_are_estimated(seen, kind, given):
     disturbed = disturb(seen, errors)
     views, landmarks, shown = draft_of(disturbed)
     found = estimate_pose_errors(views, landmarks, shown, views)
-    # a walk of 24 s holds eight independent errors of 3 s
+    # a walk of 24 s has eight independent errors of 3 s
     assert given.sigma_m / 2 < found.sigma_m < 2 * given.sigma_m
     assert given.sigma_deg / 2.5 < found.sigma_deg < 2 * given.sigma_deg
     assert (found.correlation_s < 0.3) == (kind == 'independent')
@@ -85,7 +85,7 @@ def test_the_determinant_of_the_prior_is_that_of_its_matrix():
 
 
 def test_a_wrong_mount_is_corrected():
-    # near and far, and not always straight at the table: that hides a shift in the map's place
+    # near and far, and not always straight at the table, which would hide a shift
     poses = np.array([look_at(np.array([r * np.cos(a), r * np.sin(a), 1.5 + 0.3 * np.sin(2 * a)]),
                               (0.4 * np.sin(5 * a), 0.4 * np.cos(4 * a), 0.8))
                       for a, r in zip(np.linspace(0.0, 5.0, 120),
@@ -106,7 +106,7 @@ def test_a_wrong_mount_is_corrected():
 
 
 def test_a_height_that_level_motion_does_not_show_stays_and_is_named():
-    """A camera that looks level and turns about the vertical: its y axis is the vertical."""
+    """A level camera turns about the vertical, which is its y axis."""
     angles = np.linspace(0.0, 5.0, 80)
     level = np.array([look_at(np.array([2.2 * np.cos(a), 2.2 * np.sin(a), 0.8]),
                               (0.2 * np.sin(3 * a), 0.2 * np.cos(2 * a), 0.8)) for a in angles])
@@ -117,12 +117,12 @@ def test_a_height_that_level_motion_does_not_show_stays_and_is_named():
     found = built.mount.given_from_corrected[:3, 3]
     assert found[0] == pytest.approx(0.03, abs=0.01)
     assert abs(found[1]) < 0.01
-    (note,) = [one for one in built.report.notes if 'not observable' in one]
+    (note,) = [note for note in built.report.notes if 'not observable' in note]
     assert ': y (down);' in note
 
 
 def views_of(stamps_s, frames):
-    """Views of some boxes; shared errors depend on nothing but their frames."""
+    """Return views of some boxes; shared errors depend only on their frames."""
     count, boxes = len(stamps_s), len(frames)
     nothing = np.zeros((boxes, 4))
     return Views(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), stamps_s,
@@ -144,7 +144,7 @@ def test_the_mean_error_of_the_poses_stays(correlation_s):
 
 
 def test_neighbours_are_what_some_frame_shows_together():
-    """Three rooms: landmarks 0 and 1, 1 and 2 are seen together; 3 is seen alone, and briefly."""
+    """Landmarks 0 and 1, and 1 and 2 are seen together in three rooms; 3 briefly and alone."""
     frames = np.repeat(np.arange(100), 2)
     shown = np.concatenate([np.tile([0, 1], 40), np.tile([1, 2], 50), np.tile([3, -1], 10)])
     errors = PoseErrors(0.1, 2.0, 0.0)
@@ -152,7 +152,7 @@ def test_neighbours_are_what_some_frame_shows_together():
     np.testing.assert_allclose(found[:4, 0] / (_BENDING * 0.1),
                                np.array([90, 90, 90, 10]) ** -0.5)
     np.testing.assert_allclose(found[:, 1], 20.0 * found[:, 0])
-    # never seen: as far off as a single pose
+    # never seen: with the error of a single pose
     assert found[4, 0] == pytest.approx(_BENDING * 0.1)
 
 
@@ -163,7 +163,7 @@ OPTIONS = MappingOptions(pose_errors=POSE_ERRORS, odometry_errors=NOISE)
 
 @pytest.fixture(scope='module')
 def truth():
-    """Few objects and poor boxes: odometry tells more than they do."""
+    """With few objects and poor boxes, odometry has more information than the boxes."""
     return see(make_table(4), walk_around(frames=120), noise_px=6.0, missed=0.3)
 
 
@@ -207,14 +207,14 @@ def scaled(factor):
 
 
 def joined(built):
-    """Return how many pairs of frames odometry joins, or None where it is left out."""
-    note, = [one for one in built.report.notes if one.startswith('odometry')]
+    """Return the number of pairs of frames with odometry, or None if it is left out."""
+    note, = [note for note in built.report.notes if note.startswith('odometry')]
     found = re.search(r' (\d+) of 119 pairs', note)
     return int(found[1]) if found else None
 
 
 def pose_error_m(built, truth):
-    """Return how far the motions over 10 frames are off: root mean square [m]."""
+    """Return the root mean square error of motions over 10 frames [m]."""
     one, other = (np.linalg.inv(poses[:-10]) @ poses[10:]
                   for poses in (built.map_from_camera, truth.map_from_camera))
     return float(np.sqrt(np.square(one - other)[:, :3, 3].sum(axis=1).mean()))

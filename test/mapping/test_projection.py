@@ -54,7 +54,7 @@ def test_derivatives_are_those_of_small_steps():
     assert linearize_box(rotation, translation, CENTER, BASIS, box, by_landmark, by_pose)
 
     def box_after(step):
-        """Return the box after a step of the landmark (9,) and of the pose (6,)."""
+        """Return the box after a step of the landmark (9,) and the pose (6,)."""
         center, basis = np.empty(3), np.empty((3, 3))
         move_ellipsoid(CENTER, BASIS, step[:9], center, basis)
         motion = make_transform(Rotation.from_rotvec(step[12:]).as_matrix(), step[9:12])

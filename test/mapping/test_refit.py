@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Given maps fitted to a simulated walk, and landmarks that stand in one another."""
+"""Refit given maps to a simulated walk, and find overlapping landmarks."""
 
 import re
 from dataclasses import replace
@@ -34,7 +34,7 @@ def boxes(table):
 
 
 def disturb(table, sigma_m=0.05, stretch=1.3, seed=0):
-    """Return a map as another system may have it: shifted, too large, with its own words."""
+    """Return a map as from another system: shifted, too large, with different class names."""
     rng = np.random.default_rng(seed)
     details = tuple(LandmarkDetails(class_weights=((name, 0.9), ('vase', 0.1)), source='theirs')
                     for name in table.class_ids)
@@ -123,7 +123,7 @@ def test_a_map_of_other_classes_is_refused(table, boxes):
 
 
 def test_a_landmark_does_not_become_a_distant_object(table):
-    """A landmark behind an object, seen from the front, overlaps the boxes of the object."""
+    """A landmark behind an object, seen from the front, overlaps the object's boxes."""
     table = table.select([0, 2, 3, 4, 5, 6, 7, 8])
     boxes = see(table, walk_around(turn_deg=50.0))
     stray = replace(table.select([3]), centers=table.centers[[3]] + [-0.6, -0.25, -0.15],
@@ -138,7 +138,7 @@ POSES = walk_around()
 FRAMES = np.arange(len(POSES))
 BOOK, BOTTLE, CUP = CLASSES
 ALWAYS = FRAMES >= 0
-# Each: class, centre and semi-axes [m], and the frames that have its box.
+# Each object: class, centre and semi-axes [m], and the frames with its box.
 CHAIR = BOOK, (0.0, 0.0, 0.8), (0.25, 0.25, 0.4)
 BACK = BOTTLE, (0.0, 0.0, 1.0), (0.2, 0.2, 0.2)
 TABLE = BOOK, (0.0, 0.0, 0.6), (0.5, 0.4, 0.3)
@@ -148,7 +148,7 @@ CUP_ON_TABLE = CUP, (0.1, 0.0, 0.85), (0.06, 0.06, 0.08)
 
 
 def make_map(*things):
-    """Return the map of some things: class, centre and semi-axes of each."""
+    """Return the map of some objects: class, centre and semi-axes of each."""
     classes, centers, axes = zip(*things, strict=True)
     return LandmarkMap('map', tuple(f'thing_{row}' for row in range(len(things))), classes,
                        classes, np.array(centers), np.array(axes),
@@ -156,7 +156,7 @@ def make_map(*things):
 
 
 def watch(*things, noise_px=1.0):
-    """Return what a detector sees of some things: class, centre, axes, frames with a box."""
+    """Return simulated detections of some objects: class, centre, axes, frames with a box."""
     parts = [see(make_map(thing[:3]), POSES, noise_px, seed=row)
              for row, thing in enumerate(things)]
     parts = [part.select_boxes(frames[part.frames])
@@ -170,14 +170,14 @@ def watch(*things, noise_px=1.0):
 
 
 def under(name, thing):
-    """Return a thing under another name."""
+    """Return an object under another name."""
     return (name, *thing[1:])
 
 
 DOUBLES = {'thing_1', 'thing_1_b'}
 QUICK = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=6, max_positions=4,
                      headings=2, spacing_m=2.0)
-# What the detector sees, and the class weights of the landmarks that it is.
+# Simulated detections, and the class weights of the expected landmarks.
 SCENES = {
     'two names at once': ([(*CHAIR, ALWAYS), (*under(CUP, CHAIR), ALWAYS)],
                           [{BOOK: 0.5, CUP: 0.5}]),
@@ -196,8 +196,8 @@ SCENES = {
 
 @pytest.mark.parametrize(('things', 'expected'), SCENES.values(), ids=SCENES)
 def test_what_the_images_show_at_once_is_two(things, expected):
-    """Of two things that stand in one another. A whole comes before its part."""
-    detections, pair = watch(*things), make_map(*(one[:3] for one in things))
+    """Two objects overlap. The whole comes before its part."""
+    detections, pair = watch(*things), make_map(*(thing[:3] for thing in things))
     (overlap,) = overlaps_of(pair, detections)
     assert overlap.is_duplicate == (len(expected) == 1)
     built = build_map(detections).landmark_map
@@ -208,11 +208,11 @@ def test_what_the_images_show_at_once_is_two(things, expected):
         assert np.sort(built.semi_axes[row]) == pytest.approx(np.sort(thing[2]), abs=0.02)
         assert dict(built.details[row].class_weights or {built.class_ids[row]: 1.0}
                     ) == pytest.approx(weights, abs=0.15)
-    assert not any(one.is_duplicate for one in overlaps_of(built, detections))
+    assert not any(pair.is_duplicate for pair in overlaps_of(built, detections))
 
 
 def overlaps_of(landmark_map, detections=None):
-    """Return which landmarks stand in one another, with or without a recording."""
+    """Return the overlapping landmarks, with or without a recording."""
     if detections is None:
         return find_map_overlaps(landmark_map, None, None)
     views = make_views(detections)
@@ -221,7 +221,7 @@ def overlaps_of(landmark_map, detections=None):
 
 
 def doubled_room():
-    """Return a room, and the map of it that has its bottle as a cup, too."""
+    """Return a room, and its map with the bottle also mapped as a cup."""
     room = make_table(6)
     return room, join_maps(room, replace(room.select([1]), class_ids=(CUP,), labels=('mug',)))
 
@@ -239,7 +239,7 @@ def test_the_check_counts_and_names_doubles_of_two_classes():
 def test_a_refit_and_an_update_join_doubles():
     room, doubled = doubled_room()
     seen, rows = see_rows(room, POSES, noise_px=1.0)
-    # the bottle is called a cup in every other image
+    # the bottle is detected as a cup in every other image
     classes = seen.classes.copy()
     classes[(rows == 1) & (seen.frames % 2 == 0)] = CLASSES.index(CUP)
     seen = replace(seen, classes=classes)
@@ -257,12 +257,12 @@ def test_a_refit_and_an_update_join_doubles():
 def test_a_map_made_by_hand_is_judged_by_its_classes():
     room, doubled = doubled_room()
     assert overlaps_of(room) == []
-    assert [(one.first, one.second, one.is_duplicate) for one in overlaps_of(doubled)] == [
+    assert [(pair.first, pair.second, pair.is_duplicate) for pair in overlaps_of(doubled)] == [
         (1, 6, False)]
     named = replace(doubled, class_ids=(*doubled.class_ids[:6], BOTTLE))
-    assert [one.is_duplicate for one in overlaps_of(named)] == [True]
+    assert [pair.is_duplicate for pair in overlaps_of(named)] == [True]
     assert check_map(named, options=QUICK).duplicates == 1
-    # boxes of other things tell nothing of it
+    # boxes of other objects have no information on it
     elsewhere = see(room.select([0, 2, 3, 4, 5]), POSES)
-    assert [one.is_duplicate for one in overlaps_of(doubled, elsewhere)] == [False]
+    assert [pair.is_duplicate for pair in overlaps_of(doubled, elsewhere)] == [False]
     assert (refit_map(elsewhere, doubled).part_of == np.arange(7)).all()

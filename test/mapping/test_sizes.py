@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of classes, the scale of a map, and verdicts that tell objects from keyframes."""
+"""Sizes of classes, the scale of a map, and verdicts that depend on objects or keyframes."""
 
 from dataclasses import replace
 
@@ -83,26 +83,26 @@ def replace_value(measure, value):
 
 
 def bottle(semi_axes):
-    """A table with one bottle, upright."""
+    """Return a table with one upright bottle."""
     table = make_table(2).select([1])
     assert table.class_ids == ('bottle',)
     return replace(table, semi_axes=np.array([semi_axes]))
 
 
 def with_sizes(detections):
-    """Return views that know sizes, as they do with depth, and no depth."""
+    """Return views with size priors, as with depth, but without depth."""
     return make_views(detections)._replace(
         sizes=log_sizes(detections.class_names)[detections.classes])
 
 
 def longest(views, center, basis):
-    """Return the longest extent of the fit from a start [m]."""
+    """Return the longest extent of the fit from an initial ellipsoid [m]."""
     fit = fit_ellipsoid(views, np.arange(len(views.frames)), center, basis)
     return 2.0 * np.linalg.norm(fit.basis, axis=0).max()
 
 
 def test_the_size_of_a_class_decides_only_where_boxes_of_one_side_do_not():
-    # errors of boxes that differ by 6 degrees look like a bottle that is long along the rays
+    # errors of boxes 6 degrees apart look like a bottle that is long along the rays
     table, size = bottle([0.8, 0.04, 0.13]), size_of_class('bottle')
     table = replace(table, quats_xyzw=np.array([[0.0, 0.0, 0.0, 1.0]]))
     start = table.centers[0], 0.1 * np.eye(3)

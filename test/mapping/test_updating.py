@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Updates of a map: a simulated walk whose objects have moved, or not, and a rendered room."""
+"""Update maps of a simulated walk, with and without moved objects, and of a rendered room."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ POSES = walk_around(frames=60, turn_deg=320.0, radius=2.6)
 
 
 def make_things(count=20, seed=5) -> LandmarkMap:
-    """Ellipsoids of three classes on a grid of 50 cm, each of its own size."""
+    """Return ellipsoids of three classes and different sizes on a grid of 50 cm."""
     rng = np.random.default_rng(seed)
     places = np.array([(0.5 * x - 1.0, 0.5 * y - 0.75) for x in range(5) for y in range(4)])
     centers = np.c_[places[:count] + rng.uniform(-0.06, 0.06, (count, 2)), np.full(count, 0.8)]
@@ -73,10 +73,10 @@ def test_each_change_is_reported_and_nothing_else():
     assert one.center == pytest.approx((1.6, 0.1, 0.8), abs=0.03)
     assert one.distance_m == pytest.approx(np.linalg.norm(
         np.array([1.6, 0.1, 0.8]) - things.centers[12]), abs=0.03)
-    assert all('seen in 0' in one.evidence for one in report.missing)
+    assert all('seen in 0' in landmark.evidence for landmark in report.missing)
     for row in (5, 17):
-        assert min(np.linalg.norm(np.array(one.center) - things.centers[row])
-                   for one in report.new) < 0.03
+        assert min(np.linalg.norm(np.array(landmark.center) - things.centers[row])
+                   for landmark in report.new) < 0.03
     found = updated.landmark_map
     assert 'thing_7' not in found.landmark_ids
     assert found.labels[found.landmark_ids.index('thing_12')] == 'thing number 12'
@@ -87,7 +87,7 @@ def test_each_change_is_reported_and_nothing_else():
 
 
 def test_windows_of_frames_do_not_matter(monkeypatch):
-    """Also where they part the frames of one viewpoint."""
+    """Also if they split the frames of one viewpoint."""
     things = make_things()
     walk = see(without(moved(things, {12: (1.6, 0.1, 0.8)}), 7), np.repeat(POSES, 3, axis=0),
                noise_px=2.0, missed=0.2)
@@ -121,7 +121,7 @@ def test_what_is_kept_of_a_landmark():
 
 
 def test_the_better_position_wins():
-    """A landmark is fitted again if the recording knows it better; else it stays where it is."""
+    """A landmark is refitted if the recording determines it better; otherwise it stays."""
     things = make_things()
     rng = np.random.default_rng(0)
     wrong = things.centers + rng.normal(scale=0.03, size=things.centers.shape)
@@ -137,7 +137,7 @@ def test_the_better_position_wins():
     assert errors[:10].mean() < 0.4 * before[:10].mean()
     assert all(detail.position_sigma < 0.02 for detail in found.details[:10])
     kept = (found.centers[10:] == wrong[10:]).all(axis=1)
-    assert kept.sum() >= 5  # the others differ by so much that they were nudged
+    assert kept.sum() >= 5  # the others differ by the amount that they were displaced
 
 
 def test_what_a_new_object_hides_is_not_missing():
@@ -166,7 +166,7 @@ def test_what_was_not_in_view_stays_as_it_is():
 
 
 def test_what_a_wall_hides_is_not_missing():
-    """No landmark beside it or behind it is seen: a wall may be in front."""
+    """No landmark beside or behind it is detected, so a wall may be in front."""
     things = make_things()
     old = moved(things, {row: things.centers[row] + (0.0, 3.0, 0.0) for row in range(16, 20)})
     poses = np.array([look_at(np.array([x, -2.2, 1.1]), (0.0, 0.0, 0.8))
@@ -205,7 +205,7 @@ def test_an_offset_of_the_coordinate_frame_is_corrected_and_noted():
 
 
 def test_noisy_poses_with_gaps_are_refined_against_the_map():
-    """As the relocalizer gives them: each on its own, and not in every frame."""
+    """The verticals are as from the relocalizer: independent, and missing in some frames."""
     things, rng = make_things(), np.random.default_rng(2)
     later = without(moved(things, {12: (1.6, 0.1, 0.8)}), 6)
     wrong = POSES.copy()
@@ -241,7 +241,7 @@ def embeddings_of(landmark_ids, looks):
 
 
 def seen_with_looks(later, looks):
-    """Return what is seen of things, with embeddings near the look of each thing."""
+    """Return simulated detections of objects, with embeddings near each object's look."""
     detections, truth = see_rows(later, POSES, noise_px=1.0)
     rows = looks[truth] + np.random.default_rng(0).normal(scale=0.1, size=(len(truth),
                                                                            looks.shape[1]))
@@ -251,7 +251,7 @@ def seen_with_looks(later, looks):
 
 @pytest.mark.parametrize('alike', [False, True])
 def test_two_objects_that_exchanged_places(alike):
-    """Looks tell it, unless the two are identical."""
+    """Their looks distinguish them, unless they are identical."""
     things = make_things(12)
     first, second = 1, 7  # of one class
     equal = things.semi_axes.copy()
@@ -267,7 +267,7 @@ def test_two_objects_that_exchanged_places(alike):
     assert ids(report.moved) == (set() if alike else {'thing_1', 'thing_7'})
     assert report.missing == report.new == ()
     if not alike:
-        assert all('looks different' in one.evidence for one in report.moved)
+        assert all('looks different' in landmark.evidence for landmark in report.moved)
         np.testing.assert_allclose(updated.landmark_map.centers[first], things.centers[second],
                                    atol=0.03)
     assert updated.embeddings.landmark_ids == updated.landmark_map.landmark_ids
@@ -356,7 +356,7 @@ def test_useless_recordings_say_what_to_correct(change, message):
 
 
 def test_a_lost_landmark_beside_a_like_one_comes_back():
-    """Its neighbour of the same class overlaps many of its boxes, and must not keep them."""
+    """Its neighbour of the same class overlaps many of its boxes, and must not claim them."""
     things = make_things(12)
     pair = moved(replace(things, semi_axes=np.full_like(things.semi_axes, 0.12)),
                  {3: things.centers[0] + (0.26, 0.0, 0.0)})
@@ -368,7 +368,7 @@ def test_a_lost_landmark_beside_a_like_one_comes_back():
 
 
 def test_a_displaced_landmark_that_is_hard_to_see_comes_back_and_leaves_no_ghost():
-    """Its low seen_ratio alone does not prove that it has gone from where the map has it."""
+    """Its low seen_ratio alone does not prove that it left its place in the map."""
     things = make_things(12)
     details = tuple(replace(detail, seen_ratio=ratio) for detail, ratio in zip(
         things.details, np.linspace(0.1, 0.9, 12), strict=True))
@@ -382,7 +382,7 @@ def test_a_displaced_landmark_that_is_hard_to_see_comes_back_and_leaves_no_ghost
 
 
 def test_a_landmark_that_is_never_seen_is_removed_or_named():
-    """However rarely the old recording saw it. One that is seen at times is named."""
+    """A landmark that is seen sometimes is reported, however rarely the old recording saw it."""
     things = make_things(12)
     things = replace(things, details=tuple(replace(one, seen_ratio=ratio) for one, ratio in zip(
         things.details, np.tile([0.1, 0.9], 6), strict=True)))
@@ -397,7 +397,7 @@ def test_a_landmark_that_is_never_seen_is_removed_or_named():
 
 
 def test_an_object_that_comes_back_gets_its_id_back():
-    """Also after another update, and in another place; nobody else gets the id meanwhile."""
+    """Also after another update and in another place; meanwhile no other landmark gets the id."""
     things = make_things(12)
     named = replace(things, labels=('named by a person', *things.labels[1:]))
     away = update_map(named, see(without(things, 0, 7), POSES, missed=0.2))
@@ -443,15 +443,15 @@ CLIP = ['--clip-pretrained', ASSETS / 'clip']
 
 
 def update(folder, *options):
-    """Update the map of a folder by the executable's own function; return the exit code."""
-    return build_map.main([str(one) for one in (
+    """Update the map of a folder with the executable's function; return the exit code."""
+    return build_map.main([str(argument) for argument in (
         '--observations', ROOM / 'after.npz', '--update', folder / 'map.yaml', '--no-check',
         '--out', folder / 'map.yaml', '--report', folder / 'report.json', *CLIP, *options)])
 
 
 @pytest.fixture(scope='module')
 def updated(tmp_path_factory):
-    """The folder of a map that was updated in place."""
+    """Return the folder of a map that was updated in place."""
     folder = tmp_path_factory.mktemp('changed')
     for name in ('map.yaml', 'map.embeddings.npz'):
         shutil.copyfile(ROOM / name, folder / name)
@@ -466,17 +466,17 @@ def report(updated):
 
 def test_all_nine_changes_are_reported_and_nothing_else(report):
     def names(kind):
-        return {one['landmark_id'] for one in report[kind]}
+        return {entry['landmark_id'] for entry in report[kind]}
 
     assert names('moved') == set(CHANGES['moved'])
     assert names('missing') == set(CHANGES['removed'])
     assert len(report['new']) == len(CHANGES['new']) == 3
-    assert sorted(one['class_id'] for one in report['new']) == sorted(
+    assert sorted(landmark['class_id'] for landmark in report['new']) == sorted(
         name.split('_')[0] for name in CHANGES['new'])
     assert len(report['confirmed']) == 60 - 4 - 2
     assert report['not_observed'] == []
-    assert all('seen in 0' in one['evidence'] for one in report['missing'])
-    assert all(one['rivals'] == [] and one['distance_m'] > 1.0 for one in report['moved'])
+    assert all('seen in 0' in landmark['evidence'] for landmark in report['missing'])
+    assert all(entry['rivals'] == [] and entry['distance_m'] > 1.0 for entry in report['moved'])
 
 
 def test_the_map_holds_what_is_there_now(updated, report):
@@ -487,18 +487,18 @@ def test_the_map_holds_what_is_there_now(updated, report):
     labels = dict(zip(new.landmark_ids, new.labels, strict=True))
     for name, label in zip(old.landmark_ids, old.labels, strict=True):
         assert labels.get(name, label) == label
-    # pairs exchanged their places
+    # pairs have swapped places
     places = dict(zip(old.landmark_ids, old.centers, strict=True))
     for name in CHANGES['moved']:
         here = new.centers[new.landmark_ids.index(name)]
         way = min(np.linalg.norm((here - places[other])[:2])
                   for other in CHANGES['moved'] if other != name)
         assert way < 0.1
-    # a person's ellipsoids stay
+    # ellipsoids from a person stay
     stayed = [name for name in kept if name not in CHANGES['moved']]
     for name in stayed:
         np.testing.assert_array_equal(new.centers[new.landmark_ids.index(name)], places[name])
-    assert {one['landmark_id'] for one in report['new']} == set(new.landmark_ids[len(kept):])
+    assert {entry['landmark_id'] for entry in report['new']} == set(new.landmark_ids[len(kept):])
 
 
 def test_new_landmarks_have_phrases_and_all_have_embeddings(updated, report):
@@ -508,10 +508,10 @@ def test_new_landmarks_have_phrases_and_all_have_embeddings(updated, report):
     old = load_embeddings_of_map(ROOM / 'map.yaml', new.landmark_ids)
     kept = old.is_known
     np.testing.assert_array_equal(embeddings.means[kept], old.means[kept])
-    for one in report['new']:
-        row = new.landmark_ids.index(one['landmark_id'])
-        assert one['label'] == new.labels[row]
-        assert len(new.details[row].labels) == 6 or one['label'] == one['class_id']
+    for landmark in report['new']:
+        row = new.landmark_ids.index(landmark['landmark_id'])
+        assert landmark['label'] == new.labels[row]
+        assert len(new.details[row].labels) == 6 or landmark['label'] == landmark['class_id']
 
 
 @pytest.mark.parametrize(('text', 'options', 'message'), [

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A walk around a table of known ellipsoids, as a perfect detector sees it: simulated."""
+"""A simulated walk around a table of known ellipsoids, with a perfect detector."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ CLASSES = ('book', 'bottle', 'cup')
 
 
 def make_table(count=9) -> LandmarkMap:
-    """Ellipsoids of three classes, at least 40 cm apart, about the origin."""
+    """Return ellipsoids of three classes, at least 40 cm apart, around the origin."""
     rng = np.random.default_rng(3)
     places = [(0.5 * x, 0.5 * y) for x in (-1, 0, 1) for y in (-1, 0, 1)][:count]
     centers = np.c_[np.array(places), np.full(count, 0.8)] + rng.uniform(-0.05, 0.05, (count, 3))
@@ -27,11 +27,11 @@ def make_table(count=9) -> LandmarkMap:
 
 
 def join_maps(*maps: LandmarkMap) -> LandmarkMap:
-    """Return the landmarks of several maps in one; ids of those after the first get a mark."""
+    """Join the landmarks of several maps; ids get a mark from the second map on."""
     ids = [name + '_b' * number for number, one in enumerate(maps) for name in one.landmark_ids]
-    labels, classes, details = (sum((getattr(one, name) for one in maps), ())
+    labels, classes, details = (sum((getattr(landmark_map, name) for landmark_map in maps), ())
                                 for name in ('labels', 'class_ids', 'details'))
-    arrays = (np.concatenate([getattr(one, name) for one in maps])
+    arrays = (np.concatenate([getattr(landmark_map, name) for landmark_map in maps])
               for name in ('centers', 'semi_axes', 'quats_xyzw'))
     return LandmarkMap(maps[0].frame_id, tuple(ids), labels, classes, *arrays, details)
 
@@ -50,7 +50,7 @@ def without(table: LandmarkMap, *rows) -> LandmarkMap:
 
 
 def look_at(position, target=(0.0, 0.0, 0.8)):
-    """Return map_from_camera of a camera that looks at a point, upright."""
+    """Return map_from_camera of an upright camera that looks at a point."""
     forward = np.asarray(target) - position
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -60,19 +60,19 @@ def look_at(position, target=(0.0, 0.0, 0.8)):
 
 
 def walk_around(frames=60, turn_deg=300.0, radius=2.2):
-    """Return poses (F, 4, 4) on an arc about the table, at changing height."""
+    """Return poses (F, 4, 4) on an arc around the table, at varying height."""
     angles = np.radians(np.linspace(0.0, turn_deg, frames))
     return np.array([look_at(np.array([radius * np.cos(a), radius * np.sin(a),
                                        1.5 + 0.3 * np.sin(2 * a)])) for a in angles])
 
 
 def see(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0) -> PosedDetections:
-    """Return what a detector sees: boxes with noise, clipped to the image; some are missed."""
+    """Return simulated detections: boxes with noise, clipped to the image; some are missed."""
     return see_rows(table, poses, noise_px, missed, seed)[0]
 
 
 def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0, camera=CAMERA):
-    """Return what a detector sees, and the row of the landmark that each box shows."""
+    """Return simulated detections, and the row of the landmark in each box."""
     rng = np.random.default_rng(seed)
     size = np.array([camera.width, camera.height] * 2, dtype=float)
     rows, boxes, counts = [], [], [0]

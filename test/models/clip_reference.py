@@ -23,7 +23,7 @@ SMALL_CONFIG = {
 
 @dataclass(frozen=True)
 class Reference:
-    """What open_clip itself loads from a checkpoint."""
+    """The model that open_clip loads from a checkpoint."""
 
     name: str
     file: Path

@@ -19,7 +19,7 @@ SIDE = 128
 
 
 def export_yolo(weights: Path, folder: Path, **settings: object) -> Path:
-    """Return what ``yolo export format=onnx`` makes of a file of weights."""
+    """Return the result of ``yolo export format=onnx`` for a file of weights."""
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copy(weights, folder / 'yolo.pt')
     model = import_ultralytics().YOLO(folder / 'yolo.pt')
@@ -37,7 +37,7 @@ class _OnlyResults(torch.nn.Module):
 
 
 def make_d_fine(folder: Path) -> torch.nn.Module:
-    """Write a small D-FINE with random weights as the hub has it; return it in PyTorch."""
+    """Write a small D-FINE with random weights in the hub's layout; return it in PyTorch."""
     import transformers
 
     torch.manual_seed(0)
@@ -49,7 +49,7 @@ def make_d_fine(folder: Path) -> torch.nn.Module:
     network = transformers.DFineForObjectDetection(transformers.DFineConfig(
         backbone_config=backbone, encoder_in_channels=[24, 32, 40], decoder_in_channels=[32] * 3,
         **_SMALL)).eval()
-    for module in network.modules():  # else all places of an image have nearly the same features
+    for module in network.modules():  # else all places have nearly equal features
         if hasattr(module, 'running_var'):
             module.running_var.uniform_(0.1, 0.3)
             module.running_mean.normal_(0.0, 0.1)
@@ -57,7 +57,7 @@ def make_d_fine(folder: Path) -> torch.nn.Module:
     network.config.save_pretrained(folder)
     transformers.RTDetrImageProcessor(size={'height': SIDE, 'width': SIDE}).save_pretrained(folder)
     (folder / 'onnx').mkdir()
-    # Of a module in training mode, the exporter leaves all parts in that mode.
+    # The exporter leaves all submodules of a module in its training mode.
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter('ignore')
         torch.onnx.export(
@@ -68,7 +68,7 @@ def make_d_fine(folder: Path) -> torch.nn.Module:
 
 
 def pixels(image_rgb: np.ndarray) -> np.ndarray:
-    """Return an image of the input's size as D-FINE takes it."""
+    """Return an image at the input size of D-FINE, as its input."""
     return np.ascontiguousarray(image_rgb.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""CLIP's embeddings equal open_clip's own; maps of them; weights that cannot be used."""
+"""CLIP's embeddings equal open_clip's; embeddings of maps; weights that cannot be used."""
 
 import os
 import warnings
@@ -130,7 +130,7 @@ def test_openai_torchscript_archive(small_clip, tmp_path, image_rgb):
     write_torchscript(small_clip.model, file)
     encoder, label_embeddings = load_encoder(
         options(small_clip, tmp_path, pretrained=str(file)), LABELS)
-    # Weights in this format were trained with OpenAI's activation.
+    # Weights in this format were trained with OpenAI's activation function.
     reference = with_quick_gelu(small_clip)
     bounds = crop_bounds(BBOXES, 640, 480)
     crops = reference.crops(image_rgb, bounds)
@@ -183,7 +183,7 @@ def test_images_of_this_encoder_are_compared(clip, map_file, compare):
     assert (similar > np.sum(plain * images.means, axis=1) + 0.2).all()
     if compare == 'image':
         assert np.array_equal(rows, images.means)
-    # the order is that of the map, and landmarks that were added have their label
+    # rows follow the map's order; added landmarks use their label
     fewer = images_of(images.encoder_key).in_order(ROOM.landmark_ids[:0:-1])
     save_landmark_embeddings(embeddings_path(map_file), fewer)
     again = np.asarray(embed_map(clip, ROOM, [str(map_file)], compare))
@@ -192,16 +192,16 @@ def test_images_of_this_encoder_are_compared(clip, map_file, compare):
 
 
 def test_images_of_several_maps_are_compared_together_or_not_at_all(clip, tmp_path, caplog):
-    """Each map keeps rows of its own; a map without images has all maps compared by labels."""
+    """Each map keeps its rows; if one map has no images, all are compared by labels."""
     maps = [replace(ROOM, frame_id='hall'), replace(ROOM, frame_id='attic').select([2, 0, 1])]
-    files = [str(tmp_path / f'{one.frame_id}.yaml') for one in maps]
+    files = [str(tmp_path / f'{landmark_map.frame_id}.yaml') for landmark_map in maps]
     both = join_maps(maps, files)
     for one, file in zip(maps, files, strict=True):
         write_map(file, one)
         save_landmark_embeddings(embeddings_path(file), images_of(
             resolve_clip_weights(clip).key, one.landmark_ids))
     rows = embed_map(clip, both, files, 'image')
-    expected = [images_of('', one.landmark_ids).means for one in maps]
+    expected = [images_of('', landmark_map.landmark_ids).means for landmark_map in maps]
     assert np.array_equal(np.asarray(rows), np.concatenate(expected))
     for part, own in zip(rows.parts, expected, strict=True):
         assert np.array_equal(np.asarray(part), own)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Downloads from a model hub on this machine, without a network, and onto a full disk.
+"""Downloads from a local model hub, without a network, and to a full disk.
 
-In processes of their own: the libraries read addresses and proxies once, when they are imported.
+They run in separate processes: the libraries read addresses and proxies once, on import.
 """
 
 import http.server
@@ -66,7 +66,7 @@ def test_no_network_for_yolo(tmp_path):
 
 
 class Hub(http.server.BaseHTTPRequestHandler):
-    """The part of a model hub that a download needs."""
+    """The parts of a model hub that a download needs."""
 
     weights = b''
     name = 'open_clip_model.safetensors'
@@ -112,7 +112,7 @@ def test_a_download_is_made_once(hub, tmp_path):
     hub.requests.clear()
     again = run(RESOLVE, tmp_path / 'cache')
     assert again == first and again['gelu']
-    # A robot without a network does not wait for one.
+    # A robot without a network does not wait for it.
     assert hub.requests == []
 
 

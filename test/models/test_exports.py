@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Exports to ONNX give what PyTorch gives, from a cache that may be damaged."""
+"""Exports to ONNX give the same results as PyTorch, even if their cache is damaged."""
 
 import gc
 import logging
@@ -72,7 +72,7 @@ def test_embeddings_equal_those_of_open_clip(name, precision, request, cache, im
     print(f'\n{reference.name}, {precision}: least cosine to open_clip {cosine:.7f}')
     assert cosine > (0.999999 if precision == 'fp32' else 0.999)
     assert crops.dtype == np.float32 and crops.shape == expected.shape
-    # the size of a batch has no influence
+    # the batch size has no influence
     alone = encoder.encode_crops(image_rgb, BBOXES[:1])
     assert alone[0] @ crops[0] > (0.999999 if precision == 'fp32' else 0.999)
     assert encoder.encode_crops(image_rgb, BBOXES[:0]).shape == (0, encoder.embed_dim)

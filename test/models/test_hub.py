@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Networks by OWNER/NAME from a model hub on this machine: once, whole, and without a network."""
+"""Networks by OWNER/NAME from a local model hub: downloaded once, completely, and used offline."""
 
 import hashlib
 import http.server
@@ -33,13 +33,13 @@ else:
 
 
 class Hub(http.server.BaseHTTPRequestHandler):
-    """The part of a model hub that a download needs."""
+    """The parts of a model hub that a download needs."""
 
     files: dict[str, bytes]
-    #: What is sent in place of a file
+    #: Content that is sent in place of a file
     sent: dict[str, bytes]
     requests: list[str]
-    #: A file that is sent in part, and how much of it
+    #: A file that is sent in part, and the size of this part
     broken: tuple[str, int] | None
 
     def do_HEAD(self):
@@ -112,7 +112,7 @@ def test_a_download_is_made_once_and_of_what_is_needed(hub, tmp_path):
     assert tmp_path / 'cache/weights' in found.parents
     hub.requests.clear()
     assert Path(resolve(tmp_path / 'cache')['network']) == found
-    assert hub.requests == [], 'a robot without a network does not wait for one'
+    assert hub.requests == [], 'a robot without a network does not wait for it'
     copied = tmp_path / 'cache'
     copied.rename(tmp_path / 'carried')
     assert 'carried' in resolve(tmp_path / 'carried', HF_HUB_OFFLINE='1')['network']
@@ -139,7 +139,7 @@ def test_an_interrupted_download_goes_on(hub, tmp_path):
     hub.requests.clear()
     found = Path(resolve(tmp_path)['network'])
     assert found.with_name('model.onnx_data').read_bytes() == hub.files['onnx/model.onnx_data']
-    assert not any('GET' in one and one.endswith('/config.json') for one in hub.requests)
+    assert not any('GET' in line and line.endswith('/config.json') for line in hub.requests)
 
 
 def test_a_repository_without_onnx(hub, tmp_path):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Embeddings of labels, phrases and crops: the cache on disk, memory, and which pixels count."""
+"""Embeddings of labels, phrases and crops: disk cache, memory, and the pixels that count."""
 
 import os
 import pickle
@@ -95,7 +95,7 @@ def test_the_weighted_mean_in_numbers():
 
 
 def test_a_label_beside_the_list_counts_like_the_best():
-    """As a name that a person gave a landmark which build_map had described."""
+    """As when a person renames a landmark that build_map had described."""
     one = LandmarkDetails(labels=(('a red mug', 0.5), ('a cup', 0.2)))
     assert one.labels_with('a cup') == one.labels
     assert one.labels_with('my mug') == (('my mug', 0.5), *one.labels)
@@ -190,7 +190,7 @@ def encoder():
 
 @pytest.fixture
 def observer(encoder):
-    """An observer that has seen the image once."""
+    """Return an observer that has seen the image once."""
     made = Observer(encoder, np.eye(encoder.embed_dim, dtype=np.float32))
     crops = made.crops(noisy(1), BOXES)
     assert len(crops.known) == 0
@@ -215,7 +215,7 @@ def test_another_view_is_encoded_anew(observer):
     moved = BOXES + 3.0
     assert len(observer.crops(noisy(2), moved).known) == 0, 'other boxes'
     assert len(observer.crops(255 - noisy(2), BOXES).known) == 0, 'other pixels'
-    other = next(one for one in FRAMES if one is not FRAME)
+    other = next(frame for frame in FRAMES if frame is not FRAME)
     image = cv2.imread(str(other.image))[..., ::-1].copy()
     assert len(observer.crops(image, BOXES).known) == 0, 'another image'
     covered, box = noisy(2), BOXES[np.argmax(np.prod(BOXES[:, 2:] - BOXES[:, :2], axis=1))]
@@ -227,11 +227,11 @@ def test_another_view_is_encoded_anew(observer):
 
 def test_without_time_no_crop_fits_and_a_slow_moment_passes(encoder):
     observer = Observer(encoder, np.eye(encoder.embed_dim, dtype=np.float32))
-    assert observer.crops_within(0.001) == 1, 'nothing is known of its speed'
+    assert observer.crops_within(0.001) == 1, 'its speed is unknown'
     observer.measure()
     assert observer.crops_within(0.0) == observer.crops_within(-np.inf) == 0
     assert observer.crops_within(np.inf) > 10
-    observer._crop_s = 100.0  # as of a machine that was busy
+    observer._crop_s = 100.0  # as on a busy machine
     tries = 0
     while not observer.crops_within(10.0):
         tries += 1
@@ -249,7 +249,7 @@ print(folder, oct(stat.S_IMODE(folder.stat().st_mode)), folder.stat().st_uid == 
 
 
 def resolve(*within: str, **environment: str) -> tuple[list[str], str]:
-    """Resolve the default cache in a process; return folder, mode and owner, and the log."""
+    """Resolve the default cache in a separate process; return folder, mode, owner and log."""
     variables = {name: value for name, value in os.environ.items() if name != 'XDG_CACHE_HOME'}
     done = subprocess.run([*within, sys.executable, '-c', RESOLVE], cwd=PROJECT, text=True,
                           env=variables | environment, capture_output=True, timeout=300,

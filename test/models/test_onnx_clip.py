@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""CLIP in ONNX files: in the layout of transformers and of open_clip, and what is no CLIP.
+"""CLIP in ONNX files of transformers and open_clip, and files that are not CLIP.
 
-Published files cannot be downloaded here: the networks have random weights.
+Published files cannot be downloaded here, so the networks have random weights.
 """
 
 import json
@@ -104,7 +104,7 @@ class _Embeddings(torch.nn.Module):
 
 @pytest.fixture(scope='module')
 def published(exported, tmp_path_factory):
-    """A folder as transformers' networks are published, and the networks in PyTorch."""
+    """Return a folder in the published layout of transformers, and the networks in PyTorch."""
     transformers = pytest.importorskip('transformers')
     torch.manual_seed(0)
     small = {'hidden_size': 32, 'intermediate_size': 64, 'num_hidden_layers': 2,
@@ -154,7 +154,7 @@ def text_of(file: Path, **changes) -> None:
 
 
 def other_words(file: Path) -> None:
-    """Write a tokenizer of another model."""
+    """Write the tokenizer of another model."""
     tokenizer = Tokenizer(models.WordLevel({'[UNK]': 0, '[CLS]': 1, '[SEP]': 2} | {
         f'word{number}': number for number in range(3, 30)}, '[UNK]'))
     tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Detectors in ONNX files find what their weights find in PyTorch; files that are no detector.
+"""Detectors in ONNX files give the same boxes as their weights in PyTorch; invalid files.
 
 Published files cannot be downloaded here: D-FINE has random weights.
 """
@@ -68,13 +68,13 @@ def selected(weights, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope='session')
 def d_fine(tmp_path_factory):
-    """A folder as the hub has it, and the network in PyTorch."""
+    """Return a folder in the hub's layout, and the network in PyTorch."""
     folder = tmp_path_factory.mktemp('d-fine')
     return folder, make_d_fine(folder)
 
 
 def in_boxes(images, size):
-    """Return images in a square of grey borders, as an export of a fixed size sees them."""
+    """Return images padded to a square with grey borders, as an export of fixed size sees them."""
     return [cv2.copyMakeBorder(image, 80, 80, 0, 0, cv2.BORDER_CONSTANT, value=(114,) * 3)
             for image in images]
 
@@ -109,7 +109,7 @@ def test_an_export_with_half_precision(plain, tmp_path, images, load):
     network.graph.node.insert(0, helper.make_node('Cast', ['images'], ['images32'],
                                                   to=TensorProto.FLOAT))
     for node in list(network.graph.node)[1:]:
-        node.input[:] = ['images32' if one == 'images' else one for one in node.input]
+        node.input[:] = ['images32' if name == 'images' else name for name in node.input]
     onnx.save(network, tmp_path / 'half.onnx')
     px, score = compare(load(tmp_path / 'half.onnx'), load(plain), images)
     assert px < 1.0 and score < 0.01
@@ -147,7 +147,7 @@ def test_options_choose_boxes(d_fine, load, cache):
 
     assert configure(conf=float(every.scores[4])).class_ids == every.class_ids[:4]
     assert configure(max_det=3).class_ids == every.class_ids[:3]
-    few = configure(iou=0.0)  # of boxes that touch, one of each class is left
+    few = configure(iou=0.0)  # of overlapping boxes, one of each class is left
     assert set(few.class_ids) == set(every.class_ids) and len(few) <= len(every)
     assert (configure(conf=1.0).bboxes_xyxy.shape) == (0, 4)
     for other in (an_image(1, 1), an_image(3, 700)):
@@ -158,7 +158,7 @@ def test_options_choose_boxes(d_fine, load, cache):
 
 
 def test_a_network_with_a_class_for_nothing(tmp_path, load):
-    """DETR's last logit says that a query found nothing."""
+    """DETR's last logit means that a query found no object."""
     logits = np.array([[[2.0, 0.0, 0.0], [0.0, 0.0, 5.0], [0.0, 3.0, 1.0]]], np.float32)
     boxes = np.array([[[0.5, 0.5, 0.2, 0.4], [0.1] * 4, [0.25, 0.25, 0.5, 0.5]]], np.float32)
     write_network(tmp_path / 'model.onnx', {'logits': logits, 'pred_boxes': boxes})
@@ -181,7 +181,7 @@ def test_the_confidence_in_any_object_of_the_first_yolov5(tmp_path, load):
 
 def write_network(file, outputs, metadata=None, kind=TensorProto.FLOAT, shape=(1, 3, 64, 64),
                   opset=17):
-    """Write a network whose outputs are constants, whatever image comes."""
+    """Write a network with constant outputs for every image."""
     nodes = [helper.make_node('Cast', ['images'], ['float'], to=TensorProto.FLOAT),
              helper.make_node('ReduceMean', ['float'], ['mean'], keepdims=0),
              helper.make_node('Sub', ['mean', 'mean'], ['nothing'])]
@@ -288,7 +288,7 @@ def test_a_damaged_compiled_network_is_compiled_again(plain, images, tmp_path, c
     assert 'is damaged' in warning.getMessage() and str(blob.parent) in warning.getMessage()
     caplog.clear()
     assert np.array_equal(boxes(), before) and not caplog.records
-    # a robot has the file and the cache in other places
+    # on a robot, file and cache are in other places
     copied = shutil.copy(plain, moved / plain.name)
     load_detector(DetectorOptions(str(copied), device='cpu', cache_dir=str(moved)))
     assert len(list(moved.rglob('*.blob'))) == 1

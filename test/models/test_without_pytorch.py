@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""ONNX networks run where PyTorch cannot be imported, and give the same poses."""
+"""ONNX networks run without PyTorch, and give the same poses."""
 
 import json
 import os
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
 WAKE_UPS = 10
-#: Prints the demo's poses (4, 4), null for a refusal, and how far the robot is from each [m].
+#: Prints the demo's poses (4, 4), null for a refusal, and their distances to the truth [m].
 POSES = """
 import json, sys
 import cv2, numpy as np
@@ -65,7 +65,7 @@ def hidden(tmp_path_factory) -> dict[str, str]:
 
 @pytest.fixture
 def walk(tmp_path) -> Path:
-    """A copy: evaluate keeps what it records beside its folder."""
+    """Work on a copy, since evaluate stores its recording beside the folder."""
     return Path(shutil.copytree(ASSETS / 'rig/front', tmp_path / 'walk'))
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""XFeat with the published file: its features, and keyframes that have them."""
+"""XFeat with the published file: its features, and keyframes with them."""
 
 import http.server
 import logging
@@ -46,7 +46,7 @@ def published(shared_data):
 
 @pytest.fixture(scope='module')
 def cache_dir(published, tmp_path_factory):
-    """A cache that has the file."""
+    """Return a cache that has the file."""
     folder = tmp_path_factory.mktemp('cache') / 'cliploc_ros'
     (folder / 'weights').mkdir(parents=True)
     (folder / 'weights' / FILE_NAME).symlink_to(published)
@@ -70,7 +70,7 @@ def image_rgb(kitchen):
 
 @pytest.fixture(scope='module')
 def room(shared_data):
-    """Any map: the tests look at features alone."""
+    """Return any map: these tests use only features."""
     return LandmarkMap.from_file(shared_data / 'tum_fr3_office' / 'map.yaml')
 
 
@@ -84,7 +84,7 @@ def layer_file(kitchen, room, xfeat, tmp_path_factory):
 
 @pytest.fixture
 def no_network(monkeypatch):
-    """Refuse connections at once: nothing listens on the port."""
+    """Refuse connections at once: no server listens on the port."""
     monkeypatch.setenv('https_proxy', 'http://127.0.0.1:9')
 
 
@@ -109,13 +109,13 @@ def test_features_of_a_real_image(xfeat, image_rgb):
     assert found.descriptors.dtype == np.uint8 and found.descriptors.shape[1] == 64
     assert (np.diff(found.strengths) <= 0.0).all()
     assert ((found.pixels > -0.5) & (found.pixels < (639.5, 479.5))).all()
-    # moved by a cell of the network, the image has the same features there
+    # shifted by a cell of the network, the image has the same features
     moved = xfeat.extract(np.roll(image_rgb, 32, axis=1), 500, 640)
     pairs, _ = xfeat.match(xfeat.units(found.descriptors), xfeat.units(moved.descriptors))
     steps = moved.pixels[pairs[:, 1]] - found.pixels[pairs[:, 0]]
     assert np.mean(np.abs(steps - (32, 0)).max(axis=1) < 1.0) > 0.9
     assert len(pairs) > 250
-    # a smaller one shows the same places
+    # a smaller image has features at the same places
     small = xfeat.extract(image_rgb, 500, 416)
     pairs, _ = xfeat.match(xfeat.units(found.descriptors), xfeat.units(small.descriptors))
     steps = small.pixels[pairs[:, 1]] - found.pixels[pairs[:, 0]]

@@ -137,7 +137,7 @@ def test_ultralytics_stays_off_network_home_and_pip(weights, tmp_path):
     home, here, temporary = (tmp_path / name for name in ('home', 'here', 'temporary'))
     for folder in (home, here, temporary):
         folder.mkdir()
-    # Hide pytest: ultralytics is silent under it.
+    # Hide pytest, since ultralytics is silent under it.
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith(('PYTEST', 'YOLO', 'XDG', 'OMP', 'ULTRALYTICS'))}
     environment |= {'HOME': str(home), 'PYTHONPATH': str(PROJECT), 'TMPDIR': str(temporary),
@@ -146,7 +146,7 @@ def test_ultralytics_stays_off_network_home_and_pip(weights, tmp_path):
         [sys.executable, '-c', WATCHED_RUN, str(weights), str(tmp_path / 'cache')], cwd=here,
         env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    # One line: ultralytics printed nothing.
+    # One line, so ultralytics printed nothing.
     assert json.loads(done.stdout) == {
         'events': [], 'analytics': False, 'threads': 1, 'restricted': True, 'omp': None}
     assert [*home.rglob('*')] == [*here.rglob('*')] == []
@@ -184,17 +184,17 @@ def embedded(texts) -> torch.Tensor:
 
 
 def by_ultralytics(file, texts, image_rgb):
-    """Return boxes and classes as ultralytics' own methods find them with these embeddings."""
+    """Return boxes and classes from ultralytics' methods with these embeddings."""
     model, rows = load_yolo(file), embedded(texts)
     if 'yoloe' in file.name:
         with torch.no_grad():
             model.set_classes(texts, model.model.model[-1].get_tpe(rows))
     else:
-        model.model.get_text_pe = lambda *_, **__: rows  # its tower is a package of its own
+        model.model.get_text_pe = lambda *_, **__: rows  # its text tower is a separate package
         model.set_classes(texts)
     found = model.predict(np.ascontiguousarray(image_rgb[..., ::-1]), conf=0.0, iou=0.7, imgsz=320,
                           max_det=300, device='cpu', verbose=False)[0].boxes.data.numpy()
-    return found[:, :4], [texts[int(one)] for one in found[:, 5]]
+    return found[:, :4], [texts[int(result)] for result in found[:, 5]]
 
 
 @pytest.mark.parametrize('model', ['world.pt', 'yoloe.pt'])
@@ -203,7 +203,7 @@ def test_it_detects_the_texts_as_ultralytics_does(folder, image_rgb, model):
     assert detector.class_names == ('mug', 'office chair', 'potted plant')
     found = detector.detect(image_rgb)
     boxes, classes = by_ultralytics(folder / model, list(detector.class_names), image_rgb)
-    # random weights give nearly equal scores, whose order rounding decides further down
+    # random weights give nearly equal scores, so rounding decides the order of the others
     np.testing.assert_allclose(found.bboxes_xyxy[:20], boxes[:20], atol=1e-2)
     assert list(found.class_ids[:20]) == classes[:20]
 
@@ -235,7 +235,7 @@ def test_the_texts_of_a_map():
     room = replace(make_room(), labels=(*['red mug'] * 4, *['white mug'] * 7, 'a'))
     prompts = prompts_of_map(room, 'map.yaml')
     assert prompts[:3] == (('a', 'a'), ('b', 'b'), ('c', 'c'))
-    # of four red mugs two are of class a; 'a' is a class, and no other text
+    # two of four red mugs are of class a; 'a' is a class, and no other text
     assert prompts[3] == ('red mug', 'a') and prompts[4][0] == 'white mug' and len(prompts) == 5
 
 
@@ -257,7 +257,7 @@ def test_published_networks_only():
 
     for profile in PROFILES.values():
         assert profile.detector in GITHUB_ASSETS_NAMES or is_hub_name(profile.detector)
-        # an entry of the model hub can be kept for a start without a network
+        # an entry of the model hub can be stored for a start without a network
         assert is_hub_name(profile.clip_pretrained) or open_clip.get_pretrained_cfg(
             profile.clip_model, profile.clip_pretrained)['hf_hub']
 

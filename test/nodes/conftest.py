@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures: nodes as processes, and the node in the test that exchanges messages with them."""
+"""Fixtures: nodes as processes, and the test's node that exchanges messages with them."""
 
 import pytest
 import rclpy
@@ -63,7 +63,7 @@ def start(tmp_path):
 
 @pytest.fixture(scope='module')
 def start_shared(tmp_path_factory):
-    """The same for processes that the tests of a module share."""
+    """Start modules as processes that the tests of a module share."""
     run, started = starter(tmp_path_factory.mktemp('shared'))
     yield run
     for process in started:
@@ -72,7 +72,7 @@ def start_shared(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def relocalizer(start_shared, tester, room_map):
-    """A relocalizer that matches classes in the simulated room, ready for requests."""
+    """Return a relocalizer that matches by class in the simulated room, ready for requests."""
     process = start_shared('nodes.relocalizer', parameters=class_matching(room_map))
     process.wait_for_output('ready after')
     tester.connect()
@@ -95,9 +95,9 @@ def own_relocalizer(start, tester, room_map):
 
 @pytest.fixture
 def replay(capsys):
-    """Answer a recorded case again with the executable evaluate; return its output.
+    """Answer a recorded case with the executable evaluate; return its output.
 
-    It comes to the same verdict, with the confidence of an answer.
+    The verdict is the same, with the confidence of the recorded answer.
     """
     def run(case, landmark_map, answer):
         capsys.readouterr()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A process that publishes images without pause, or one that joins and leaves again and again."""
+"""A process that publishes images continuously, or one that joins and leaves repeatedly."""
 
 import sys
 import time
@@ -15,7 +15,7 @@ from cliploc_ros.ros.qos import AdaptiveSubscription
 
 
 def publish():
-    """Publish VGA images, a few more each second than a camera does."""
+    """Publish VGA images, slightly faster than a camera."""
     node = Node('camera')
     publisher = node.create_publisher(
         Image, 'image', QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE))
@@ -27,7 +27,7 @@ def publish():
 
 
 def join(times):
-    """Subscribe, take three images, and leave. Print a line for each time."""
+    """Subscribe, take three images, and leave. A line is printed each time."""
     node = Node('joiner')
     for _ in range(times):
         images = []

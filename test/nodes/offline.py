@@ -57,7 +57,7 @@ def request(node):
 
 def main():
     folder, arguments = Path(sys.argv[1]), sys.argv[2:]
-    # variables, so that each node is a new interpreter without the imports of another one
+    # separate processes, so that each node is a new interpreter without imports of another
     variables = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     os.environ.update(variables)
     nodes = [Process(f'nodes.{name}', arguments, folder / f'{name}.log', **variables)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Start modules of the package as processes, and wait for what they do."""
+"""Start modules of the package as processes, and wait for conditions."""
 
 import multiprocessing
 import os
@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 PROJECT = Path(__file__).resolve().parents[2]
-# The time limit of a wait. Only a failing test takes this long.
+# Time limit of a wait. Only a failing test takes this long.
 PATIENCE_S = 60.0
-# These imports take most of a start: two seconds, nine with PyTorch.
+# These imports take most of the start-up time: two seconds, nine with PyTorch.
 _IMPORTS = ['torch', 'torchvision', 'open_clip', 'cliploc_ros.cli.replay',
             'cliploc_ros.nodes.detector', 'cliploc_ros.nodes.relocalizer',
             'cliploc_ros.ros.wake_up']
@@ -64,10 +64,10 @@ class Fork:
 
 
 class Process:
-    """A module of the package in its own process, with its output in a file.
+    """A module of the package in a separate process, with its output in a file.
 
-    By default it is forked from a server that has done its imports. With fresh, or inside another
-    command, or with its own environment variables, a new interpreter starts it, as for a user.
+    By default it is forked from a server with the imports done. With ``fresh``, inside another
+    command, or with environment variables, it starts in a new interpreter, as for a user.
     """
 
     def __init__(self, module, arguments, log, fresh=False, within=(), **environment):
@@ -91,7 +91,7 @@ class Process:
         return self.log.read_text()
 
     def sees(self, path):
-        """Return the path outside of the process's own mounts."""
+        """Return the path outside the process's mounts."""
         return self._proc(f'root{path}')
 
     def wait_for_output(self, text):
@@ -103,7 +103,7 @@ class Process:
         return Path(f'/proc/{self._process.pid}/{name}')
 
     def memory_mib(self, field='VmRSS'):
-        """Resident memory now, or with VmHWM at its peak [MiB]."""
+        """Return the resident memory, or with VmHWM its peak [MiB]."""
         return int(self._proc('status').read_text().split(f'{field}:')[1].split()[0]) / 1024
 
     def descriptors(self):

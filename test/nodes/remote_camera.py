@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-r"""A camera that requests its pose of a relocalizer on another machine: prints each answer.
+r"""A camera that requests its pose from a relocalizer on another machine, and prints each answer.
 
     PYTHONPATH=.:test:test/nodes python test/nodes/remote_camera.py \
         REQUESTS raw|compressed reliable|best_effort JPEG_QUALITY
@@ -22,7 +22,7 @@ _PERIOD_S = 0.2
 
 
 def frames(transport, count, quality):
-    """Return a frame for each request, each from another place, with an image like a photo's."""
+    """Yield a frame for each request, each from another place, with a photo-like image."""
     rng = np.random.default_rng(0)
     small = rng.integers(0, 256, (30, 40, 3), dtype=np.uint8)
     pixels = cv2.resize(small, (640, 480), interpolation=cv2.INTER_CUBIC)
@@ -39,7 +39,7 @@ def frames(transport, count, quality):
 
 
 def with_reliability(camera, name):
-    """Publish with another reliability: only the newest message counts."""
+    """Publish with another reliability; only the newest message is kept."""
     profile = QoSProfile(depth=1, reliability=ReliabilityPolicy[name.upper()])
     for attribute in ('images', 'compressed', 'infos', 'detections'):
         former = getattr(camera, attribute)
@@ -49,18 +49,18 @@ def with_reliability(camera, name):
 
 
 def ask(camera, frame):
-    """Request a pose and publish a frame, each time with a new stamp; return what came back."""
+    """Request a pose and publish a frame, each time with a new stamp; return the results."""
     began_at, poses, shown_at, answers = time.monotonic(), len(camera.initial_poses), -1.0, []
     future = camera.ask()
     future.add_done_callback(answers.append)
     while not future.done() and time.monotonic() - began_at < 60.0:
         if time.monotonic() - shown_at > _PERIOD_S:
             shown_at = time.monotonic()
-            frame[0].header.stamp.nanosec += 1_000_000  # that of all three messages
+            frame[0].header.stamp.nanosec += 1_000_000  # the stamp of all three messages
             camera.publish(frame)
         camera.spin()
     took_s = time.monotonic() - began_at
-    while time.monotonic() - began_at < took_s + 0.5:  # would a second answer or pose come?
+    while time.monotonic() - began_at < took_s + 0.5:  # wait for an unwanted second answer or pose
         camera.spin()
     answer = future.result()
     return {'seconds': round(took_s, 3), 'answers': len(answers), 'message': answer.message,

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Two network namespaces joined by a slow, lossy link, for kernels without netem.
 
-Each namespace has a tap device; this process carries the Ethernet frames from one to the other,
-late, at a limited rate, and loses some. Needs root.
+Each namespace has a tap device. This process transfers the Ethernet frames between them with a
+delay, at a limited rate, and drops some. Needs root.
 
     python test/nodes/slow_link.py --delay-ms 50 --loss 0.05 --rate-mbit 10 \
         --left python camera.py ... --right python -m cliploc_ros.nodes.relocalizer ...
 
-It ends with the left command and its exit code.
+It exits with the left command and its exit code.
 """
 
 import argparse
@@ -26,12 +26,12 @@ import sys
 import time
 
 _TUNSETIFF, _IFF_TAP, _IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
-# What waits for the link is bounded, as in a router: a fifth of a second at the rate.
+# The queue of the link is bounded as in a router: a fifth of a second at the rate.
 _QUEUE_S = 0.2
 
 
 class Direction:
-    """Frames on their way from one tap to the other."""
+    """Frames in transit from one tap to the other."""
 
     def __init__(self, sink, options, seed):
         self._sink, self._options, self._random = sink, options, random.Random(seed)
@@ -47,7 +47,7 @@ class Direction:
             self.overflown += 1
             return
         self._free_at = sent_at
-        self._count += 1  # frames of one moment keep their order
+        self._count += 1  # frames of the same time keep their order
         heapq.heappush(self._waiting, (sent_at + self._options.delay_ms / 1e3, self._count, frame))
 
     def deliver(self, now):
@@ -66,14 +66,14 @@ class Direction:
 
 
 def tap():
-    """Make the tap device of this namespace; return its file descriptor."""
+    """Create the tap device of this namespace; return its file descriptor."""
     descriptor = os.open('/dev/net/tun', os.O_RDWR | os.O_NONBLOCK)
     fcntl.ioctl(descriptor, _TUNSETIFF, struct.pack('16sH', b'slow0', _IFF_TAP | _IFF_NO_PI))
     return descriptor
 
 
 def start(command, address):
-    """Start a command in namespaces of its own; return its process id and the end of its tap."""
+    """Start a command in separate namespaces; return its process id and the end of its tap."""
     here, there = socket.socketpair()
     pid = os.fork()
     if pid:
@@ -82,7 +82,7 @@ def start(command, address):
         descriptors = array.array('i')
         descriptors.frombytes(message[0][2])
         return pid, descriptors[0]
-    # shared memory of its own, or DDS would bypass the link
+    # separate shared memory, or DDS would bypass the link
     os.unshare(os.CLONE_NEWNET | os.CLONE_NEWNS)
     descriptor = tap()
     for line in ('mount --make-rprivate /', 'mount -t tmpfs tmpfs /dev/shm', 'ip link set lo up',
@@ -96,7 +96,7 @@ def start(command, address):
 
 
 def carry(left, right, options, is_over):
-    """Carry frames between two taps until it is over; return both directions."""
+    """Transfer frames between two taps until the end; return both directions."""
     ways = {left: Direction(right, options, 1), right: Direction(left, options, 2)}
     while not is_over():
         wait_s = min(way.next_at for way in ways.values()) - time.monotonic()

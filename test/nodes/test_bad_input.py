@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every bad input is named in the answer, and the node lives on."""
+"""Every bad input is named in the answer, and the node keeps running."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def of_another_camera(image, info, detections):
 
 
 MANY_BOXES = np.random.default_rng(0).uniform((0, 0, 200, 200), (200, 200, 400, 400), (5000, 4))
-# One of each cause, and what the answer quotes of it. test/ros has all of them.
+# One fault of each cause, and the quote in the answer. test/ros has all of them.
 BAD_FRAMES = {
     'encoding': (changed(0, encoding='yuv422'), 'yuv422'),
     'huge size': (changed(0, width=2**31, height=2**31), '2147483648'),
@@ -49,7 +49,7 @@ BAD_FRAMES = {
 
 
 def refusal(tester, frame):
-    """Return the answer to a bad frame; a good one of the test before may still be on its way."""
+    """Return the answer to a bad frame, though a good frame may still be in transit."""
     answer = tester.relocalize(frame)
     return tester.relocalize(frame) if answer.success else answer
 
@@ -67,7 +67,7 @@ def test_bad_frames(relocalizer, tester, name):
 
 
 def test_what_strangers_write_is_quoted_in_a_line(relocalizer, tester):
-    """Answer, log and diagnostics: a message of a megabyte must not become many."""
+    """Answer, log and diagnostics must not multiply a message of a megabyte."""
     frame = make_frame()
     frame[0].encoding = '[FATAL] all is lost\n' * 50_000
     answer = refusal(tester, frame)

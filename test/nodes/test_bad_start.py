@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A relocalizer that is started wrongly says so, lives, and works once it is mended."""
+"""A relocalizer with a bad start reports it, stays alive, and works once it is fixed."""
 
 
 import pytest

@@ -18,7 +18,7 @@ from cliploc_ros.ros.conversions import detections_to_msg
 
 BASE_FROM_CAMERA = [float(number) for mount in MOUNTS for number in (
     *mount[:3, 3], *Rotation.from_matrix(mount[:3, :3]).as_quat())]
-# The clock of a camera that has none [s].
+# Clock offset of an unsynchronized camera [s].
 NEVER = 1000.0
 
 
@@ -36,7 +36,7 @@ def cases(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def four_cameras(start_shared, tester, surroundings_map, cases):
-    """Start a relocalizer; return it, and what asks while some cameras publish."""
+    """Start a relocalizer; return it, and a function that requests while some cameras publish."""
     publishers = {name: {kind: tester.create_publisher(kind, f'{name}/{topic}', RELIABLE)
                          for kind, topic in ((CameraInfo, 'camera_info'), (Image, 'image'),
                                              (Detection2DArray, 'detections'))} for name in NAMES}
@@ -121,20 +121,20 @@ def test_a_recorded_request_of_four_cameras_replays(four_cameras, tester, surrou
     (NAMES[1:], {}), (NAMES, {'left': NEVER})])
 def test_a_camera_that_is_late_or_silent_is_left_out_and_named(four_cameras, working, late_s):
     process, ask = four_cameras
-    missing = next(iter(late_s), None) or next(one for one in NAMES if one not in working)
+    missing = next(iter(late_s), None) or next(name for name in NAMES if name not in working)
     ask_until(ask, f'no image of {missing};', working, late_s)
     assert 'Traceback' not in process.output()
 
 
 @pytest.mark.full
 def test_one_detector_serves_all_cameras_in_turn(start, tester):
-    """With one network: images of one instant, more of them than it can look at."""
+    """With one network, images of the same instant, more than it can process."""
     process = start('nodes.detector', parameters={
         'model': PROJECT / 'demo/assets/yolo.onnx', 'cameras': list(NAMES)})
     process.wait_for_output('ready after')
     publishers = {name: tester.create_publisher(Image, f'{name}/image', RELIABLE)
                   for name in NAMES}
-    heard = {name: [] for name in NAMES[:3]}  # nobody listens to the last one
+    heard = {name: [] for name in NAMES[:3]}  # the last topic has no subscriber
     subscriptions = [tester.create_subscription(Detection2DArray, f'{name}/detections',
                                                 heard[name].append, 10) for name in heard]
     sent = 0
@@ -153,9 +153,9 @@ def test_one_detector_serves_all_cameras_in_turn(start, tester):
     finally:
         for subscription in subscriptions:
             tester.destroy_subscription(subscription)
-        for one in publishers.values():
-            tester.destroy_publisher(one)
+        for publisher in publishers.values():
+            tester.destroy_publisher(publisher)
     stamps = [{msg.header.stamp.sec for msg in messages} for messages in heard.values()]
     assert {msg.header.frame_id for msg in heard['left']} == {'left'}
-    assert len(set.intersection(*stamps)) >= 3, f'of the same instants: {stamps}'
+    assert len(set.intersection(*stamps)) >= 3, f'images of the same instants: {stamps}'
     assert 'Traceback' not in process.output()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Depth of an RGB-D camera at the relocalizer: right, wrong, late, and none."""
+"""Depth of an RGB-D camera at the relocalizer: correct, wrong, late and missing."""
 
 import struct
 
@@ -12,7 +12,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from tester import RELIABLE, ask_until, make_frame
 
 ROOM = make_room()
-# On a busy machine, too.
+# Enough on a busy machine as well.
 SEARCH = {'algorithm': 'auto', 'time_budget_ms': 5000.0}
 DEPTHS_M = depth_image(ROOM, MAP_FROM_CAMERA, see_room(ROOM).bboxes_xyxy)
 
@@ -37,7 +37,7 @@ def compressed(frame):
 
 @pytest.fixture
 def depth_camera(tester):
-    """Publishes depth next to a frame, as a camera would, until the answer comes."""
+    """Publishes depth next to a frame, as a camera would, until the answer arrives."""
     raw = tester.create_publisher(Image, 'depth', RELIABLE)
     small = tester.create_publisher(CompressedImage, 'depth/compressedDepth', RELIABLE)
 
@@ -86,7 +86,7 @@ def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth
 
 
 def test_a_request_never_waits_for_depth(own_relocalizer, depth_camera):
-    """Of a camera that is silent, late, or sees none."""
+    """The depth camera is silent, late, or has no depth."""
     process = own_relocalizer(depth_transport='raw', **SEARCH)
     for depth in (None, message(make_frame(), late_s=0.5), message(make_frame(), 0.0 * DEPTHS_M)):
         answer = depth_camera(depth)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes say of themselves on /diagnostics while their input comes, stops and fails."""
+"""/diagnostics of the nodes while their input arrives, stops and fails."""
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -14,13 +14,13 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 
 @pytest.fixture
 def status(tester):
-    """The last report of the one node that runs: level, message and values."""
+    """The last report of the running node: level, message and values."""
     heard = []
     subscription = tester.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
 
     class Status:
         def wait(self, level, text='', work=tester.spin, **values):
-            """Wait for a new report of a level, with a text and values in it."""
+            """Wait for a new report with a level, a text and values."""
             heard.clear()
 
             def fits():
@@ -49,7 +49,7 @@ def test_a_relocalizer_that_hears_everything_nothing_and_half(own_relocalizer, t
     assert {'waiting last [ms]', 'queue age [s]', 'images dropped unpaired',
             'frames skipped while busy', 'memory [MiB]'} <= set(values)
     tester.wait(lambda: float(status.wait(OK, 'active', frame)['image rate [Hz]']) > 1.0,
-                'images to be counted')
+                'a count of images')
     status.wait(WARN, 'no image on /image for', (frame[1], frame[2]))
     status.wait(ERROR, 'no camera_info on /camera_info for', (frame[0], frame[2]))
     tester.destroy_publisher(tester.infos)
@@ -59,7 +59,7 @@ def test_a_relocalizer_that_hears_everything_nothing_and_half(own_relocalizer, t
 
 
 def test_what_contradicts_itself_is_named_until_it_is_gone(own_relocalizer, tester, status):
-    """A doubt warns, in a refusal, too. A fault of the detector is an error."""
+    """A doubt gives a warning, also in a refusal. A fault of the detector is an error."""
     process = own_relocalizer()
     image, info, detections = make_frame()
     info.header = Header(stamp=image.header.stamp, frame_id='color_frame')
@@ -96,7 +96,7 @@ def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
         bad.encoding = 'yuv422'
         status.wait(WARN, "encoding 'yuv422' is not one of", (bad,))
         status.wait(OK, 'active', (image,))
-    # it rests while nobody asks, although images come
+    # it idles without subscribers, although images arrive
     status.wait(OK, 'active', (image,), **{'listened to': 'False', 'image rate [Hz]': '0.0',
                                            'detections rate [Hz]': '0.0'})
     tester.destroy_publisher(tester.images)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable doctor on a robot of real nodes, where each thing is broken once."""
+"""Run the executable doctor on a robot of real nodes, with each part broken once."""
 
 import re
 import shutil
@@ -29,7 +29,7 @@ MOUNT = [0.0, 0.0, 0.5, -0.70710678, 0.0, 0.0, 0.70710678]
 
 
 class Robot:
-    """Publishes what a robot does, and what a test broke; it changes frame and odometry."""
+    """Publishes the topics of a robot, with a test's faults; it changes frame and odometry."""
 
     def __init__(self, tester):
         self._tester = tester
@@ -46,7 +46,7 @@ class Robot:
         odometry.header.stamp = make_frame(stamp_s=now)[0].header.stamp
         odometry.twist.twist.linear.x = self.speed_m_s
         self._odometry.publish(odometry)
-        time.sleep(self.detection_s)  # of the detector: odometry does not wait for it
+        time.sleep(self.detection_s)  # for the detector; odometry does not wait for it
         self._tester.publish(frame[2:])
         for _ in range(3):
             self._tester.spin()
@@ -64,7 +64,7 @@ def robot(tester):
 
 @pytest.fixture
 def examine(start, robot, room_map, tmp_path):
-    """Run the doctor with parameters; return its lines, what to (state, text), and exit code."""
+    """Run the doctor; return its lines as a dict of (state, text), and its exit code."""
     def run(*arguments, **parameters):
         shutil.copy(room_map, tmp_path / 'map.yaml')
         file = tmp_path / 'robot.yaml'
@@ -106,7 +106,7 @@ def of_another_detector(image, info, detections):
 
 
 def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examine, tester):
-    """The parameters and topics are those of the running relocalizer."""
+    """Parameters and topics are those of the running relocalizer."""
     own_relocalizer('--ros-args', '-r', 'odom:=/odom', base_frame='base_link',
                     base_from_camera=MOUNT)
     found, code = examine('--relocalizer', '/relocalizer')
@@ -161,7 +161,7 @@ def test_a_prior_decides_for_the_doctor_as_for_the_relocalizer(examine, tester, 
     tester.destroy_publisher(publisher)
 
 
-#: Old images are from before all odometry.
+#: Old images predate all odometry.
 CONSEQUENCES = {'calibration': ('pose',), 'clock': ('odometry',), 'tf': ('pose',)}
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What happens on a robot all the same: processes die, time jumps, cameras are fast."""
+"""Faults on a robot: processes die, time jumps, cameras are too fast."""
 
 import signal
 
@@ -31,7 +31,7 @@ def test_a_detector_that_is_killed_and_restarted_while_a_request_waits(start, te
             tester.publish(make_frame(stamp_s=float(next(stamps)))[:2])
             return future.done()
         tester.wait(answered, 'an answer from the new detector')
-        # noise shows nothing, and that is what is said
+        # noise shows no objects, and the answer says so
         assert future.result().message.startswith('refused: ')
         assert second.alive
     finally:

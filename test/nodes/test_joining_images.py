@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A node subscribes to a camera that is already running; the relocalizer does for each request."""
+"""A node subscribes to a running camera, as the relocalizer does for each request."""
 
 import os
 import subprocess
@@ -32,9 +32,9 @@ def run():
 
 
 def test_every_join_receives_images(run):
-    """Fast DDS soon blocked each of these processes where it deserialized the images itself."""
+    """Fast DDS soon blocked each of these processes if it deserialized the images itself."""
     for _ in range(os.cpu_count()):
-        run('-c', 'while True: pass')  # on busy cores a join meets images half on their way
+        run('-c', 'while True: pass')  # on busy cores, a new subscription meets images in transit
     run('test/nodes/joiner.py', 'publish')
     joiners = [run('test/nodes/joiner.py', 'join', JOINS) for _ in range(JOINERS)]
     joined = [joiner.communicate(timeout=2 * PATIENCE_S)[0].count(' s\n') for joiner in joiners]

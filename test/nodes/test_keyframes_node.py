@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The relocalizer as a process with a layer of keyframes next to its map: the demo's room."""
+"""The relocalizer as a process with a keyframe layer next to its map, in the demo's room."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def room_map(tmp_path):
 
 
 def query_frame(stamp_s=100.0):
-    """Return image 2 of the walk with its pose, and the messages of it."""
+    """Return image 2 of the walk with its pose and messages."""
     seen = next(one for number, one in enumerate(frames_of('sequence').read()) if number == QUERY)
     image, info, detections = make_frame(UNKNOWN, stamp_s)
     image.width, image.height, image.step = seen.camera.width, seen.camera.height, \
@@ -75,7 +75,7 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     assert 'another verdict' in capsys.readouterr().out
     tester.wait(lambda: tester.poses, 'a pose')
     assert pose_error(transform_of(tester.poses[0].pose.pose), seen.map_from_camera)[0] < 0.05
-    # boxes that the objects' search accepts, in an image of another place
+    # boxes that the object search accepts, in an image of another place
     contradicted = tester.relocalize((image, info, make_frame()[2]))
     assert not contradicted.success
     assert 'keyframes give poses ' in contradicted.message
@@ -91,7 +91,7 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
 
 
 def test_a_map_of_keyframes_alone(start, tester, room_map, tmp_path, capsys):
-    """It is a map: with default options, and without CLIP; one with landmarks comes and goes."""
+    """It is a valid map with default options and without CLIP; landmarks may come and go."""
     bare = tmp_path / 'bare.yaml'
     write_bare_map(bare, build_layer(frames_of('mapping').select(LIKE_QUERY),
                                      LandmarkMap.empty('map'), LayerOptions(0.0, 0.0, 300)))
@@ -137,7 +137,7 @@ def diagnostics_of(tester):
     heard = []
     subscription = tester.create_subscription(
         DiagnosticArray, '/diagnostics', lambda msg: heard.extend(
-            one for one in msg.status if 'relocalizer' in one.name), 10)
+            status for status in msg.status if 'relocalizer' in status.name), 10)
     tester.wait(lambda: heard, 'diagnostics')
     tester.destroy_subscription(subscription)
     return {value.key: value.value for value in heard[-1].values}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Both nodes are managed: every transition over the real services, in any order."""
+"""Both nodes are managed: every transition via the real services, in any order."""
 
 import os
 import signal
@@ -33,7 +33,7 @@ class Manager:
         self._get = tester.create_client(GetState, f'/{name}/get_state')
         for client in (self._change, self._get):
             tester.wait(client.service_is_ready, client.srv_name)
-        # ready here is not yet ready there: the first answers may be lost
+        # ready here does not mean ready there, so the first answers may be lost
         asked = []
 
         def answered():
@@ -62,7 +62,7 @@ class Manager:
 
 @pytest.fixture
 def manage(start, tester):
-    """Start a node that waits for its manager; return both."""
+    """Start a node that waits for its manager; return node and manager."""
     managers = []
 
     def run(name, fresh=False, environment=(), **parameters):
@@ -109,7 +109,7 @@ def test_a_label_of_a_megabyte_is_refused_in_a_short_line(manage, room_map):
 
 
 def processor_share(process, tester, seconds=3.0):
-    """The share of a core that a process uses while a camera publishes at 30 Hz."""
+    """Return the share of a core that a process uses while a camera publishes at 30 Hz."""
     frame = make_frame()
     begun, used_s, sent = time.monotonic(), process.cpu_s(), 0
     while (elapsed_s := time.monotonic() - begun) < seconds:
@@ -133,7 +133,7 @@ def test_only_an_active_relocalizer_localizes(manage, tester, room_map):
     tester.answer(tester.ask_reinitialize())
     assert not tester.answer(tester.ask()).success
     share = processor_share(process, tester)
-    print(f'\ninactive beside a camera: {100 * share:.1f} % of a core')
+    print(f'\ninactive with a camera running: {100 * share:.1f} % of a core')
     assert share < 0.05
 
 
@@ -142,7 +142,7 @@ def test_deactivation_answers_the_request_that_waits(manage, tester, room_map):
     tester.connect()
     manager.do('configure', 'activate')
     future = tester.ask()
-    tester.wait(lambda: tester.listened_to() == 3, 'the relocalizer to listen')
+    tester.wait(lambda: tester.listened_to() == 3, 'the relocalizer to subscribe')
     manager.do('deactivate')
     answer = tester.answer(future)
     assert not answer.success
@@ -151,7 +151,7 @@ def test_deactivation_answers_the_request_that_waits(manage, tester, room_map):
 
 
 def test_the_manager_hears_by_a_bond_whether_a_node_lives(manage, tester, room_map):
-    """On the topic and with the name that Nav2's manager listens for, by a stand-in for bondpy."""
+    """The bond uses the topic and name that Nav2's manager expects; bondpy is a stand-in."""
     heard = []
     tester.create_subscription(KeyValue, '/bond', heard.append, 10)
     path = f'{PROJECT / "test/nodes/stand_ins"}:{os.environ.get("PYTHONPATH", "")}'
@@ -178,7 +178,7 @@ def test_the_manager_hears_by_a_bond_whether_a_node_lives(manage, tester, room_m
 def test_a_detector_looks_for_what_its_map_names_when_it_is_configured(manage, tester, tmp_path):
     from open_weights import write_open_yolo, write_tower  # needs PyTorch
 
-    """A YOLO-World with random weights: which classes it reports, not where they are."""
+    """Test the reported classes of a YOLO-World with random weights, not their positions."""
     parameters = {'model': write_open_yolo(tmp_path / 'world.pt', 'yolov8n-worldv2.yaml'),
                   'vocabulary': 'map', 'map_file': tmp_path / 'map.yaml', 'conf': 0.0,
                   'imgsz': 320, 'cache_dir': tmp_path / 'cache', 'inference': 'pytorch',

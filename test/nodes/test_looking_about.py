@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot that looks about until it knows where it is: frames joined by odometry on the wire."""
+"""A robot that looks around until it is localized: frames joined by real odometry messages."""
 
 
 import numpy as np
@@ -26,20 +26,20 @@ MAP_FROM_BASE = MAP_FROM_CAMERA @ invert_transform(BASE_FROM_CAMERA)
 ODOM_FROM_MAP = make_transform(Rotation.from_euler('z', 70, degrees=True).as_matrix(),
                                np.array([3.0, -4.0, 1.0]))
 START_S = 100.0
-# Boxes per view, those nearest to its middle: one less than min_inliers.
+# Boxes per view, nearest to its middle: one fewer than min_inliers.
 BOXES = 3
 PARAMETERS = {'base_frame': 'base_link', 'base_from_camera': MOUNT, 'algorithm': 'auto',
               'min_inliers': BOXES + 1, 'timeout_s': 20.0, 'max_turn_rad_s': 1.0}
 
 
 def turned(yaw_deg):
-    """Where the robot's base is when it has turned on the spot."""
+    """Return the pose of the robot's base after a turn on the spot."""
     turn = Rotation.from_euler('z', yaw_deg, degrees=True).as_matrix()
     return MAP_FROM_BASE @ make_transform(turn, np.zeros(3))
 
 
 def look(yaw_deg, stamp_s):
-    """The messages of a frame of a robot that turned."""
+    """Return the messages of a frame of a robot that has turned."""
     map_from_camera = turned(yaw_deg) @ BASE_FROM_CAMERA
     ahead = (ROOM.centers - map_from_camera[:3, 3]) @ map_from_camera[:3, 2]
     in_front = np.nonzero(ahead > 1.0)[0]
@@ -52,12 +52,12 @@ def look(yaw_deg, stamp_s):
 
 
 def swept(now_s, turn_deg_s):
-    """The yaw of a robot that looks to and fro over 48 degrees."""
+    """Return the yaw of a robot that looks to and fro over 48 degrees."""
     return abs((turn_deg_s * (now_s - START_S) + 48.0) % 96.0 - 48.0) - 24.0
 
 
 class Robot:
-    """Says all the while where it is, and turns on the spot while it is asked."""
+    """Publishes its odometry continuously, and turns on the spot during requests."""
 
     def __init__(self, tester):
         self._tester = tester
@@ -84,7 +84,7 @@ class Robot:
             self._tester.spin()
 
     def ask(self, turn_deg_s, change=lambda odometry, now_s: None):
-        """Ask, and turn until there is an answer; return it."""
+        """Request a pose, and turn until the answer arrives; return it."""
         future = self._tester.ask()
         wait_for(future.done, 'an answer', work=lambda: self.step(turn_deg_s, change))
         return future.result()
@@ -99,7 +99,7 @@ def robot(tester):
 
 @pytest.fixture(scope='module')
 def looking(start_shared, tester, room_map):
-    """A relocalizer of the robot's camera, ready to be asked."""
+    """Return a relocalizer for the robot's camera, ready for requests."""
     process = start_shared('nodes.relocalizer', parameters={
         'map_file': room_map, 'matching': 'class', **PARAMETERS})
     process.wait_for_output('ready after')
@@ -109,7 +109,7 @@ def looking(start_shared, tester, room_map):
 
 
 def error_of(pose, turn_deg_s):
-    """The error of a pose published: of x, y, z [m] and about the map's axes [rad]."""
+    """Return the error of a published pose: x, y, z [m] and about the map's axes [rad]."""
     stamp_s = pose.header.stamp.sec + 1e-9 * pose.header.stamp.nanosec
     found, truth = transform_of(pose.pose.pose), turned(swept(stamp_s, turn_deg_s))
     return np.r_[truth[:3, 3] - found[:3, 3],

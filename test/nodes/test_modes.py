@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The relocalizer as a process: its inputs, modes and frames, floods, and its end."""
+"""The relocalizer as a process: inputs, modes, frames, floods and shutdown."""
 
 import math
 import os
@@ -37,7 +37,7 @@ def test_compressed_images(own_relocalizer, tester):
 
 
 def test_any_detector_will_do(own_relocalizer, tester):
-    """Another publisher, with names of its own for the classes, and turned boxes."""
+    """Another publisher has different class names and rotated boxes."""
     names = {'a': 'class/0', 'b': 'Beta', 'c': 'gamma ray'}
     image, info, detections = make_frame()
     for detection in detections.detections:
@@ -61,7 +61,7 @@ def test_continuous_mode_publishes_without_being_asked(own_relocalizer, tester):
         tester.feed_until(
             lambda s=stamp_s: tester.poses and tester.poses[-1].header.stamp.sec == s,
             make_frame(stamp_s=float(stamp_s)), 'a pose')
-    assert not tester.initial_poses  # a running localizer is never reset unasked
+    assert not tester.initial_poses  # a running localizer is never reset without a request
     assert tester.relocalize(make_frame(stamp_s=3.0)).success
     tester.wait(lambda: tester.initial_poses, 'an initial pose')
     assert process.stop()[0] == 0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A camera that moves on its robot: tf2 is asked at the image's stamp, and waited for."""
+"""A camera that moves on its robot: tf2 is queried, and waited for, at the image's stamp."""
 
 import time
 
@@ -17,13 +17,13 @@ pytestmark = pytest.mark.needs('tf2_ros')
 
 
 def base_from_camera(height_m):
-    """A camera on a lift, looking aside."""
+    """Return the mount of a camera on a lift that looks to the side."""
     return transform_from_pose(np.array([0.1, 0.2, height_m]), np.array([0.0, 0.6, 0.0, 0.8]))
 
 
 @pytest.fixture
 def lift(tester):
-    """Tell tf2 how high the camera was: heights [m] by time [s]."""
+    """Publish the camera's heights [m] by time [s] to tf2."""
     from tf2_msgs.msg import TFMessage
     publisher = tester.create_publisher(TFMessage, '/tf', 100)
 
@@ -92,7 +92,7 @@ def test_map_to_odom_is_broadcast_where_it_is_asked_for(own_relocalizer, tester)
     tester.feed_until(answered, frame)
     assert future.result().success, future.result().message
     tester.wait(lambda: len(heard) > 2, 'map -> odom')
-    assert {one.child_frame_id for one in heard} == {'odom'}
+    assert {message.child_frame_id for message in heard} == {'odom'}
     t, q = heard[-1].transform.translation, heard[-1].transform.rotation
     map_from_odom = transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
     tester.wait(lambda: tester.poses, 'the pose')

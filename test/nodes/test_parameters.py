@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters over the wire: a dump starts the same node, which reads its map again."""
+"""Parameter services: a dump starts an equal node, and the map is read again."""
 
 
 import yaml

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What `prepare` makes is all that nodes need on a machine without a network and PyTorch."""
+"""The output of `prepare` is sufficient for nodes on a machine without network and PyTorch."""
 
 import os
 import shutil
@@ -17,10 +17,10 @@ from demo import ASSETS
 
 pytestmark = pytest.mark.full
 
-# A network of its own: the loopback interface and no route.
+# A separate network: the loopback interface and no route.
 OFFLINE = ('unshare', '--map-root-user', '--net', 'sh', '-c', 'ip link set lo up && exec "$@"',
            'sh')
-# Mounts a folder on itself, read-only, as a robot of a fleet mounts the cache of all.
+# Mounts a folder on itself read-only, as a fleet's robot mounts a shared cache.
 READ_ONLY = ('unshare', '--mount', 'sh', '-c',
              'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"')
 WEIGHTS = ('yolo.onnx', 'clip')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a relocalizer knows before an image: the topic ~/prior, and its last pose."""
+"""Priors of a relocalizer: the topic ~/prior, and its last pose."""
 
 
 import json
@@ -14,13 +14,13 @@ from tester import RELIABLE, ask_until, make_frame
 from cliploc_ros.ros.qos import LATCHED
 
 TWINS = doubled_room(np.array([10.0, 0.0, 0.0])).select(range(21))
-# on a busy machine, too
+# enough on a busy machine as well
 SEARCH = {'algorithm': 'auto', 'time_budget_ms': 2000.0}
 
 
 @pytest.fixture
 def twins_map(tmp_path):
-    """Two rooms, 10 m apart along x; the second one lacks three objects of the first."""
+    """Return two rooms, 10 m apart along x; the second lacks three objects of the first."""
     path = tmp_path / 'twins.yaml'
     write_map(TWINS, path)
     return path
@@ -36,21 +36,21 @@ def at(x_m, frame_id='map', deviation=0.5, yaw_variance=10.0):
 
 @pytest.fixture
 def tell(tester):
-    """Publish on a topic of the relocalizer until it hears, and what it logs, if it does."""
+    """Publish on a topic of the relocalizer until it is received and, if given, logged."""
     made = []
 
     def publish(process, msg, expect='', profile=LATCHED, topic='relocalizer/prior'):
         publisher = tester.create_publisher(type(msg), topic, profile)
         made.append(publisher)
-        # volatile and transient local subscriptions hear ~/prior
+        # ~/prior reaches volatile and transient local subscriptions
         matched = 2 if topic.endswith('prior') and profile is LATCHED else 1
         tester.wait(lambda: publisher.get_subscription_count() >= matched, 'the subscription')
         publisher.publish(msg)
         if expect:
             process.wait_for_output(expect)
     yield publish
-    for one in made:
-        tester.destroy_publisher(one)
+    for each in made:
+        tester.destroy_publisher(each)
 
 
 def test_the_topic_decides_between_rooms_that_look_alike(own_relocalizer, tester, tell,
@@ -83,13 +83,13 @@ def test_a_robot_wakes_where_it_was(own_relocalizer, tester, tell, twins_map, tm
     known = {'map_file': twins_map, 'last_pose_file': file, **SEARCH}
     first = own_relocalizer(**known)
     assert 'refused' in tester.relocalize(make_frame()).message
-    tell(first, at(0.0), profile=RELIABLE)  # which the next process does not hear
+    tell(first, at(0.0), profile=RELIABLE)  # the next process does not receive it
     ask_until(tester.relocalize, 'accepted', make_frame())
     tester.wait(file.exists, 'the file')
     kept = json.loads(file.read_text())
     assert kept['frame_id'] == 'map' and len(kept['map_hash']) == 12
     assert kept['map_from_robot'][0][3] == pytest.approx(0.3, abs=0.05)
-    # where the localizer has it now
+    # the localizer's present pose
     shown = at(12.0, deviation=0.1)
     tester.wait(lambda: tell(first, shown, topic='amcl_pose') or json.loads(file.read_text())[
         'map_from_robot'][0][3] == 12.0, 'the pose of the localizer')

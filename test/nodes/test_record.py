@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A request that went wrong in the field becomes a test case; counters and the map's hash."""
+"""A failed request in the field becomes a test case; counters and the map's hash."""
 
 import hashlib
 
@@ -13,7 +13,7 @@ from cliploc_ros.messages import image_from_msg
 
 
 def four_of(rows=(0, 3, 6, 9)):
-    """A frame with four objects of one class, in wrong places: nothing fits."""
+    """Return a frame with four objects of one class in wrong places, which fits no pose."""
     seen = see_room(make_room()).select(np.array(rows))
     boxes = seen.bboxes_xyxy[::-1] + np.array([0.0, 40.0, 0.0, 40.0])
     return make_frame(type(seen)(boxes, seen.class_ids, seen.scores))

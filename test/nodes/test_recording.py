@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The 17 real TUM frames as a recording, through real nodes, one wake-up request a frame."""
+"""The 17 real TUM frames as a recording, with real nodes, and a request for each frame."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ FRAMES = 17
 def wake_up_on_frames(tester):
     """Request until each frame of a looping recording is answered; return all answers in turn.
 
-    Which frame an answer is about stands in the stamp of the hypotheses published with it.
+    The stamp of the hypotheses published with an answer identifies its frame.
     """
     answers = []
     tester.hypotheses.clear()
@@ -43,9 +43,9 @@ def wake_up_on_frames(tester):
 
 
 def core_answers(office, detections):
-    """What the core says of detections in turn, without any ROS.
+    """Return the core's answers to successive detections, without ROS.
 
-    A frame that is requested twice is localized twice, since each answer adds evidence about the
+    A frame that is requested twice is localized twice, since each answer adds evidence on the
     camera.
     """
     localizer = Localizer(Relocalizer(LandmarkMap.from_file(office / 'map.yaml'),
@@ -56,18 +56,18 @@ def core_answers(office, detections):
 
 def test_recorded_detections(shared_data, start, tester, tmp_path):
     office = shared_data / 'tum_fr3_office'
-    assert tum_to_bag([str(one) for one in (
+    assert tum_to_bag([str(argument) for argument in (
         office, tmp_path / 'bag', '--intrinsics', 'fr3', '--detections',
         office / 'detections.json')]) == 0
     start('nodes.relocalizer', parameters={
         'map_file': office / 'map.yaml', 'matching': 'class',
-        'time_budget_ms': 10_000.0,  # a busy machine's clock must not cut a search short
+        'time_budget_ms': 10_000.0,  # a busy machine must not cut a search short
     }).wait_for_output('ready after')
     tester.connect()
     start('cli.replay', tmp_path / 'bag', '--loop', '--rate', '3')
     with tester.hearing_detections() as heard:
         answers = wake_up_on_frames(tester)
-        # a busy machine may drop a message on its way here; the recording comes round again
+        # a busy machine may drop a message in transit; the recording repeats it
         tester.wait(lambda: {stamp for stamp, *_ in answers} <= set(heard),
                     'the detections of every answer')
     errors_m, wrong, sequence = {}, 0, read_tum(office)
@@ -75,7 +75,7 @@ def test_recorded_detections(shared_data, start, tester, tmp_path):
     for (stamp, answer, hypotheses), expected in zip(answers, expected_answers, strict=True):
         assert answer.success == expected.accepted
         poses = [transform_of(pose) for pose in hypotheses.poses]
-        np.testing.assert_allclose(poses, [one.map_from_camera for one in expected.hypotheses],
+        np.testing.assert_allclose(poses, [best.map_from_camera for best in expected.hypotheses],
                                    atol=1e-9)
         truth = sequence.pose_at(stamp)
         if truth is not None:

@@ -34,7 +34,7 @@ def test_a_request_is_answered_with_a_pose(relocalizer, tester):
 
 
 def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
-    """The client of the documents; ~/answer tells the same to those who come later."""
+    """The documented client; ~/answer gives the same answer to late subscribers."""
     page = (PROJECT / 'doc/interface.md').read_text()
     client = subprocess.Popen(
         [sys.executable, '-c', re.search('```python\n(import rclpy.*?)```', page, re.DOTALL)[1]],
@@ -53,7 +53,7 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     pose = tester.poses[-1].pose
     assert [float(x), float(y), float(fields['z [m]'])] == [
         pose.pose.position.x, pose.pose.position.y, pose.pose.position.z]
-    assert fields['covariance'].split() == [repr(float(one)) for one in pose.covariance]
+    assert fields['covariance'].split() == [repr(float(value)) for value in pose.covariance]
     assert (fields['source'], fields['frames'], fields['landmarks']) == ('objects', '1', '12')
     assert 1.0 >= float(fields['confidence']) >= float(fields['confidence needed']) > 0.5
     assert 0.0 < float(fields['position deviation [m]']) < 0.2
@@ -72,7 +72,7 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     assert (refused.passed, fields['verdict'], fields['kind']) == (
         b'\x00', 'refused', 'too_few_objects')
     assert 'x [m]' not in fields
-    tester.wait(lambda: heard[-1].status == refused.status, 'the same on the topic')
+    tester.wait(lambda: heard[-1].status == refused.status, 'the same answer on the topic')
     assert int(refused.id) == int(fields['answer']) > 1
     tester.destroy_subscription(subscription)
 
@@ -97,9 +97,9 @@ def test_frames_out_of_order_and_time_going_back(relocalizer, tester):
 
 def test_requests_that_wait_together_reset_the_localizer_once(relocalizer, tester):
     futures = [tester.ask() for _ in range(10)]
-    tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to listen')
+    tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to subscribe')
     tester.feed_until(lambda: all(future.done() for future in futures), make_frame())
     assert all(future.result().success for future in futures)
     tester.wait(lambda: tester.initial_poses, 'an initial pose')
-    # those that came after the frame was taken ask for a newer one, together
+    # requests after the frame was taken share a newer frame
     assert len(tester.initial_poses) <= 3

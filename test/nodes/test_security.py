@@ -11,13 +11,13 @@ from tester import make_frame
 pytestmark = pytest.mark.full
 
 POLICY = PROJECT / 'config/security_policy.xml'
-# What tf2_ros and nav2_msgs bring, which are not installed everywhere the tests run.
+# Topics and services of tf2_ros and nav2_msgs, which are not installed on all test machines.
 FOREIGN = {'/tf', '/tf_static', '/relocalizer/load_map'}
 GRAPH = {('topics', 'publish'): 'get_publisher_names_and_types_by_node',
          ('topics', 'subscribe'): 'get_subscriber_names_and_types_by_node',
          ('services', 'reply'): 'get_service_names_and_types_by_node',
          ('services', 'request'): 'get_client_names_and_types_by_node'}
-# What SROS 2 makes of the permission to call an action.
+# Topics and services that SROS 2's permission to call an action implies.
 CALL = {('topics', 'subscribe'): ('feedback', 'status'),
         ('services', 'request'): ('send_goal', 'cancel_goal', 'get_result')}
 
@@ -31,13 +31,13 @@ def allowed(node, kind, act):
 
 
 def used(tester, node, kind, act):
-    if node not in tester.get_node_names():  # which are told later than what they have
+    if node not in tester.get_node_names():  # these are reported later
         return set()
     return {name for name, _ in getattr(tester, GRAPH[kind, act])(node, '/')}
 
 
 def check(tester, node, *absent):
-    """Wait until a node does all that its policy allows but what is absent; it never does more."""
+    """Wait until a node uses all that its policy allows, except absent parts, and nothing else."""
     for kind, act in GRAPH:
         expected = allowed(node, kind, act) - FOREIGN - set(absent)
         tester.wait(lambda k=kind, a=act, e=expected: used(tester, node, k, a) - FOREIGN == e,
@@ -48,10 +48,10 @@ def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
     process = own_relocalizer(mode='continuous', gravity='imu', depth_transport='raw',
                               watch='amcl_pose')
     tester.feed_until(lambda: tester.poses, make_frame(), 'a pose')
-    tester.ask()  # odometry is listened to during a request
+    tester.ask()  # the node subscribes to odometry during a request
     check(tester, 'relocalizer', '/image/compressed', '/depth/compressedDepth', '/clock')
     process.stop()
-    tester.wait(lambda: 'relocalizer' not in tester.get_node_names(), 'the first one to be gone')
+    tester.wait(lambda: 'relocalizer' not in tester.get_node_names(), 'the end of the first node')
     own_relocalizer(image_transport='compressed', use_sim_time='true',
                     depth_transport='compressed')
     tester.ask()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the relocalizer shows, to those who look."""
+"""Visualization topics of the relocalizer, for subscribers."""
 
 from contextlib import contextmanager
 
@@ -19,7 +19,7 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
 
 @contextmanager
 def looking(tester, message_type, name, profile=10):
-    """Keep what comes on a topic of the relocalizer; the publisher knows that somebody looks."""
+    """Collect messages on a topic of the relocalizer, once the publisher knows the subscriber."""
     topic, heard = f'relocalizer/{name}', []
     subscription = tester.create_subscription(message_type, topic, heard.append, profile)
     try:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A relocalizer that searches two floors, and changes of its maps while it runs."""
+"""A relocalizer that searches two floors, and whose maps change at run time."""
 
 import importlib
 import os
@@ -21,7 +21,7 @@ def other_room():
 
 @pytest.fixture
 def floors(tmp_path):
-    """Write maps; return their files as a parameter of the command line has them."""
+    """Write maps; return their files as a command-line parameter."""
     def write(*maps):
         files = [tmp_path / f'{number}.yaml' for number in range(len(maps))]
         for number, (one, file) in enumerate(zip(maps, files, strict=True)):
@@ -50,13 +50,13 @@ def test_each_floor_answers_in_its_own_coordinate_frame(own_relocalizer, tester,
 
 
 def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
-    """A bad list changes nothing; one map is rolled out, and back."""
+    """A bad list changes nothing; one map is replaced, and restored."""
     first, second = floors(ROOM, other_room())
     own_relocalizer(map_file=first)
     frame = make_frame(see_room(other_room()))
 
     def reloaded(**parameters):
-        """Set parameters; return whether the maps could be read again."""
+        """Set parameters; return whether the maps could be reloaded."""
         assert all(tester.set_parameter(*parameter).successful for parameter in parameters.items())
         return tester.trigger('reload_map').success
     assert not tester.relocalize(frame).success
@@ -92,7 +92,7 @@ def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors, 
 @pytest.mark.full
 @pytest.mark.needs('nav2_msgs')
 def test_no_url_keeps_the_relocalizer_from_answering(own_relocalizer, tester, floors, tmp_path):
-    """Pipes, devices, files with holes, floods, names that no file has: each 50 times."""
+    """Pipes, devices, sparse files, floods, and impossible names, 50 times each."""
     srv = importlib.import_module('nav2_msgs.srv')
     first, _ = floors(ROOM, other_room())
     process = own_relocalizer(map_file=first)

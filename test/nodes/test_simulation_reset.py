@@ -12,7 +12,7 @@ from cliploc_ros.core.geometry.transforms import pose_error
 
 
 class World:
-    """A simulation with a robot, whose odometry begins at another place in each run."""
+    """A simulation with a robot, whose odometry begins at a different place in each run."""
 
     def __init__(self, tester, now_s):
         self._tester, self.now_s = tester, now_s
@@ -30,13 +30,13 @@ class World:
         self.now_s = round(now_s + TICK_S, 6)
 
     def reset(self, now_s):
-        """Begin another run at a time."""
+        """Start another run at a time."""
         self.now_s = now_s
         self.robot.carry(0.4)
         self._clock.publish(Clock(clock=stamp(now_s)))
 
     def check(self):
-        """Request a pose; check that it is the robot's in the present run."""
+        """Request a pose; check that it is the robot's pose in the current run."""
         future, self.robot.speed_m_s = self._tester.ask(), 0.0
         wait_for(future.done, 'an answer', work=self.robot.step)
         assert future.result().success, future.result().message

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Camera and relocalizer on two machines, joined by a slow link that loses packets: simulated."""
+"""Camera and relocalizer on two machines with a simulated slow link that loses packets."""
 
 import json
 import os
@@ -45,7 +45,7 @@ def test_every_request_over_a_slow_link_is_answered_once(room_map):
     assert lost > 0
     assert [answer['answers'] for answer in answers] == [1] * REQUESTS
     for answer, x in zip(answers, 0.3 + 0.05 * np.arange(REQUESTS), strict=True):
-        # a request that no image reached fails; none gives a wrong pose
+        # a request without an image fails; no answer has a wrong pose
         assert answer['message'].startswith((f'accepted: x {x:.2f} y -0.20 z -0.50 m in map, ',
                                              'no new frame'))
         assert answer['seconds'] < 21.0

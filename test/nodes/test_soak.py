@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Two requests at once, again and again, about a looping recording: each answer is right."""
+"""Two concurrent requests on a looping recording, repeatedly: each answer is correct."""
 
 import os
 from statistics import median_low
@@ -18,18 +18,18 @@ from cliploc_ros.ros.conversions import stamp_ns
 
 pytestmark = pytest.mark.full
 
-#: So many by default; CLIPLOC_SOAK_REQUESTS=10000 asks for more, in ten minutes.
+#: Default number of requests; CLIPLOC_SOAK_REQUESTS=10000 takes ten minutes.
 REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '200'))
-#: Over the second half. A short run is still warming up there: pools of the middleware grow with
+#: Growth in the second half. A short run is still warming up: pools of the middleware grow with
 #: the first thousand subscriptions.
 GROWTH = 0.01 if REQUESTS >= 10_000 else 0.03
-#: Those of the middleware and of Python, and 24 for callbacks that may wait: that pool only grows.
+#: Threads of the middleware and of Python, and 24 for waiting callbacks, whose pool never shrinks.
 MAX_THREADS = 45
 FRAMES, PERIOD_NS = 60, 25_000_000
 
 
 def move_camera(number):
-    """Return the true pose (4, 4) of a frame: each stands elsewhere."""
+    """Return the true pose (4, 4) of a frame, different for each."""
     moved = MAP_FROM_CAMERA.copy()
     moved[0, 3] += 0.01 * (number - FRAMES / 2)
     return moved
@@ -37,7 +37,7 @@ def move_camera(number):
 
 @pytest.fixture(scope='module')
 def recording(tmp_path_factory):
-    """A round of frames at 40 Hz; one in four shows too few objects to answer from."""
+    """A loop of frames at 40 Hz; one in four shows too few objects for a pose."""
     path, room = tmp_path_factory.mktemp('soak') / 'round', make_room()
     jpeg = cv2.imencode('.jpg', np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))[1].tobytes()
     with BagWriter(path) as bag:

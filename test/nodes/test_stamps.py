@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps by which detections cannot be assigned to an image: refused with the cause."""
+"""Stamps that do not assign detections to an image are refused, with the cause."""
 
 import numpy as np
 import pytest
@@ -17,9 +17,9 @@ RATE_HZ = 10
 
 
 class Camera:
-    """A camera of a robot that drives to and fro, and a detector that is some images late.
+    """A camera of a robot that drives to and fro, and a detector with a delay of some images.
 
-    `image_stamp` and `boxes_stamp` make a stamp of the number of an image.
+    `image_stamp` and `boxes_stamp` return the stamp for the number of an image.
     """
 
     def __init__(self, publish, image_stamp, boxes_stamp=None, info_stamp=None, late=2):
@@ -29,7 +29,7 @@ class Camera:
 
     @staticmethod
     def place(number):
-        """Return the pose of the camera (4, 4) at an image: half a metre at 1 m/s, and back."""
+        """Return the camera's pose (4, 4) at an image: half a metre at 1 m/s, and back."""
         move_m = 0.5 - abs(number / RATE_HZ % 2.0 - 1.0)
         return MAP_FROM_CAMERA @ make_transform(np.eye(3), np.array([move_m, 0.0, 0.0]))
 
@@ -46,7 +46,7 @@ class Camera:
 
 
 def right(number):
-    """Count the images from 1000 s on."""
+    """Return stamps that count the images from 1000 s on."""
     ns = 10**12 + 1234567 + number * 10**9 // RATE_HZ
     return Time(sec=ns // 10**9, nanosec=ns % 10**9)
 
@@ -65,7 +65,7 @@ UNUSABLE = {
 
 @pytest.fixture
 def ask(tester):
-    """Ask while a camera goes on; return the answer."""
+    """Request a pose while a camera runs; return the answer."""
     def asking(camera, timeout_s=10.0):
         assert tester.set_parameter('timeout_s', timeout_s).successful
         future = tester.ask()
@@ -102,11 +102,11 @@ def test_stamps_that_name_no_image_pair_nothing(relocalizer, tester, ask, health
     health.clear()
     camera = Camera(lambda message: tester.publish([message]), right)
     assert ask(camera).success
-    tester.wait(lambda: (DiagnosticStatus.OK, 'active') in health, 'no problem any more')
+    tester.wait(lambda: (DiagnosticStatus.OK, 'active') in health, 'the end of the problem')
 
 
 def test_late_detections_with_the_stamp_of_their_image_are_right(relocalizer, tester, ask):
-    """Calibration without a stamp is that of all images."""
+    """A calibration without stamp is used for all images."""
     for info_stamp in (right, zero):
         tester.forget()
         answer = ask(Camera(lambda message: tester.publish([message]), right,

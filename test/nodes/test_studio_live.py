@@ -23,7 +23,7 @@ def live(ros):
 
 @contextmanager
 def in_a_thread(action):
-    """Do something in a thread; yield the list that its result or its error comes into."""
+    """Run a function in a thread; yield the list that receives its result or error."""
     outcome = []
 
     def run():

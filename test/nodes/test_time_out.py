@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A request that CLIP cannot finish in time: ViT-B-32 of random weights and 400 crops.
+"""A request that CLIP cannot complete in time: ViT-B-32 with random weights and 400 crops.
 
-The similarities mean nothing, and no pose is certain enough for a confidence of 1.
+The similarities mean nothing, and no pose reaches a confidence of 1.
 """
 
 import re
@@ -19,9 +19,9 @@ from cliploc_ros.core.observation import Detections
 
 pytestmark = pytest.mark.full
 
-# ViT-B-32 takes 20 s and more for so many crops.
+# ViT-B-32 takes at least 20 s for these crops.
 BOXES, TIMEOUT_S = 400, 6.0
-# For the answer's way back on a busy machine.
+# Time for the answer to arrive on a busy machine.
 LATE_S = 0.5
 
 
@@ -35,7 +35,7 @@ def weights(tmp_path_factory):
 
 @pytest.fixture
 def slow(own_relocalizer, tester, weights, tmp_path):
-    """A relocalizer that no pose satisfies and that 400 crops take too long for."""
+    """Return a relocalizer that accepts no pose, and for which 400 crops take too long."""
     return own_relocalizer(
         matching='hybrid', algorithm='auto', min_confidence=1.0, clip_model='ViT-B-32',
         clip_pretrained=weights, cache_dir=tmp_path, timeout_s=TIMEOUT_S,
@@ -43,7 +43,7 @@ def slow(own_relocalizer, tester, weights, tmp_path):
 
 
 def crowded_frame(number):
-    """Boxes of the room's classes, side by side, of one picture."""
+    """Return boxes of the room's classes, side by side in one image."""
     left, top = map(np.ravel, np.meshgrid(np.arange(20) * 32.0, np.arange(20) * 24.0))
     boxes = np.stack([left, top, left + 30.0, top + 22.0], axis=1)
     assert len(boxes) == BOXES and boxes.max() <= CAMERA.width
@@ -62,8 +62,9 @@ def test_the_answer_is_in_time_and_names_what_used_it_up(slow, tester):
         assert re.search(r'time is up: CLIP took [\d.]+ of [\d.]+ s; choose a faster profile or a '
                          r'smaller CLIP, or raise timeout_s', answer.message)
         assert took_s < TIMEOUT_S + LATE_S
-        # without, where a batch took longer than the one before, and beyond the time-out
+        # similarities are missing if a batch took longer than the previous one, beyond the time-
+        # out
         counts += map(int, re.findall(rf'CLIP of (\d+) of {BOXES} crops', answer.message))
     assert all(0 < count < BOXES for count in counts)
-    # what the first request has encoded, the second one does not encode again
+    # crops encoded for the first request are not encoded again for the second
     assert len(counts) < 2 or counts[1] > counts[0]

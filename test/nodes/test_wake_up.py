@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable wake_up with a real relocalizer and, where nav2_msgs is there, a real `spin`."""
+"""The executable wake_up with a real relocalizer and, if nav2_msgs is installed, real `spin`."""
 
 import math
 import re
@@ -20,13 +20,13 @@ LOOK = (r'^look (\d+) \[[0-9.]+ s\](, (?:not )?turned by .*?)?: '
 
 
 def looks(process):
-    """What was printed for each look: its number, what was turned before, and the answer."""
+    """Parse the output of each look: its number, the turn before it, and the answer."""
     return [(int(number), turned, answer) for number, turned, answer in re.findall(
         LOOK, process.output(), re.MULTILINE)]
 
 
 def poor_frame():
-    """A frame with two objects: too few for a pose."""
+    """Return a frame with two objects: too few for a pose."""
     return make_frame(see_room(make_room()).select(np.array([0, 1])))
 
 
@@ -45,7 +45,7 @@ def end(tester):
 
 @pytest.fixture
 def wake_up_until(start, end):
-    """Wake up with more and more time, as a busy machine needs it, until that shows a text."""
+    """Wake up with increasing time limits, as a busy machine needs, until a text is printed."""
     def run(text, *arguments, frame=lambda: ()):
         for timeout_s in (3, 12, 48):
             process = start('cli.wake_up', *arguments, '--timeout', timeout_s)
@@ -57,7 +57,7 @@ def wake_up_until(start, end):
 
 
 class Spinner:
-    """A server of Nav2's spin for a robot that sees nothing before it has turned enough.
+    """A server of Nav2's spin; its robot sees no objects before it has turned far enough.
 
     Each goal takes the next of the outcomes: 'turn', 'collide', 'refuse' or 'hang' until it is
     cancelled; the last one repeats.
@@ -131,10 +131,10 @@ def test_refusals_end_when_time_is_up(relocalizer, wake_up_until, tester):
 def test_the_robot_turns_until_it_sees_enough(relocalizer, start, end, serve_spin):
     spinner = serve_spin('turn', 'collide', 'turn')
     process = start('cli.wake_up', '--turn-deg', 30)
-    # after a collision it turns to the other side: past where it began
+    # after a collision it turns the other way, past its start
     assert end(process, lambda: make_frame() if spinner.yaw < -0.4 else poor_frame()) == ACCEPTED
     steps = [math.degrees(goal.target_yaw) for goal in spinner.goals]
-    # an image from before a turn may still be on its way: another turn
+    # an image from before a turn may still be in transit, which causes another turn
     assert steps[:4] == pytest.approx([30.0, 30.0, -30.0, -30.0])
     turns = [turned for _, turned, _ in looks(process) if turned]
     assert len(turns) == len(steps)
@@ -160,7 +160,7 @@ def test_an_interrupt_stops_the_robot(relocalizer, start, end, tester, serve_spi
     process.send(signal.SIGTERM)
     assert end(process) == INTERRUPTED
     assert spinner.cancelled.done()
-    tester.wait(lambda: tester.listened_to() == 0, 'the poor frames to be gone')
+    tester.wait(lambda: tester.listened_to() == 0, 'the end of the poor frames')
     assert tester.relocalize(make_frame()).success
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The watch of a localizer: right, kidnapped, silent and broken ones, with real nodes."""
+"""The watch of a localizer that is correct, kidnapped, silent or broken, with real nodes."""
 
 import signal
 from dataclasses import replace
@@ -21,11 +21,11 @@ PERIOD_S = 1.0
 
 
 class Watched:
-    """What is published of a watch, while its robot goes on."""
+    """The published output of a watch, while its robot drives."""
 
     def __init__(self, tester, robot, process):
         self.tester, self.robot, self.process = tester, robot, process
-        #: One of each look.
+        #: One report of each look.
         self.states, self.flags, self.values, self.message = [], [], {}, ''
         self._heard = [
             tester.create_subscription(String, 'relocalizer/localization_state',
@@ -49,29 +49,29 @@ class Watched:
             print(what, self.states[-8:], self.values.get('watch reason'))
 
     def until_state(self, state):
-        """Go on until a state is published; return after how many looks."""
+        """Drive until a state is published; return the number of looks."""
         before = len(self.states)
         self.until(lambda: state in self.states[before:], state)
         return 1 + self.states[before:].index(state)
 
     def kidnap(self):
-        """Carry the robot by 3 m, and go on until it is lost.
+        """Kidnap the robot by 3 m, and drive until it is lost.
 
-        In eight tries, with looks .3 m apart after eight that agreed, it took 4 to 11 looks. What
-        was said before is no look at the other place.
+        In eight tries, with looks .3 m apart after eight agreeing looks, it took 4 to 11 looks.
+        Earlier reports do not count as looks at the other place.
         """
         self.robot.carry(3.0)
         assert self.until_state('uncertain') <= 3
         assert self.until_state('lost') <= 12
 
     def looks(self, count):
-        """Go on for some looks; return their states."""
+        """Drive for some looks; return their states."""
         before = len(self.states)
         self.until(lambda: len(self.states) >= before + count, f'{count} looks')
         return self.states[before:]
 
     def until_reason(self, text):
-        """Go on until the diagnostics name a reason; the robot is never lost meanwhile."""
+        """Drive until the diagnostics state a reason; the robot is never lost meanwhile."""
         before = len(self.states)
         self.until(lambda: text in self.values.get('watch reason', ''), f'the reason {text!r}')
         assert 'lost' not in self.states[before:]
@@ -79,7 +79,7 @@ class Watched:
 
 @pytest.fixture
 def watch(own_relocalizer, tester):
-    """Start a relocalizer that watches, and a robot in its room."""
+    """Start a relocalizer with a watch, and a robot in its room."""
     made = []
 
     def run(**parameters):
@@ -90,11 +90,11 @@ def watch(own_relocalizer, tester):
         made.append(Watched(tester, Robot(tester), process))
         return made[-1]
     yield run
-    for one in made:
-        one.close()
-        one.robot.close()
-        print(one.process.output())
-        assert one.process.alive and 'Traceback' not in one.process.output()
+    for watched in made:
+        watched.close()
+        watched.robot.close()
+        print(watched.process.output())
+        assert watched.process.alive and 'Traceback' not in watched.process.output()
     tester.localizer.is_on = True
 
 
@@ -140,11 +140,11 @@ def test_a_lost_robot_is_relocalized_once_it_stands(watch):
 
 
 def test_a_localizer_that_started_again_without_a_pose_is_woken_up(watch, tester):
-    """As AMCL with use_respawn: it publishes and subscribes again, and waits for a pose."""
+    """As AMCL with use_respawn: it advertises and subscribes again, and waits for a pose."""
     watched = watch(on_lost='relocalize')
     watched.until_state('localized')
     watched.robot.speed_m_s, watched.robot.has_localizer = 0.0, False
-    watched.looks(1)  # a process takes its time to start: what the one before showed is heard
+    watched.looks(1)  # the start takes time; the previous pose is still received
     tester.localizer.start_again()
     watched.until(lambda: tester.poses, 'a request')
     watched.until_state('localized')
@@ -152,7 +152,7 @@ def test_a_localizer_that_started_again_without_a_pose_is_woken_up(watch, tester
 
 
 def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester, tmp_path):
-    """No image comes meanwhile: the verdict falls with its map, not with the next look."""
+    """No image arrives meanwhile: the verdict is dropped with its map, not at the next look."""
     watched = watch()
     watched.until_state('localized')
     write_map(replace(make_room(), frame_id='elsewhere'), tmp_path / 'elsewhere.yaml')
@@ -166,7 +166,7 @@ def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester
 
 @pytest.mark.full
 def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
-    """The robot drives on for a while, and nothing is done until it stands."""
+    """The robot continues to drive, and nothing is done until it stands."""
     watched = watch()
     watched.robot.speed_m_s = 0.0
     process = start('cli.wake_up', '--watch', '--turn-deg', 0)

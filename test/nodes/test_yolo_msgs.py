@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Detections of yolo_ros: yolo_msgs where it is installed, a clear message where it is not."""
+"""Detections of yolo_ros: yolo_msgs if it is installed, otherwise a clear message."""
 
 import os
 from types import SimpleNamespace as Fields
@@ -16,8 +16,8 @@ from cliploc_ros.ros.conversions import from_yolo_msg
 def as_yolo(msg, array=Fields, detection=Fields):
     """Return detections with the fields of a yolo_msgs/DetectionArray."""
     made = []
-    for one in msg.detections:
-        guess, box = one.results[0].hypothesis, one.bbox
+    for given in msg.detections:
+        guess, box = given.results[0].hypothesis, given.bbox
         made.append(detection(class_id=0, class_name=guess.class_id, score=guess.score, id=''))
         made[-1].bbox = made[-1].bbox if hasattr(made[-1], 'bbox') else Fields(
             center=Fields(position=Fields(), theta=0.0), size=Fields())

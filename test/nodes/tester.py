@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A node in the test that exchanges messages with the nodes, and frames of the simulated room."""
+"""The test's node that exchanges messages with the nodes, and frames of the simulated room."""
 
 import time
 from contextlib import contextmanager
@@ -29,7 +29,7 @@ RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class TakingLocalizer:
-    """Shows each initial pose as its own at once, while it is on."""
+    """Publishes each initial pose at once as its estimate, while it is switched on."""
 
     def __init__(self, node, namespace=''):
         self.is_on, self.frame = True, None
@@ -43,7 +43,7 @@ class TakingLocalizer:
             PoseWithCovarianceStamped, f'{self._namespace}initialpose', self._show, RELIABLE)
 
     def start_again(self):
-        """Know no pose any more, as a process that was killed and started again."""
+        """Forget the pose, like a process that was killed and restarted."""
         self._node.destroy_publisher(self._publisher)
         self._node.destroy_subscription(self._subscription)
         self._start()
@@ -55,7 +55,7 @@ class TakingLocalizer:
 
 
 class Tester(Node):
-    """Publishes frames, requests poses, and keeps what the relocalizer publishes."""
+    """Publishes frames, requests poses, and collects the relocalizer's messages."""
 
     def __init__(self):
         super().__init__('tester')
@@ -155,7 +155,7 @@ class Tester(Node):
              Detection2DArray: self.detections}[type(message)].publish(message)
 
     def feed_until(self, condition, frame, what='an answer'):
-        """Publish a frame repeatedly, like a camera, until a condition holds."""
+        """Publish a frame repeatedly, like a camera, until a condition is met."""
         def work():
             self.publish(frame)
             for _ in range(5):
@@ -163,7 +163,7 @@ class Tester(Node):
         wait_for(condition, what, work=work)
 
     def call_while(self, service_type, name, frame):
-        """Call a service without arguments, and publish a frame until the answer comes."""
+        """Call a service without arguments, and publish a frame until the answer arrives."""
         client = self.create_client(service_type, name)
         self.wait(client.service_is_ready, name)
         future = client.call_async(service_type.Request())
@@ -172,14 +172,14 @@ class Tester(Node):
         return future.result()
 
     def relocalize(self, frame):
-        """Send a request, publish a frame until the answer comes, and return the answer."""
+        """Send a request, publish a frame until the answer arrives, and return the answer."""
         future = self.ask()
         self.feed_until(future.done, frame)
         return future.result()
 
 
 def ask_until(ask, text, *given):
-    """Ask until an answer says something: on a busy machine a message is late at times."""
+    """Request until the answer has a text: on a busy machine messages are sometimes late."""
     for _ in range(30):
         answer = ask(*given)
         if text in answer.message:
@@ -193,7 +193,7 @@ def transform_of(pose):
 
 
 def make_frame(detections=None, stamp_s=100.0):
-    """The messages of one frame of the simulated room, all of one stamp."""
+    """Return the messages of one frame of the simulated room, with the same stamp."""
     seconds = int(stamp_s)
     header = Header(frame_id='camera_optical_frame',
                     stamp=Time(sec=seconds, nanosec=round((stamp_s - seconds) * 1e9)))
@@ -208,5 +208,5 @@ def make_frame(detections=None, stamp_s=100.0):
 
 
 def class_matching(room_map, **parameters):
-    """Parameters of a relocalizer that needs no network."""
+    """Return parameters of a relocalizer that needs no network."""
     return {'map_file': room_map, 'matching': 'class', 'algorithm': 'bf', **parameters}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot that drives to and fro in the simulated room, with a localizer like AMCL."""
+"""A robot that drives to and fro in the simulated room, with an AMCL-like localizer."""
 
 import time
 
@@ -24,7 +24,7 @@ NOISE = np.random.default_rng(0).integers(0, 256, 3 * CAMERA.width * CAMERA.heig
 MOUNT = [0.0, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5]
 BASE_FROM_CAMERA = transform_from_pose(np.array(MOUNT[:3]), np.array(MOUNT[3:]))
 TICK_S, POSE_EVERY = 0.05, 5
-# It turns round after this way.
+# It turns around after this distance.
 REACH_M = 0.5
 
 
@@ -38,17 +38,17 @@ def stamp(seconds):
 
 
 class Robot:
-    """Publishes what a robot does: step after step, in real time."""
+    """Publishes a robot's topics, step by step, in real time."""
 
     def __init__(self, tester):
         self._tester, self._tick, self.image_every = tester, 0, 2
         self._odom = tester.create_publisher(Odometry, 'odom', RELIABLE)
         self.speed_m_s, self._x, self._sign = 0.3, 0.0, 1.0
-        #: (4, 4): where its run of odometry began; another one after it was carried away.
+        #: (4, 4): start of its run of odometry; another pose after a kidnap.
         self.start = MAP_FROM_CAMERA @ aside(-1.5)
-        #: What the localizer takes for that.
+        #: The localizer's estimate of it.
         self.map_from_odom = self.start
-        #: Of what it shows: a number, or NaN.
+        #: Error of its published poses: a number, or NaN.
         self.error_m = 0.0
         self.frame_id, self.has_odom, self.has_localizer, self.sees = 'map', True, True, True
         self.clock, self.on_tick = time.time, lambda now_s, map_from_odom, odom_from_base: None
@@ -62,11 +62,11 @@ class Robot:
         return self.start @ aside(self._x) @ invert_transform(BASE_FROM_CAMERA)
 
     def carry(self, metres):
-        """Kidnap it: neither odometry nor the localizer notices."""
+        """Kidnap the robot; odometry and localizer do not register it."""
         self.start = self.start @ aside(metres)
 
     def step(self):
-        """Go on by one tick."""
+        """Drive for one tick."""
         if abs(self._x) > REACH_M:
             self._sign = -np.sign(self._x)
         self._x += self._sign * self.speed_m_s * TICK_S
@@ -83,7 +83,7 @@ class Robot:
             image, *others = make_frame(seen, now_s)
             image.data = np.roll(NOISE, self._tick).tobytes()  # a frozen image is a fault
             self._tester.publish((image, *others))
-        if self._tester.initial_poses:  # as AMCL takes it at rest
+        if self._tester.initial_poses:  # as AMCL accepts it at rest
             given = transform_of(self._tester.initial_poses.pop().pose.pose)
             self.map_from_odom = given @ invert_transform(odom_from_base)
             self.show(odom_from_base, now_s)

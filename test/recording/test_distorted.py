@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo's walks through a lens with strong distortion: the programs, from recording to pose."""
+"""Run the programs on the demo's walks through a lens with strong distortion."""
 
 import json
 import shutil
@@ -24,13 +24,13 @@ from demo.truth import read_objects
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--device', 'cpu')
-# That of the TUM sequences fr1.
+# Distortion of the TUM sequences fr1.
 LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob',
               (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
 
 
 def bend(source, folder, every=1):
-    """Write each n-th image of a walk of the demo as a camera with the lens takes it."""
+    """Write every n-th image of a walk of the demo as seen through the lens."""
     shutil.copytree(source, folder)
     rows = [row for row in (folder / 'rgb.txt').read_text().splitlines() if row[0] != '#'][::every]
     (folder / 'rgb.txt').write_text('\n'.join(rows) + '\n')
@@ -61,7 +61,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def recorded(folder):
-    """The observations of the walk for mapping; its map lies next to them."""
+    """Return the observations of the mapping walk; its map lies next to them."""
     bend(ASSETS / 'mapping', folder / 'mapping')
     assert build_map(arguments('--tum', folder / 'mapping', *NETWORKS, '--no-clip', '--no-check',
                                '--no-joint', '--out', folder / 'map.yaml', '--record-to',
@@ -70,10 +70,10 @@ def recorded(folder):
 
 
 def landmarks_off(file):
-    """Return how far the landmarks of a map lie from the nearest object of their class [m]."""
+    """Return the distance of each landmark to the nearest object of its class [m]."""
     objects, built = read_objects(ASSETS / 'mapping'), LandmarkMap.from_file(file)
-    return np.array([min(np.linalg.norm(one.center - center) for one in objects
-                         if one.class_id == class_id)
+    return np.array([min(np.linalg.norm(item.center - center) for item in objects
+                         if item.class_id == class_id)
                      for center, class_id in zip(built.centers, built.class_ids, strict=True)])
 
 
@@ -84,7 +84,7 @@ def test_a_folder_gives_the_map_of_the_room(recorded, folder):
 
 
 def test_an_edge_at_the_border_of_the_image_is_open(recorded):
-    """The lens moves the border inwards: such an edge measures no object."""
+    """The lens moves the image border inwards, so a box edge there does not measure an object."""
     views = make_views(recorded)
     assert views.is_open.any(axis=0).all() and 0.02 < views.is_open.mean() < 0.1
     left, top, right, bottom = views.bounds[0] * LENS.fx + (319.5, 239.5, 319.5, 239.5)
@@ -94,14 +94,14 @@ def test_an_edge_at_the_border_of_the_image_is_open(recorded):
 
 
 def test_boxes_of_an_ideal_fisheye_are_undistorted():
-    """With zeros the radius is the angle. A box far from the axis is lost."""
+    """With coefficients of zero, the radius is the angle. A box far from the axis is discarded."""
     lens = Camera(640, 480, 200.0, 200.0, 320.0, 240.0, 'equidistant', (0.0,) * 4)
     found = Detections(np.array([[400.0, 210.0, 480.0, 270.0], [600.0, 230.0, 638.0, 250.0]]),
                        ('cup', 'tv'), np.array([0.9, 0.9]))
     raw = RawFrame(0, 0, np.eye(4), lambda: (np.zeros((480, 640, 3), dtype=np.uint8), lens))
     seen = RunNetworks(lambda image: found)(raw)
     assert seen.class_ids.tolist() == ['cup'] and seen.open_edges.tolist() == [[False] * 4]
-    across = np.hypot(120.0, 30.0) / 200.0  # of the middle of the upper edge
+    across = np.hypot(120.0, 30.0) / 200.0  # for the middle of the upper edge
     np.testing.assert_allclose(seen.bboxes_xyxy[0], [
         320 + 200 * np.tan(0.4), 240 - 30 * np.tan(across) / across,
         320 + 200 * np.tan(0.8), 240 + 30 * np.tan(across) / across], atol=1e-6)

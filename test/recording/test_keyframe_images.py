@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images of keyframes: stored only where they are asked for, small, and undistorted."""
+"""Images of keyframes: stored only on request, small, and undistorted."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +41,7 @@ def frame():
 
 
 def wall(frame):
-    """Return the frame as a recording, its image on a wall 2 m away."""
+    """Return a recording of the frame, with its image on a wall 2 m away."""
     depth = DepthImage(np.full(frame.image_rgb.shape[:2], 2.0, np.float32), None)
     seen = replace(frame, depth=depth)
 
@@ -61,7 +61,7 @@ def test_at_the_edge_of_a_depth_image_a_pixel_without_depth_has_none(frame):
 
 
 def test_many_images_are_chosen_as_by_comparing_all(frame, demo_map):
-    """Comparing each of 5,000 with all chosen ones before it took 41 minutes."""
+    """A comparison of each of 5,000 frames with all chosen ones took 41 minutes."""
     rng, asked, chosen = np.random.default_rng(0), [], []
     poses = np.tile(np.eye(4), (5000, 1, 1))
     poses[:, :3, 3] = rng.uniform(-0.6, 0.6, (5000, 3))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Observations of the demo's walk, with its real networks: once, resumed, by two workers."""
+"""Observations of the demo's walk with its real networks: complete, resumed, by two workers."""
 
 import shutil
 import signal
@@ -31,7 +31,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--device', 'cpu')
 CLIP = ('--clip-pretrained', ASSETS / 'clip')
-# A short walk shows objects from one side: this test is about what the networks say.
+# A short walk shows objects from one side only: this test is about the networks' output.
 ALL = ('--min-baseline', '1', '--frame-id', 'room', '--no-check')
 TIMEOUT_S = 600.0  # with networks, on a machine under load
 
@@ -42,7 +42,7 @@ def arguments(*parts):
 
 @pytest.fixture(scope='module')
 def walk(tmp_path_factory):
-    """A third of the demo's walk, with a pose for all but the last image, and flat depth."""
+    """Return a third of the demo's walk with flat depth, and poses for all but the last image."""
     folder = tmp_path_factory.mktemp('walk') / 'tum'
     shutil.copytree(ASSETS / 'sequence', folder)
     rows = [line for line in (folder / 'rgb.txt').read_text().splitlines()
@@ -61,7 +61,7 @@ def walk(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def recorded(walk):
-    """The observations of a run without interruption, as the executable leaves them."""
+    """Return the observations of an uninterrupted run of the executable."""
     done = subprocess.run(
         [sys.executable, '-m', 'cliploc_ros.cli.build_map', *arguments(
             '--tum', walk, *NETWORKS, *CLIP, *ALL, '--out', walk.parent / 'map.yaml')],
@@ -75,7 +75,7 @@ def recorded(walk):
 
 def assert_equal(one, other):
     for name in ('bboxes_xyxy', 'classes', 'scores', 'map_from_camera', 'stamps_s'):
-        # PyTorch adds up in another order on another number of threads
+        # with another number of threads, PyTorch sums in another order
         np.testing.assert_allclose(getattr(one.detections, name),
                                    getattr(other.detections, name), atol=1e-2)
     np.testing.assert_allclose(one.detections.embeddings.astype(float),
@@ -106,7 +106,7 @@ def test_observations_lie_next_to_the_recording(walk, recorded, capsys):
 
 @pytest.mark.parametrize('seen', [0, 2])
 def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen):
-    """Before the first image it leaves nothing; later what the next run goes on from."""
+    """Before the first image nothing is left; later the next run resumes from the file."""
     image = cv2.imread(str(min((ASSETS / 'sequence/rgb').iterdir())))
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 
@@ -155,7 +155,7 @@ def test_other_options_record_again_and_depth_is_stored(walk, recorded, tmp_path
     content = load_recorded(file).detections
     assert 2 <= len(content) < 15
     assert content.embeddings is None
-    # 10,000 counts of TUM are 2 m, spread by nothing
+    # 10,000 counts of TUM are 2 m, without variation
     np.testing.assert_allclose(content.depths, 2.0, atol=1e-6)
     np.testing.assert_allclose(content.depth_spreads, 0.0, atol=1e-6)
 
@@ -172,7 +172,7 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
     np.testing.assert_allclose(from_bag.bboxes_xyxy, from_folder.bboxes_xyxy, atol=1e-2)
     np.testing.assert_allclose(from_bag.map_from_camera, from_folder.map_from_camera, atol=1e-6)
     assert from_bag.odom_from_camera is None
-    # odometry is added to what the networks said before
+    # odometry is added to the earlier output of the networks
     linked = (*command, '--pose-topic', '/ground_truth', '--odometry-topic')
     assert main(arguments(*linked, '/wheels')) == 1
     assert 'no topic /wheels' in capsys.readouterr().err
@@ -199,7 +199,8 @@ def test_refusals(walk, recorded, tmp_path, run_here, options, expected):
     other, cut = tmp_path / 'other.txt', tmp_path / 'cut.npz'
     other.write_text('5000 0 0 0 0 0 0 1\n5001 1 0 0 0 0 0 1\n')
     cut.write_bytes(recorded.read_bytes()[:-200])
-    filled = [one.format(walk=walk, other=other, folder=tmp_path, cut=cut) for one in options]
+    filled = [option.format(walk=walk, other=other, folder=tmp_path, cut=cut)
+              for option in options]
     done = run_here(main, *filled, *NETWORKS, '--no-clip', '--out', tmp_path / 'map.yaml')
     assert done.returncode == 1 and expected in done.stderr, done.stderr
     assert len([line for line in done.stderr.splitlines() if line.startswith('error:')]) == 1

@@ -14,7 +14,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 
-# The time limit of a wait. Only a failing test takes this long.
+# Time limit of a wait. Only a failing test takes this long.
 PATIENCE_S = 60.0
 
 
@@ -29,7 +29,7 @@ def context():
 
 @pytest.fixture
 def make_node(context):
-    """Create nodes that are destroyed at the end of the test; keywords as of rclpy's Node."""
+    """Create nodes that are destroyed at the end of the test, with keywords of rclpy's Node."""
     made = []
 
     def make(name='node_under_test', **keywords):
@@ -75,7 +75,7 @@ def robot(context, make_node, wait):
         executor.add_node(node)
 
     def spin():
-        with suppress(InvalidHandle):  # the shutdown below may come while it waits
+        with suppress(InvalidHandle):  # the shutdown below may happen while it waits
             executor.spin()
     spinning = threading.Thread(target=spin)
     spinning.start()
@@ -87,10 +87,10 @@ def robot(context, make_node, wait):
 
 @pytest.fixture
 def wheels(robot, make_node):
-    """A publisher of odometry that has said nothing yet; the robot listens to it."""
+    """Create a silent publisher of odometry that the robot subscribes to."""
     wheels = make_node('wheels').create_publisher(Odometry, 'odom', 10)
     robot.odometry.open()
     robot.wait(lambda: wheels.get_subscription_count() and robot.odometry.is_published,
-               'the wheels to be heard')
+               'the discovery of the odometry')
     yield wheels
     robot.odometry.close()

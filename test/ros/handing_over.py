@@ -21,7 +21,7 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PARAMETERS = RelocalizerParameters(base_frame='base_link')
 
-# Moments of odometry since the image [s].
+# Times of odometry since the image [s].
 ONE_HZ, TEN_HZ = (0.0, 1.0, 2.0), tuple(tick / 10 for tick in range(10))
 
 
@@ -36,7 +36,7 @@ def make_pose():
 
 
 class Localizer:
-    """Stands for AMCL: hears initial poses, and answers update requests while it may."""
+    """Replaces AMCL: receives initial poses, and answers update requests while it may."""
 
     def __init__(self, node):
         self.node = node
@@ -59,7 +59,7 @@ class Localizer:
 
 
 class Robot:
-    """A relocalizer's hand-over and a localizer, all of whose callbacks are executed."""
+    """A relocalizer's hand-over and a localizer, whose callbacks are all executed."""
 
     def __init__(self, make_node, wait):
         self.node, self.wait = make_node('relocalizer'), wait
@@ -69,19 +69,19 @@ class Robot:
         self.jumps = TimeJumps(self.node, self.odometry.forget)
 
     def hand_over(self, timeout_s=10.0, **changes):
-        """Hand a pose over; return how long it took [s]."""
+        """Hand a pose over; return the elapsed time [s]."""
         start = time.monotonic()
         self.handoff.hand_over(make_pose(), replace(PARAMETERS, **changes), start + timeout_s,
                                start, self.jumps)
         return time.monotonic() - start
 
     def jump(self):
-        """Have the relocalizer's clock jump: to simulated time, and back."""
+        """Make the relocalizer's clock jump: to simulated time, and back."""
         for is_simulated in (True, False):
             self.node.set_parameters([Parameter('use_sim_time', value=is_simulated)])
 
     def meet(self):
-        """Wait until the relocalizer knows the localizer."""
+        """Wait until the relocalizer has discovered the localizer."""
         self.wait(lambda: self.handoff._publisher.get_subscription_count(), 'the subscriber')
 
     def meet_service(self):
@@ -89,12 +89,12 @@ class Robot:
 
 
 def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
-    """Publish odometry at moments since the image, and wait until the last is heard."""
+    """Publish odometry at times since the image, and wait until the last is received."""
     stand(robot, wheels, {moment_s: speed_m_s * moment_s for moment_s in moments_s}, twist_m_s)
 
 
 def stand(robot, wheels, places, twist_m_s=0.0, rad_per_m=0.0):
-    """Publish where the robot was at moments since the image, and wait until that is heard."""
+    """Publish poses of the robot at times since the image, and wait until they are received."""
     for moment_s, x_m in places.items():
         odometry = Odometry()
         odometry.header.stamp = stamp(100.0 + moment_s)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where features meet: cameras, what is known besides, and what asks, in one process."""
+"""Combinations of features: cameras, priors and kinds of requests, in one process."""
 
 import math
 import time
@@ -41,7 +41,7 @@ LAYER = make_layer(MAP)
 
 
 class Drive:
-    """A robot that drives ahead, what its cameras see, and the localizer that answers."""
+    """A robot that drives ahead, its cameras' observations, and the localizer."""
 
     def __init__(self, cameras, known, folder, mode='on_request'):
         self.parameters = RelocalizerParameters(
@@ -58,12 +58,12 @@ class Drive:
         self.cameras, self.rng, self.objects = cameras, np.random.default_rng(3), 8
 
     def pixels(self):
-        """Return an image (h, w) of some blobs, another one each time."""
+        """Return an image (h, w) of some blobs, different each time."""
         return cv2.resize(self.rng.integers(0, 255, (6, 8), np.uint8), (CAMERA.width,
                                                                         CAMERA.height))
 
     def see(self, number):
-        """Return the frames of an instant with their states, and the true pose of the first."""
+        """Return the frames of an instant with their states, and the first one's true pose."""
         robot = make_transform(np.eye(3), np.array([0.0, 0.0, 0.05 * number]))
         frames = []
         for name, mount, seen in zip(NAMES, MOUNTS, look(self.rng, robot, self.objects,
@@ -87,7 +87,7 @@ class Drive:
         return frames[:self.cameras], robot @ MOUNTS[0]
 
     def localize(self, number=0, deadline=math.inf):
-        """Answer for an instant as the node does; return the result and the pose's error [m]."""
+        """Localize an instant as the node does; return the result and the pose's error [m]."""
         ((frame, state), *beside), truth = self.see(number)
         found = self.localizer.localize(frame, self.parameters, KnownBefore(
             state, beside, self.region), StageTimes('waiting', time.monotonic()), deadline)
@@ -99,21 +99,21 @@ class Drive:
         return found, math.inf if pose is None else pose_error(pose, truth)[0]
 
     def recorded(self):
-        """Store the request; return what another localizer answers to the file."""
+        """Store the request; return the answer of another localizer to the file."""
         self.recorder.store(self.parameters)
         *_, path = sorted(Path(self.parameters.record_folder).iterdir())
         case = read_case(path)
         return case, self.repeated(case, case.options)
 
     def repeated(self, case, options):
-        """Return what another localizer answers to the last query of a case."""
+        """Return the answer of another localizer to the last query of a case."""
         return repeat(case, Localizer(
             Relocalizer(MAP, options),
             KeyframeLocalizer(LAYER) if self.localizer.keyframes else None))
 
 
 def equal(one, other):
-    """Return whether two results are equal bit by bit, times aside."""
+    """Assert that two results are equal bit by bit, except for times."""
     np.testing.assert_array_equal(one.map_from_camera, other.map_from_camera)
     np.testing.assert_array_equal(one.covariance, other.covariance)
     assert (one.accepted, one.evidence, one.reason) == (other.accepted, other.evidence,
@@ -139,7 +139,7 @@ def test_a_refused_request_searches_keyframes_as_far_as_its_time_allows(
 @pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)
 def test_a_request_is_answered_and_its_record_is_answered_alike(cameras, known, tmp_path):
     drive = Drive(cameras, known, tmp_path)
-    for number in range(2):  # the second fuses the first, by odometry
+    for number in range(2):  # the second fuses the first, with odometry
         found, error_m = drive.localize(number)
         assert found.found.accepted and error_m < 0.05
         assert found.found.source == 'objects'
@@ -155,7 +155,7 @@ def test_a_request_is_answered_and_its_record_is_answered_alike(cameras, known, 
 
 @pytest.mark.parametrize('cameras', [1, 4])
 def test_a_refused_request_of_several_looks_is_refused_again_alike(cameras, tmp_path):
-    """Looks that disagree, and what they said of the cameras, are in the record."""
+    """The record contains looks that disagree, and their evidence on the cameras."""
     drive = Drive(cameras, 'all', tmp_path)
     drive.objects = 3
     drive.parameters = replace(drive.parameters, min_confidence=1.0)
@@ -210,7 +210,7 @@ def test_the_watch_tells_a_right_pose_from_a_wrong_one(cameras, known, displaced
 
 
 def test_mounts_of_cameras_are_no_odometry(tmp_path):
-    """Without odometry a filter learns from each instant, and the watch knows of no standing."""
+    """Without odometry a filter updates at each instant; the watch never assumes standing."""
     drive = Drive(4, 'nothing', tmp_path, 'continuous')
     drive.has_odometry = False
     for number in range(3):

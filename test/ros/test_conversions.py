@@ -100,7 +100,7 @@ def test_a_small_file_that_claims_a_huge_size_is_not_decoded(extension):
 
 
 def test_exif_does_not_turn_the_picture():
-    """The intrinsics are those of the sensor, whichever way up a viewer would show it."""
+    """The intrinsics are those of the sensor, regardless of the orientation for viewing."""
     upper = np.zeros((40, 60, 3), dtype=np.uint8)
     upper[:20] = 255
     exif = PIL.Image.Exif()
@@ -162,7 +162,7 @@ def region(**changes):
     ({'roi': region(do_rectify=True), 'binning_x': 1, 'binning_y': 2}, (400, 150),
      (1000, 510, 441, 191), (800, 410, 401, 151))])
 def test_binning_and_a_region_of_interest(changes, size, k, p):
-    """Whatever the image, a pixel of the sensor is the same ray through the same lens."""
+    """For every image, a pixel of the sensor is the same ray through the same lens."""
     info = camera_info(**SENSOR | changes)
     raw, rectified = (camera_from_msg(info, size, is_rectified) for is_rectified in (False, True))
     assert (raw.width, raw.height) == size
@@ -209,7 +209,7 @@ def classified(*hypotheses):
 
 
 def test_the_most_confident_class_counts():
-    nan = float('nan')  # hides no other class
+    nan = float('nan')  # does not hide another class
     msg = Detection2DArray(detections=[
         classified(('cup', 0.2), ('vase', 0.7), ('bowl', 0.1)), classified(),
         classified(('chair', 0.5)), classified(('cup', 0.9), ('vase', nan)),

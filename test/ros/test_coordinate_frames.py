@@ -21,14 +21,14 @@ def test_without_a_base_the_camera_itself_is_meant(ask):
 
 
 def test_an_optical_frame_in_numbers(ask):
-    # z of the camera is ahead (x), x of it to the right (-y), y of it down (-z)
+    # the camera's z is ahead (x), its x to the right (-y), its y down (-z)
     camera_from_base = ask('base_link', [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5])
     np.testing.assert_allclose(camera_from_base, [[0, -1, 0, 0], [0, 0, -1, 1],
                                                   [1, 0, 0, -0.3], [0, 0, 0, 1]], atol=1e-12)
 
 
 def test_a_base_that_nobody_places_is_named_with_the_remedy(ask):
-    # also where tf2_ros is not installed
+    # also if tf2_ros is not installed
     for _ in range(2):
         with pytest.raises(NoTransformError, match='base_from_camera'):
             ask('base_link', NO_MOUNT)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Refusals by kind, and the hash of a map."""
+"""Counts of refusals by kind, and the hash of a map."""
 
 import hashlib
 

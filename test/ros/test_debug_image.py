@@ -41,7 +41,7 @@ def pixels_of(canvas, color):
 def test_boxes_and_outlines_are_where_they_were_seen(room, found):
     seen = grey_image(room)
     canvas = draw_debug_image(seen, found, room, '')
-    assert (seen.image_rgb == 128).all(), 'the image itself stays'
+    assert (seen.image_rgb == 128).all(), 'the image itself is unchanged'
     box = seen.observation.detections.bboxes_xyxy[0]
     middle = (box[:2] + box[2:]) / 2
     outline = pixels_of(canvas, ELLIPSE)
@@ -65,14 +65,14 @@ def test_boxes_beyond_all_measure_do_no_harm(room, found):
 
 
 def layer_of(room, **images):
-    """One keyframe with the camera's size, and ten points along its middle row."""
+    """Return one keyframe with the camera's size, and ten points along its middle row."""
     pixels = np.column_stack([np.linspace(50, 590, 10), np.full(10, 240.0)])
     return replace(make_layer(room, keyframes=1, points=10),
                    pixels=(16 * pixels).astype(np.uint16), **images)
 
 
 def recognized(found):
-    """Answer by five of the points, which the image shows 100 px further up."""
+    """Answer from five of the points, which are 100 px further up in the image."""
     pixels = np.column_stack([np.linspace(50, 290, 5), np.full(5, 140.0)])
     seen = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 5, 0.8, 0.8, keyframes=(0,),
                            pixels=pixels, rows=np.arange(5))
@@ -85,9 +85,9 @@ def test_the_best_keyframe_is_beside_the_image(room, found):
     assert draw_debug_image(seen, recognized(found), room, '').shape == alone.shape
     without = draw_debug_image(replace(seen, layer=layer_of(room)), recognized(found), room, '')
     height, width = alone.shape[:2]
-    assert without.shape == alone.shape, 'no empty half where no image is stored'
+    assert without.shape == alone.shape, 'no empty half if no image is stored'
     assert (alone == draw_debug_image(seen, found, room, '')).all()
-    assert np.ptp(without[140, 290].astype(int)) > 200, 'points that agree are drawn all the same'
+    assert np.ptp(without[140, 290].astype(int)) > 200, 'points that agree are drawn anyway'
     jpeg = cv2.imencode('.jpg', np.full((192, 256, 3), (200, 30, 30), np.uint8)[..., ::-1])[1]
     shown = draw_debug_image(replace(seen, layer=layer_of(
         room, images=jpeg.ravel(), image_offsets=np.array([0, jpeg.size]))),

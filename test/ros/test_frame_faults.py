@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Each field of camera_info and of the headers, broken in turn, and odd ones that are valid."""
+"""Each field of camera_info and of the headers, broken in turn, and unusual but valid values."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def with_element(name, matrix, place, value):
     *((with_element('p', P, place, value), 'refused', 'P') for place, value in (
         (0, 1000.0), (5, 250.0))),
     ({'k': np.reshape(K, (3, 3)).T.ravel()}, 'refused', 'transposed'),
-    # without P, unusual pixels are possible
+    # without P, unusual pixel shapes are possible
     (with_element('k', K, 0, 1000.0) | {'p': [0.0] * 12}, 'doubted', 'K'),
     (with_element('k', K, 2, 424.0) | {'p': [0.0] * 12}, 'doubted', 'K'),
     (with_element('k', K, 2, 424.0), 'refused', 'P'),
@@ -72,7 +72,7 @@ def with_element(name, matrix, place, value):
     ({'k': np.multiply(K, 2.0)}, 'refused', 'K'),
     ({'k': [1000.0, 0.0, 640.0, 0.0, 1000.0, 480.0, 0.0, 0.0, 1.0]}, 'refused', '1280x960'),
     ({'k': [250.0, 0.0, 160.0, 0.0, 250.0, 120.0, 0.0, 0.0, 1.0]}, 'refused', '320x240'),
-    # without a size nothing but the principal point tells
+    # without a size only the principal point can be checked
     ({'width': 0, 'height': 0, 'k': [1000.0, 0.0, 640.0, 0.0, 1000.0, 480.0, 0.0, 0.0, 1.0]},
      'refused', '1280x960'),
     ({'width': 1280, 'height': 960}, 'refused', '1280x960'), ({'width': 480}, 'refused', '480x'),
@@ -103,7 +103,7 @@ def test_each_field_of_camera_info(changes, verdict, names):
 
 
 @pytest.mark.parametrize(('changes', 'rectified', 'verdict'), [
-    (RIGHT | {'r': TURNED} | {'d': BARREL['d']}, True, 'doubted'),  # its frame may be the left's
+    (RIGHT | {'r': TURNED} | {'d': BARREL['d']}, True, 'doubted'),  # may be in the left's frame
     (with_element('p', P, 0, 0.0), True, 'refused'),
     (with_element('p', P, 1, 9.0), True, 'refused'),
     (with_element('p', P, 5, 1400.0), True, 'refused'), ({'p': [0.0] * 12}, True, 'refused'),
@@ -120,7 +120,7 @@ def test_rectified_images_are_judged_by_p(changes, rectified, verdict):
     (BARREL | {'r': TURNED}, SIZE, True), ({'k': [0.0] * 9, 'd': [0.5] * 5}, SIZE, True),
     ({'d': [0.0] * 8}, SIZE, False), ({'distortion_model': 'rational_polynomial'}, SIZE, False),
     (FISHEYE, SIZE, False), (FISHEYE | {'k': [240.0, 0.0, *K[2:4], 240.0, *K[5:]]}, SIZE, False),
-    # a crop of the sensor's corner, and bins of four pixels
+    # a crop of the sensor's corner, and 2 x 2 binning
     ({'width': 1920, 'height': 1200, 'k': [1400.0, 0.0, 960.0, 0.0, 1400.0, 600.0, 0.0, 0.0, 1.0],
       'p': [0.0] * 12, 'roi': RegionOfInterest(x_offset=1280, y_offset=720, width=640,
                                                height=480)}, SIZE, False),
@@ -143,7 +143,7 @@ def test_messages_of_another_coordinate_frame(frames, certain):
 
 @pytest.mark.parametrize('tilt_deg', [-40.0, -20.0, 0.0, 30.0])
 def test_a_body_frame_in_place_of_an_optical_one(tilt_deg):
-    """The pose of a camera on a robot tells whether it looks at the ceiling."""
+    """The camera's pose on a robot shows whether it looks at the ceiling."""
     base_from_body = make_transform(
         Rotation.from_euler('ZY', [70.0, tilt_deg], degrees=True).as_matrix(), np.zeros(3))
     base_from_optical = base_from_body @ invert_transform(OPTICAL_FROM_BODY)
@@ -157,7 +157,7 @@ def test_a_body_frame_in_place_of_an_optical_one(tilt_deg):
 @pytest.mark.parametrize(('topic', 'rectified', 'changes', 'certain'), [
     ('/camera/image_rect', False, BARREL, [True]),
     ('/camera/image_rect_color/compressed', False, BARREL, [True]),
-    ('/camera/image_rect', False, {}, []),  # nothing to rectify
+    ('/camera/image_rect', False, {}, []),  # no rectification needed
     ('/camera/image_rect', False, RIGHT, [True]), ('/camera/image_rect', False, FISHEYE, [True]),
     ('/rect/image', False, BARREL, [False]), ('/camera/image_rect', True, BARREL, []),
     ('/camera/image_raw', False, BARREL, []), ('/infra1/image_rect_raw', False, {}, []),

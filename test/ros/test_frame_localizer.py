@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From messages to a pose without the node around it, by classes alone."""
+"""From messages to a pose without the node, by class."""
 
 import time
 from dataclasses import replace
@@ -89,7 +89,7 @@ def test_a_rectified_image_is_measured_with_p(localizer, values):
 @pytest.mark.parametrize('is_level', [True, False])
 def test_a_mount_of_body_axes_is_refused_where_the_pose_contradicts_it(make_node, values, tmp_path,
                                                                        is_level):
-    """The room is upright, or on its back before a camera that looks up."""
+    """The room is upright, or on its back in front of a camera that looks up."""
     turn = Rotation.from_euler('x', -90.0 if is_level else 0.0, degrees=True)
     room = make_room()
     write_map(replace(room, centers=turn.apply(room.centers), quats_xyzw=(
@@ -131,7 +131,7 @@ def test_more_detections_than_allowed_are_not_searched(localizer, values):
 
 
 def test_depth_of_another_camera_is_registered(localizer, values, caplog):
-    """Of half the resolution, 20 cm to the left of the colour camera: a wall at 4 m."""
+    """Depth with half the resolution, 20 cm to the left of the colour camera: a wall at 4 m."""
     height, width = CAMERA.height // 2, CAMERA.width // 2
     left = make_transform(np.eye(3), np.array([-0.2, 0.0, 0.0]))
     depth = Image(header=Header(frame_id='depth'), height=height, width=width, encoding='16UC1',
@@ -162,7 +162,7 @@ def test_heights_and_verticals_reach_the_search(localizer, values):
     blind = localize(localizer, make_frame(), values)
     upright = localize(localizer, make_frame(), values, MAP_FROM_CAMERA[2, :3])
     assert blind.accepted and upright.accepted
-    # tilts are what a vertical makes sure
+    # a vertical makes tilts certain
     assert np.trace(upright.covariance[3:5, 3:5]) < np.trace(blind.covariance[3:5, 3:5])
     askew = localize(localizer, make_frame(), values, -MAP_FROM_CAMERA[2, :3])
     assert not askew.accepted

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of one camera from its messages as they come: what waits for a slow detector."""
+"""Frames of one camera from its messages as they arrive: waiting for a slow detector."""
 
 import copy
 import math
@@ -19,7 +19,7 @@ PERIOD_NS = 33_333_333
 
 
 def stamped(msg, number):
-    found = copy.copy(msg)  # all share their pixels
+    found = copy.copy(msg)  # all share the same pixels
     ns = (number + 1) * PERIOD_NS
     found.header = Header(stamp=Time(sec=ns // 10**9, nanosec=ns % 10**9), frame_id='camera')
     return found
@@ -27,7 +27,7 @@ def stamped(msg, number):
 
 @pytest.fixture
 def feed(make_node):
-    """Feed a camera at 30 Hz whose detections come some images late; return its frames."""
+    """Feed a camera at 30 Hz whose detections arrive some images late; return its frames."""
     def run(images, late, depth_bytes):
         frames = []
         source = FrameSource(make_node(), RelocalizerParameters(depth_transport='raw'), math.inf,
@@ -50,7 +50,7 @@ def feed(make_node):
     (3, 2 * 1280 * 720, 1.0), (45, 2 * 1280 * 720, 0.45), (24, 4 * 1280 * 720, 0.45),
     (12, 4 * 1920 * 1080, 0.4), (45, 4 * 1920 * 1080, 0.1)])
 def test_depth_waits_as_long_as_its_image_does(feed, late, depth_bytes, share):
-    """More than fits the memory: some are left out, and not all."""
+    """More images than fit into memory: some are left out, but not all."""
     frames = feed(3 * late + 30, late, depth_bytes)
     depths = [frame.depth for frame in frames]
     assert len(frames) > 20

@@ -41,7 +41,7 @@ def test_stages_in_numbers():
                                'search p99 [ms]': '99.0'}
     for _ in range(1000):
         stages.add({'search': 7.0})
-    assert stages.values()['search p99 [ms]'] == '7.0', 'what is long ago counts no more'
+    assert stages.values()['search p99 [ms]'] == '7.0', 'old times no longer count'
 
 
 def test_stages_of_one_result_follow_each_other():
@@ -53,7 +53,7 @@ def test_stages_of_one_result_follow_each_other():
     assert list(times.ms) == ['waiting', 'search', 'CLIP']
     assert times.ms['waiting'] == pytest.approx(2000.0)
     assert times.ms['CLIP'] == pytest.approx(5000.0)
-    assert 2000.0 <= times.ms['search'] < 2500.0, 'the running stage counts until now'
+    assert 2000.0 <= times.ms['search'] < 2500.0, 'the running stage counts up to now'
 
 
 def test_a_node_says_how_it_is_once_a_second(make_node, spin_until):

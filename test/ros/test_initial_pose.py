@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Handing a pose over: real subscribers, odometry and services that answer, or never do."""
+"""Handing a pose over: real subscribers, odometry, and services that answer or never do."""
 
 import math
 import threading
@@ -44,7 +44,7 @@ def test_a_localizer_that_starts_meanwhile_is_waited_for(robot):
 
 @pytest.fixture
 def served(robot):
-    """The robot, whose localizer hears poses and serves updates."""
+    """Return a robot whose localizer receives poses and serves updates."""
     robot.localizer.subscribe()
     robot.localizer.serve()
     robot.meet()
@@ -81,7 +81,7 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
     robot.meet()
     with ThreadPoolExecutor(1) as pool:
         handing_over = pool.submit(robot.hand_over)
-        robot.wait(lambda: robot.odometry._heard._waiters, 'it to wait for odometry')
+        robot.wait(lambda: robot.odometry._heard._waiters, 'a wait for odometry')
         robot.jump()
         tell(robot, wheels, TEN_HZ)
         with pytest.raises(TimeJumpError):
@@ -94,7 +94,7 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
 
 @pytest.fixture
 def silent(robot):
-    """A localizer that has a topic for its pose, but shows none."""
+    """A localizer with a topic for its pose that publishes none."""
     robot.localizer.node.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
     robot.localizer.subscribe()
     robot.handoff.open('amcl_pose')
@@ -104,7 +104,7 @@ def silent(robot):
 
 
 def test_who_hears_the_pose_but_shows_none_is_no_localizer(robot):
-    """Such as ros2 topic echo."""
+    """Subscribers such as ros2 topic echo."""
     robot.localizer.subscribe()
     robot.handoff.open('amcl_pose')
     robot.meet()
@@ -134,7 +134,7 @@ def test_a_localizer_has_taken_the_pose_once_it_shows_it(robot, off_m, named):
 
 @pytest.fixture
 def showing(served):
-    """A localizer that shows what it is given, and that may stop to do so."""
+    """A localizer that publishes the poses it is given, and that can stop doing so."""
     localizer, node = served.localizer, served.localizer.node
     shows = node.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
 
@@ -150,7 +150,7 @@ def showing(served):
 
 
 def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):
-    """It showed the pose, and then answers no update and shows nothing more."""
+    """It published the pose, but then answers no update and publishes nothing more."""
     showing.localizer.may_answer.clear()
     with pytest.raises(NoLocalizerError, match=r'took the pose, but has ended or hangs'):
         showing.hand_over()
@@ -206,7 +206,7 @@ def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(silent, end, erro
     (0.65, 0.0, 'map', False), (0.0, 26.0, 'map', False), (0.0, 0.0, 'floor_2', False),
     (math.nan, 0.0, 'map', False), (0.0, math.nan, 'map', False)])
 def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
-    """.3 m and three deviations of .1 m, 10 degrees and three of 5."""
+    """Limits: .3 m and three deviations of .1 m, 10 degrees and three deviations of 5."""
     given, shown = make_pose(), make_pose()
     given.pose.pose.orientation.w = 1.0
     given.pose.covariance[0], given.pose.covariance[7] = 0.1**2, 0.02**2

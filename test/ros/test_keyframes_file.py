@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameter keyframes_file: which layer is read, and that a bad one stops nothing."""
+"""The parameter keyframes_file: which layer is read; a bad layer does not stop the node."""
 
 import logging
 
@@ -16,7 +16,7 @@ ROOM = make_room()
 
 @pytest.fixture
 def room(tmp_path):
-    """A map with a layer next to it."""
+    """Write a map with a layer next to it."""
     path = tmp_path / 'room.yaml'
     write_map(ROOM, path)
     save_layer(layer_path(path), make_layer(ROOM))

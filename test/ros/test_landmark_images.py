@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The relocalizer with the demo's CLIP in a map whose objects only their images tell apart."""
+"""The relocalizer with the demo's CLIP in a map whose objects differ only in their images."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ from demo.truth import read_frames
 
 HEADER = Header(frame_id='camera')
 FRAMES = list(read_frames(ASSETS / 'sequence', 0.5))
-# Images of the landmarks come from its neighbours: another walk is not at hand.
+# Images of the landmarks come from neighbouring frames, since there is no other walk.
 QUERY, NEIGHBOURS = FRAMES[34], FRAMES[32:34] + FRAMES[35:37]
 
 
@@ -48,7 +48,7 @@ def mapped(frame):
 
 
 def images_of(landmark_map, encoder):
-    """The mean embedding of each landmark that the neighbours show."""
+    """Return the mean embedding of each landmark that the neighbours show."""
     sums = np.zeros((len(landmark_map), encoder.embed_dim))
     for frame in NEIGHBOURS:
         boxes = mapped(frame)
@@ -64,7 +64,7 @@ def images_of(landmark_map, encoder):
 
 @pytest.fixture(scope='module')
 def world(tmp_path_factory):
-    """Values of the parameters for a map without names, and the image embeddings next to it."""
+    """Return parameters for a map without names, with image embeddings next to it."""
     folder = tmp_path_factory.mktemp('nameless')
     named = LandmarkMap.from_file(ASSETS / 'map.yaml')
     count = len(named)
@@ -81,7 +81,7 @@ def world(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def frame():
-    """The query as messages: its boxes are true, and its detector knows things only."""
+    """Return the query as messages, with true boxes and a single class 'thing'."""
     image, boxes = read_image(QUERY), mapped(QUERY)
     detections = Detections(np.array([box.bbox_xyxy for box in boxes]), ('thing',) * len(boxes),
                             np.ones(len(boxes)))
@@ -94,7 +94,7 @@ def frame():
 
 
 def finds(localizer, frame, values) -> bool:
-    """Return whether the pose is accepted; it then has to be right."""
+    """Return whether the pose is accepted; fail if it is accepted but wrong."""
     found = localizer.localize(frame, values, KnownBefore(RobotState(np.eye(4))),
                                StageTimes('waiting', 0.0)).found
     if found.accepted:

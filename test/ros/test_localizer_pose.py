@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the localizer has the camera at the stamp of an image, by its topic and odometry since."""
+"""The localizer's pose of the camera at the stamp of an image, from its topic and odometry."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def robot(make_node):
 
 @pytest.fixture
 def amcl(make_node):
-    """A localizer that publishes, and has shown nothing yet."""
+    """A localizer that has not published a pose yet."""
     return make_node('amcl').create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
 
 
@@ -109,7 +109,7 @@ def test_what_is_no_pose_of_one_localizer_is_refused(localizer, robot, make_node
             localizer.hear(msg)
         with pytest.raises(NoLocalizerPoseError):
             at(localizer, robot, 10.0, **given)
-    is_refused()  # none was shown
+    is_refused()  # none was published
     broken = shown(10.0)
     broken.pose.pose.orientation.w = np.nan
     is_refused(broken)

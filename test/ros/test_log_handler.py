@@ -9,7 +9,7 @@ from cliploc_ros.ros.node.lifecycle import RosLogHandler
 
 @pytest.fixture
 def logger(make_node):
-    """A logger of Python whose records go to a real node's."""
+    """A Python logger whose records go to a real node's logger."""
     handler = RosLogHandler(make_node('spokesman'))
     logger = logging.getLogger('cliploc_ros_test')
     logger.propagate = False
@@ -30,7 +30,7 @@ def test_records_come_out_of_the_node_at_their_level(logger, capfd, level, word)
 
 
 def test_levels_may_change_from_record_to_record(logger, capfd):
-    """Each level from the same line: rclpy refuses that where a level is no part of the call."""
+    """All levels from the same line: rclpy rejects that unless the level is part of the call."""
     for level in (logging.INFO, logging.ERROR, logging.WARNING, logging.INFO):
         logger.log(level, 'text')
     assert capfd.readouterr().err.count('text') == 4

@@ -14,7 +14,7 @@ from cliploc_ros.ros.frame_localizer import load_map
 
 @pytest.fixture
 def start_with(make_node):
-    """Make a node as `--params-file` makes it."""
+    """Make a node as with `--params-file`."""
     def run(path):
         return make_node(cli_args=['--ros-args', '--params-file', str(path)],
                          automatically_declare_parameters_from_overrides=True)
@@ -29,7 +29,7 @@ def test_parameters_and_file_give_the_same_map(start_with, tmp_path):
     write_map(path, room)
     of_parameters = load_map(start_with(path), [])
     of_file = load_map(start_with(path), [str(path)])
-    # rclpy hands parameters over in an order of its own
+    # rclpy passes parameters in arbitrary order
     again = of_parameters.select([of_parameters.landmark_ids.index(name)
                                   for name in of_file.landmark_ids])
     for name in ('frame_id', 'landmark_ids', 'labels', 'class_ids', 'details'):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""map -> odom, and transforms before and after a jump; most of it with the real tf2_ros."""
+"""map -> odom, and transforms before and after a jump; mostly with the real tf2_ros."""
 
 import time
 from dataclasses import replace
@@ -28,7 +28,7 @@ STAMP = stamp(100.0)
 
 
 def moving(seconds, x_m, parent='odom', child='base_link'):
-    """A transform of a robot that is x_m ahead, and turned to the left."""
+    """Return a transform of a robot that is x_m ahead and turned to the left."""
     return transform_msg(Header(frame_id=parent, stamp=stamp(seconds)), child,
                          transform_from_pose(np.array([x_m, 0.0, 0.0]), np.array(QUARTER_LEFT)))
 
@@ -40,7 +40,7 @@ def test_a_robot_is_needed():
 
 
 class Robot:
-    """A node with transforms and map -> odom, and what broadcasts and hears /tf."""
+    """A node with transforms and map -> odom, and a broadcaster and subscriber of /tf."""
 
     def __init__(self, make_node, spin_until):
         from tf2_msgs.msg import TFMessage
@@ -62,14 +62,14 @@ class Robot:
         self._spin_until([self.node, self.world], condition, what, work)
 
     def place(self, seconds, source='base_link'):
-        """Return how far ahead the robot was, as tf2 has it; None if it has nothing."""
+        """Return the robot's x according to tf2; None if tf2 has no transform."""
         try:
             return self.transforms.lookup('odom', source, stamp(seconds), 0.0)[0, 3]
         except NoTransformError:
             return None
 
     def tell(self, seconds, x_m):
-        """Broadcast where the robot was until that is known."""
+        """Broadcast the robot's pose until it is received."""
         self.spin_until(lambda: self.place(seconds) == x_m, f'{x_m} m at {seconds} s',
                         lambda: self.broadcaster.sendTransform(moving(seconds, x_m)))
 
@@ -98,7 +98,7 @@ def test_odom_is_tied_to_the_map(robot):
                              PARAMETERS, time.monotonic())
     robot.spin_until(lambda: robot.heard, 'map -> odom')
     t = robot.heard[0].transform.translation
-    # the same heading in both, so that odom lies a metre behind, along its own x
+    # the same heading in both, so odom is a metre behind along its x axis
     np.testing.assert_allclose([t.x, t.y, t.z], [4.0, 5.0, 0.0], atol=1e-9)
     assert robot.heard[0].child_frame_id == 'odom'
 
@@ -108,7 +108,7 @@ def test_odom_is_tied_to_the_map(robot):
     (100.0, None),  # the clock jumps
     (100.5, -100.0), (103.0, 2.5), (2.0, 1.0)])  # odometry restarts, and no clock jumps
 def test_a_jump_or_a_restart_ends_the_broadcast_until_the_next_pose(robot, restart_s, x_m):
-    """Its origin is reset, at once or in a silence, or a bag loops."""
+    """Its origin is reset, at once or during a silence, or a bag loops."""
     robot.map_to_odom.open()
     robot.tell(100.0, 1.0)
     robot.tell_odometry(99.9, 1.0)
@@ -121,11 +121,11 @@ def test_a_jump_or_a_restart_ends_the_broadcast_until_the_next_pose(robot, resta
         robot.map_to_odom.forget()
     else:
         robot.tell_odometry(restart_s, x_m)
-    # images from before: its search ends after the restart, or it arrives after it
+    # images from before: the search ends after the restart, or the image arrives after it
     for at in (received_at, time.monotonic())[:1 if restart_s <= 100.0 else 2]:
         with pytest.raises(TimeJumpError):
             robot.map_to_odom.update(header, MAP_FROM_BASE, PARAMETERS, at)
-    robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'what is on its way')
+    robot.spin_until(lambda: robot.world.count_publishers('/tf') == 2, 'messages in transit')
     robot.heard.clear()
     end = time.monotonic() + 0.5  # five periods
     robot.spin_until(lambda: time.monotonic() > end, 'silence')
@@ -147,13 +147,13 @@ def test_transforms_from_before_a_jump_are_forgotten(robot, restart_s):
         robot.tell(seconds, x_m)
     robot.transforms.forget()
     assert robot.place(99.5) is None and robot.place(100.0) is None
-    assert robot.place(0.0, 'shelf') == 7.0, 'nobody says it again'
-    # one from before that arrives late
+    assert robot.place(0.0, 'shelf') == 7.0, 'the transform is not repeated'
+    # a late message from before
     robot.tell(100.02, 3.0)
     for seconds, x_m in ((restart_s, 11.0), (restart_s + 1.0, 12.0)):
         robot.tell(seconds, x_m)
     assert robot.place(restart_s + 0.5) == pytest.approx(11.5)
-    assert robot.place(restart_s + 2.0) is None, 'not interpolated to one from before'
+    assert robot.place(restart_s + 2.0) is None, 'no interpolation across the jump'
 
 
 @pytest.mark.needs('tf2_ros')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a map is: a path, a file:// URL, or a file of an installed package."""
+"""Places of a map: a path, a file:// URL, or a file of an installed package."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from cliploc_ros.ros.parameters import RelocalizerParameters, map_files, path_of
 
 @pytest.fixture
 def prefix(tmp_path, monkeypatch):
-    """A workspace with the package my_maps."""
+    """Create a workspace with the package my_maps."""
     marker = tmp_path / 'share/ament_index/resource_index/packages/my_maps'
     marker.parent.mkdir(parents=True)
     marker.touch()

@@ -17,7 +17,7 @@ from cliploc_ros.ros.visualization import (
 def test_every_landmark_is_an_ellipsoid_with_its_label():
     room = make_room()
     first, *markers = landmark_markers(room).markers
-    assert first.action == Marker.DELETEALL, 'what was shown before goes'
+    assert first.action == Marker.DELETEALL, 'earlier markers are removed'
     ellipsoids, texts = markers[::2], markers[1::2]
     assert [text.text for text in texts] == list(room.labels)
     assert len({(marker.ns, marker.id) for marker in markers}) == 2 * len(room)
@@ -27,7 +27,7 @@ def test_every_landmark_is_an_ellipsoid_with_its_label():
         position, q = ellipsoid.pose.position, ellipsoid.pose.orientation
         np.testing.assert_array_equal([position.x, position.y, position.z], room.centers[row])
         np.testing.assert_array_equal([q.x, q.y, q.z, q.w], room.quats_xyzw[row])
-        # RViz takes diameters
+        # RViz expects diameters
         np.testing.assert_array_equal(
             [ellipsoid.scale.x, ellipsoid.scale.y, ellipsoid.scale.z], 2 * room.semi_axes[row])
         assert text.pose.position.z > room.centers[row][2] + room.semi_axes[row].max()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images of several cameras, of one instant for a detector that cannot look at all of them."""
+"""Images of several cameras at one instant, for a detector that cannot process all of them."""
 
 import threading
 
@@ -22,7 +22,7 @@ def image(stamp):
 
 
 def shown_to_a_busy_worker(offers):
-    """What a worker sees of images that come while it is busy with another one."""
+    """Return the images that a busy worker processes."""
     worker, seen = Worker(print), []
     entered, gate = threading.Event(), threading.Event()
 
@@ -45,12 +45,12 @@ def shown_to_a_busy_worker(offers):
 
 
 @pytest.mark.parametrize(('offers', 'expected', 'dropped'), [
-    # the newest instant that both have, then what is left
+    # the newest instant that both have, then the remaining images
     ([('a', 1), ('b', 1), ('a', 2)], [('a', 1), ('b', 1), ('a', 2)], 0),
     ([('a', 1), ('b', 1), ('a', 2), ('b', 2)], [('a', 2), ('b', 2)], 2),
     ([('a', 1), ('a', 2), ('a', 3)], [('a', 3)], 2),
     ([('a', 1), ('a', 2), ('a', 3), ('b', 1)], [('a', 2), ('b', 1), ('a', 3)], 1),
-    # a camera that is late does not hold the others back
+    # a late camera does not delay the others
     ([('a', 8), ('a', 9), ('b', 3)], [('a', 8), ('b', 3), ('a', 9)], 0),
     ([('b', 5), ('a', 1)], [('b', 5), ('a', 1)], 0),
 ])

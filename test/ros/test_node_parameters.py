@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of real nodes: given in files, changed at run time, refused."""
+"""Parameters of real nodes: from files, changed at run time, and rejected."""
 
 from dataclasses import dataclass
 from pathlib import Path

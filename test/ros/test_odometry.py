@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry on the wire: the camera's place at an image, and the robot's speed."""
+"""Real odometry messages: the camera's pose at an image, and the robot's speed."""
 
 import threading
 from dataclasses import replace
@@ -24,7 +24,7 @@ PARAMETERS = RelocalizerParameters(base_frame='base_link', base_from_camera=OPTI
 
 
 def odom_from_base(seconds):
-    """A robot that turns by 20 degrees a second and drives 0.1 m/s along x."""
+    """A robot that turns at 20 degrees per second and drives at 0.1 m/s along x."""
     turn = Rotation.from_euler('z', 20.0 * seconds, degrees=True).as_matrix()
     return make_transform(turn, np.array([0.1 * seconds, 2.0, 0.0]))
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the robot was at an instant, by odometry's messages as they come."""
+"""The robot's pose at an instant, from odometry messages in their order of arrival."""
 
 import functools
 from copy import deepcopy
@@ -41,14 +41,14 @@ def test_between_two_messages_it_is_in_between():
 
 
 def test_it_turns_the_short_way():
-    """Quaternions of opposite sign are one attitude."""
+    """Quaternions of opposite sign are the same orientation."""
     window = OdometryWindow(10.0)
     window.add(0, np.zeros(3), turned(170.0))
     window.add(S // 10, np.zeros(3), -turned(190.0))
     assert abs(heading(window.pose_at(S // 20))) == pytest.approx(180.0, abs=1e-6)
 
 
-@pytest.mark.parametrize('speed_m_s', [1.0, 0.0])  # reset 51 m away, or told by its heading
+@pytest.mark.parametrize('speed_m_s', [1.0, 0.0])  # reset 51 m away, or detected by its heading
 def test_odometry_that_was_reset_joins_nothing_across_it(speed_m_s):
     window = OdometryWindow(10.0)
     drive(window, (50.0, 51.05), speed_m_s=speed_m_s)
@@ -111,7 +111,7 @@ def test_what_is_no_pose_is_left_out(position, quat_xyzw):
 
 def test_a_clock_set_back_begins_anew():
     window = OdometryWindow(5.0)
-    for restart in (98.0, 3.0):  # a bag that begins again, and a simulation
+    for restart in (98.0, 3.0):  # a bag that restarts, and a simulation
         drive(window, (100.0, 102.0))
         drive(window, (restart, restart + 1.0))
         assert len(window) == 10
@@ -121,22 +121,23 @@ def test_a_clock_set_back_begins_anew():
 
 
 def talk(window, seconds, x_m=0.0, degrees=0.0):
-    """Take a pose; return whether it begins another run."""
+    """Add a pose; return whether it starts another run."""
     run = window.run
     window.add(round(seconds * S), np.array([x_m, 0.0, 0.0]), turned(degrees))
     return window.run != run
 
 
 @pytest.mark.parametrize(('speed_m_s', 'turn_deg_s', 'silence_s', 'x_m', 'degrees', 'restarts'), [
-    # it stood: it is where it was, or its driver has begun within a distance that it could drive
+    # it stood: it is at the same place, or its driver restarted within a distance that it could
+    # drive
     *((0.0, 0.0, silence_s, *moved) for silence_s in (3.5, 60.0) for moved in (
         (0.0, 0.0, False), (0.08, 4.0, False), (1.0, 0.0, True), (-0.2, 0.0, True),
         (0.0, 8.0, True))),
-    # it drove on for 2 s or stopped; its driver began at (0, 0), where it did not drive
+    # it drove on for 2 s or stopped; its driver restarted at (0, 0), where it did not drive
     *((0.5, 15.0, 2.0, *moved) for moved in (
         (3.5, 30.0, False), (2.6, 0.0, False), (3.2, 15.0, False), (0.0, 0.0, True),
         (5.0, 30.0, True), (3.5, 80.0, True))),
-    # nobody knows where it went in a long silence
+    # its path in a long silence is unknown
     (0.5, 0.0, 4.0, 4.5, 0.0, True)])
 def test_where_a_robot_may_be_after_a_silence(speed_m_s, turn_deg_s, silence_s, x_m, degrees,
                                               restarts):
@@ -154,14 +155,14 @@ def test_a_slow_source_that_misses_two_messages_goes_on():
 
 
 def on_an_arc(seconds, speed_m_s, turn_rad_s=0.4):
-    """Where a robot is that has driven along an arc: position, and heading [rad]."""
+    """Return the position and heading [rad] of a robot that has driven along an arc."""
     radius_m, angle = speed_m_s / turn_rad_s, turn_rad_s * seconds
     return radius_m * np.array([np.sin(angle), 1.0 - np.cos(angle), 0.0]), angle
 
 
 @functools.cache
 def window_of_an_arc(rate_hz, speed_m_s, twist):
-    """Return a window of a robot that has driven for 3 s, and the moment of its newest pose."""
+    """Return a window of a robot that has driven for 3 s, and the time of its newest pose."""
     window, moments = OdometryWindow(30.0), np.arange(3 * rate_hz) / rate_hz
     for moment in moments:
         assert not begins(window, moment, speed_m_s, twist)
@@ -169,7 +170,7 @@ def window_of_an_arc(rate_hz, speed_m_s, twist):
 
 
 def begins(window, seconds, speed_m_s, twist, aside_m=0.0, degrees=0.0):
-    """Take a pose of a robot on an arc, moved aside and turned; return whether a run begins."""
+    """Add a pose of a robot on an arc, shifted and turned; return whether a run starts."""
     run, (position, angle) = window.run, on_an_arc(seconds, speed_m_s)
     window.add(round(seconds * S), position - np.array([aside_m, 0.0, 0.0]),
                turned(np.degrees(angle) + degrees),
@@ -181,7 +182,7 @@ def begins(window, seconds, speed_m_s, twist, aside_m=0.0, degrees=0.0):
 @pytest.mark.parametrize('speed_m_s', [0.0, 0.3, 1.0])
 @pytest.mark.parametrize(('twist', 'aside_m'), [(1.0, 0.7), (0.0, 1.2)], ids=['true', 'empty'])
 def test_a_driver_that_restarts_in_a_gap_is_told_by_its_twist(rate_hz, speed_m_s, twist, aside_m):
-    """At another place, or with another heading; then its twist may be anything."""
+    """At another place or with another heading, whatever its twist is."""
     former, newest = window_of_an_arc(rate_hz, speed_m_s, twist)
     for gap_s, (moved_m, turned_deg), first_twist in product(
             (0.0, 0.15, 0.4), ((2.0, 0.0), (aside_m, 0.0), (0.0, 90.0), (0.0, -90.0)),
@@ -196,7 +197,7 @@ def test_a_driver_that_restarts_in_a_gap_is_told_by_its_twist(rate_hz, speed_m_s
 @pytest.mark.parametrize('speed_m_s', [0.0, 0.3, 2.0])
 @pytest.mark.parametrize('twist', [1.0, 0.8, 0.0, -1.0, 1000.0])
 def test_a_robot_that_goes_on_after_lost_messages_does_not_restart(rate_hz, speed_m_s, twist):
-    """Whatever its driver puts into the twist; it slips, and its stamps are late, too."""
+    """Whatever twist its driver sends; it slips, and its stamps are also late."""
     former, newest = window_of_an_arc(rate_hz, speed_m_s, twist)
     for gap_s in (1 / rate_hz, 0.15, 0.4):
         window = deepcopy(former)
@@ -206,7 +207,7 @@ def test_a_robot_that_goes_on_after_lost_messages_does_not_restart(rate_hz, spee
 
 @pytest.mark.parametrize('rate_hz', [5, 10, 50])
 def test_a_robot_that_starts_and_stops_does_not_restart(rate_hz):
-    """It changes its speed at 2 m/s^2; the driver fills the twist or does not."""
+    """It accelerates at 2 m/s^2; the driver sends a twist or none."""
     for twist in (0.0, 1.0):
         window, place_m = OdometryWindow(30.0), 0.0
         for moment in np.arange(0.0, 12.0, 1 / rate_hz):
@@ -220,7 +221,7 @@ def test_a_robot_that_starts_and_stops_does_not_restart(rate_hz):
 @pytest.mark.parametrize('rate_hz', [5, 10, 50])
 @pytest.mark.parametrize('back_s', [0.25, 0.5, 0.8])
 def test_a_clock_set_back_by_less_than_a_second_begins_anew(rate_hz, back_s):
-    """Stamps that were, or nearly so, with other poses."""
+    """Repeated or nearly repeated stamps with other poses."""
     former, newest = window_of_an_arc(rate_hz, 1.0, 0.0)
     window = deepcopy(former)
     moments = newest + np.arange(1, 2 + round(back_s * rate_hz)) / rate_hz
@@ -241,7 +242,7 @@ def test_stamps_that_do_not_go_on_hold_no_run_together(step_s):
 
 def test_one_of_two_poses_of_a_stamp_stays():
     window = OdometryWindow(30.0)
-    for x_m in (1.0, 1.02, 1.04):  # a filter that corrects itself
+    for x_m in (1.0, 1.02, 1.04):  # a filter that corrects its pose
         window.add(S, np.array([x_m, 0.0, 0.0]), UPRIGHT)
     assert window.pose_at(S)[0, 3] == 1.0 and window.run == 0
     window.add(S, np.array([1.2, 0.0, 0.0]), UPRIGHT)
@@ -269,7 +270,7 @@ def test_the_way_is_what_was_driven_not_how_far_it_led():
     window.add(39 * S + S // 20, np.array([0.1, 0.0, 0.0]), UPRIGHT)  # late
     assert window.way_at(39 * S + S // 20) == window.way_at(39 * S)
     window.clear()
-    rng = np.random.default_rng(0)  # visual odometry trembles by millimetres
+    rng = np.random.default_rng(0)  # visual odometry jitters by millimetres
     for tick in range(50 * 50, 110 * 50):
         window.add(tick * S // 50, rng.normal(0.0, 0.002, 3), UPRIGHT)
-    assert window.way_at(109 * S) < 0.2, 'each run begins with none'
+    assert window.way_at(109 * S) < 0.2, 'each run starts at a distance of 0'

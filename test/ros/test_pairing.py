@@ -10,13 +10,13 @@ TOPICS = ('image', 'camera_info', 'detections')
 LIMITS = {'image': 100, 'camera_info': 30, 'detections': 50}
 MAX_COUNT = 4
 
-# Few stamps, so that they repeat, go back, and often complete; some items exceed every limit.
+# Few stamps, so that they repeat, go back, and often form pairs; some items exceed every limit.
 ADDITIONS = st.lists(st.tuples(st.sampled_from(TOPICS), st.integers(-2, 4), st.integers(0, 120)),
                      max_size=80)
 
 
 def add_all(pairing, *additions):
-    """Add (topic, stamp) with small items named after both; return the last answer."""
+    """Add (topic, stamp) with small items named after both; return the last result."""
     for topic, stamp in additions:
         answer = pairing.add(topic, stamp, f'{topic} {stamp}', 1)
     return answer
@@ -35,7 +35,7 @@ def test_what_came_is_known_for_the_reason_that_nothing_paired():
 
 
 class Expected:
-    """The same in lists: (stamp, item, size) of each topic in order of arrival."""
+    """A reference with lists: (stamp, item, size) of each topic in order of arrival."""
 
     def __init__(self):
         self.waiting = {topic: [] for topic in TOPICS}
@@ -70,9 +70,9 @@ def test_a_set_is_complete_if_and_only_if_nothing_of_it_was_evicted(additions):
 
 
 def paired_by_a_slow_detector(behind, room, images, queue=False, begin=0):
-    """Return the images that pair, of a camera whose detections come so many images later.
+    """Return the paired images of a camera whose detections arrive a number of images later.
 
-    A detector takes the newest image when it is done with one, or all of them from a queue.
+    A detector processes the newest image when it is ready, or all images from a queue.
     """
     pairing = ExactPairing({'image': 100 * room, 'detections': 10**9}, 2000, 'image', 'detections')
     paired, taken, done_at = [], 0, begin
@@ -90,7 +90,7 @@ def paired_by_a_slow_detector(behind, room, images, queue=False, begin=0):
 @pytest.mark.parametrize(('behind', 'room'), [(12, 10), (60, 43), (60, 10), (300, 10), (5, 43)])
 def test_images_pair_however_slow_the_detector_is(behind, room):
     """4K images at 30 Hz, of which 10 fit into memory, and 1080p: .4, 2 and 10 s late."""
-    for begin in (0, behind // 2):  # it begins with the first image, or was at work before
+    for begin in (0, behind // 2):  # it starts with the first image, or was already running
         paired = paired_by_a_slow_detector(behind, room, 10 * behind, begin=begin)
         assert len(paired) >= 8, paired
     assert len(paired_by_a_slow_detector(behind, room, 10 * behind, queue=True)) >= 6

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files of several robots: a node's own ones, as ROS itself gives them to it."""
+"""Parameter files of several robots: a node gets the same parameters as from ROS."""
 
 import pytest
 import yaml
@@ -34,10 +34,11 @@ def test_a_node_has_the_parameters_that_ros_gives_to_it(make_node, tmp_path, con
     node = make_node(base, namespace=namespace, automatically_declare_parameters_from_overrides=
                      True, start_parameter_services=False,
                      cli_args=['--ros-args', '--params-file', str(file)])
-    given = {one: node.get_parameter(one).value for one in ('k', 'map.frame_id')
-             if node.has_parameter(one)}
+    given = {key: node.get_parameter(key).value for key in ('k', 'map.frame_id')
+             if node.has_parameter(key)}
     if given:
-        assert {one.name: one.value for one in parameters_of_files([file], name)} == given
+        found = parameters_of_files([file], name)
+        assert {parameter.name: parameter.value for parameter in found} == given
     else:
         with pytest.raises(OptionsError, match='--relocalizer'):
             parameters_of_files([file], name)

@@ -74,7 +74,7 @@ def test_tables_are_sound(name):
 
 
 def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
-    # offline a search may take its time; a request's answer is waited for
+    # an offline search is not limited in time, but a client waits for an answer
     assert RelocalizerParameters().options() == RelocalizerOptions(time_budget_s=0.05)
     rows = {row.name: row for row in RelocalizerParameters.rows()}
     for name in ('iterations', 'iou_threshold', 'min_inliers', 'k'):

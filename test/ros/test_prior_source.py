@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before an image: from the topic, and from the file of the last pose."""
+"""Priors of an image: from the topic, and from the file of the last pose."""
 
 import json
 
@@ -36,7 +36,7 @@ def pose(frame_id='map', at=None, covariance=COVARIANCE):
 
 @pytest.fixture
 def source(make_node):
-    """A source whose node works behind at once."""
+    """A source whose node executes background work at once."""
     node = make_node()
     node.worker = Worker(print)
     yield PriorSource(node, CoordinateFrames(node))
@@ -82,7 +82,7 @@ def test_the_last_accepted_pose_holds_at_the_next_start_until_another_is_accepte
     file = tmp_path / 'last.json'
     parameters = RelocalizerParameters(last_pose_file=str(file), last_pose_probability=0.6)
     source.keep(pose(), parameters, 'one')
-    source._node.worker.run(lambda: None)  # what it wrote behind is there
+    source._node.worker.run(lambda: None)  # its background writes are complete
     assert json.loads(file.read_text())['map_hash'] == 'one'
     content = file.read_bytes()
     source.keep(pose(at=turned(0.7, 1.001, -2.0)), parameters, 'two')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Requests in a real node with a real frame source; the localizer is the test's own function."""
+"""Requests in a real node with a real frame source; the localizer is a function of the test."""
 
 import array
 import re
@@ -39,7 +39,7 @@ def set_values(node, **values):
 
 
 class Answering(ManagedNode):
-    """A managed node whose map is what `loads` returns and whose frames `localize` answers."""
+    """A managed node whose map comes from `loads` and whose frames `localize` answers."""
 
     def __init__(self):
         super().__init__('answering', RelocalizerParameters)
@@ -86,8 +86,8 @@ class Camera:
 
 @pytest.fixture
 def node():
-    """A node of the default context, as ManagedNode makes it, spun in a thread of its own."""
-    is_first = not rclpy.ok()  # test/nodes has its own
+    """A node of the default context, made like ManagedNode, spun in a separate thread."""
+    is_first = not rclpy.ok()  # test/nodes has a separate one
     if is_first:
         rclpy.init()
     made = Answering()
@@ -131,7 +131,7 @@ def shoot_until(camera, wait, *futures):
 
 
 def test_a_request_gets_no_image_older_than_itself(node, camera, clients, wait):
-    """The second request arrives while the first one's image is searched."""
+    """The second request arrives while the image of the first is being searched."""
     searched, go_on = [], threading.Event()
 
     def localize(frame):
@@ -147,7 +147,7 @@ def test_a_request_gets_no_image_older_than_itself(node, camera, clients, wait):
     go_on.set()
     shoot_until(camera, wait, first, second, third)
     assert first.result().received_at < arrived_at <= second.result().received_at
-    # whoever waits together shares an answer
+    # requests that wait together share an answer
     assert third.result() is second.result() and len(searched) == 2
 
 
@@ -166,7 +166,7 @@ def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, cl
 
 
 def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
-    """Ten of them fit into memory; the boxes of the first one come after twelve, or never."""
+    """Ten images fit into memory; the boxes of the first arrive after twelve, or never."""
     infos, boxes, images = camera.publishers
     data = array.array('B', bytes(3840 * 2160 * 3))
 
@@ -180,7 +180,7 @@ def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
         wait(lambda: node.frames.sources['']._pairing.received['image'] > before, 'the image')
 
     request = clients.submit(node.requests.answer)
-    wait(lambda: all(one.get_subscription_count() for one in camera.publishers), 'the node')
+    wait(lambda: all(each.get_subscription_count() for each in camera.publishers), 'the node')
     for number in range(1, 13):
         take(number)
     boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=1))))
@@ -219,12 +219,12 @@ def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
     start = time.monotonic()
     requests = [clients.submit(node.requests.answer) for _ in range(4)]
     wait(lambda: all(request.done() for request in requests), 'the answers')
-    assert time.monotonic() - start < 0.9, 'they wait side by side'
+    assert time.monotonic() - start < 0.9, 'they wait concurrently'
     assert all('nobody publishes /image' in request.result().message for request in requests)
 
 
 class LateTransforms:
-    """In the place of tf2's buffer: it knows the images that are old enough."""
+    """Replaces tf2's buffer: it has transforms only for images that are old enough."""
 
     def __init__(self, late_s):
         self.late_s, self.asked_at = late_s, {}

@@ -30,7 +30,7 @@ def heard():
 
 @pytest.fixture
 def cameras(make_node):
-    """Return what publishes a frame of some cameras: their names, and their stamps."""
+    """Return a function that publishes a frame of some cameras, given their names and stamps."""
     node = make_node('cameras')
     publishers = {(name, kind): node.create_publisher(kind, f'{name}/{topic}', 10)
                   for name in NAMES for kind, topic in (
@@ -80,7 +80,7 @@ def ask(rig, cameras, late_s, wait, first_s=10.0, patience_s=30.0):
 
 
 def names(frame):
-    return [frame.camera, *(one.camera for one in frame.beside)]
+    return [frame.camera, *(other.camera for other in frame.beside)]
 
 
 @pytest.mark.parametrize(('late_s', 'together', 'left_out'), [
@@ -92,12 +92,12 @@ def names(frame):
 ])
 def test_frames_of_one_instant_come_together(rig, cameras, wait, late_s, together, left_out):
     frame = ask(rig, cameras, late_s, wait)
-    if set(late_s) == set(NAMES):  # the first frames may come before all cameras are heard
+    if set(late_s) == set(NAMES):  # the first frames may arrive before all cameras are discovered
         wait(lambda: names(ask(rig, cameras, late_s, wait, 100.0)) == together, 'all cameras')
         frame = ask(rig, cameras, late_s, wait, 200.0)
     assert names(frame) == together
     assert frame.left_out == left_out
-    assert {one.image.header.frame_id for one in (frame, *frame.beside)} == set(together)
+    assert {heard.image.header.frame_id for heard in (frame, *frame.beside)} == set(together)
 
 
 def test_silent_inputs_are_named_by_camera(rig, cameras, wait):
@@ -129,12 +129,12 @@ def test_nothing_in_time_and_a_rig_that_is_closed(rig, cameras, wait):
 
 
 def now_s():
-    """Return a stamp; stamps that go on evenly are at once known to be images' own."""
+    """Return a stamp; evenly spaced stamps are recognized at once as image stamps."""
     return 100.0 + time.monotonic()
 
 
 def in_turn(cameras, heard, order, gap_s=0.0, skew_s=0.0):
-    """Publish six instants, whose detections come one camera after another; return the heard."""
+    """Publish six instants, with detections one camera after another; return the received ones."""
     begun_s = now_s()
     for _ in range(6):
         at_s = now_s()
@@ -145,8 +145,8 @@ def in_turn(cameras, heard, order, gap_s=0.0, skew_s=0.0):
             time.sleep(gap_s)
             cameras(at_s, {name: 0.0}, (Detection2DArray,))
         time.sleep(0.05)
-    time.sleep(0.7)  # all patience is over
-    stamps = [one.image.header.stamp for one in heard]
+    time.sleep(0.7)  # all waiting times have passed
+    stamps = [frame.image.header.stamp for frame in heard]
     assert len({(stamp.sec, stamp.nanosec) for stamp in stamps}) == len(stamps), 'each once'
     return [one for one, at in zip(heard, stamps, strict=True)
             if at.sec + 1e-9 * at.nanosec >= begun_s - 1e-6]
@@ -154,8 +154,8 @@ def in_turn(cameras, heard, order, gap_s=0.0, skew_s=0.0):
 
 @pytest.fixture
 def known(rig, cameras, wait, heard):
-    """Publish until the cameras are known, and their stamps for their own."""
-    wait(lambda: any(not one.left_out for one in heard), 'the first whole instant',
+    """Publish until the cameras and their image stamps are known."""
+    wait(lambda: any(not frame.left_out for frame in heard), 'the first whole instant',
          lambda: cameras(now_s(), ALL) or time.sleep(0.05))
 
 
@@ -163,37 +163,37 @@ def known(rig, cameras, wait, heard):
 @pytest.mark.parametrize('rig', [math.inf], indirect=True)
 @pytest.mark.parametrize(('gap_s', 'skew_s'), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.06), (0.1, 0.06)])
 def test_instants_are_passed_on_with_all_cameras_once(cameras, heard, gap_s, skew_s):
-    """Whoever comes first, and however late the others arrive."""
+    """In any order, however late the others arrive."""
     for order in (NAMES, NAMES[::-1]):
         found = in_turn(cameras, heard, order, gap_s, skew_s)
-        assert [names(one) for one in found] == [list(NAMES)] * 6
+        assert [names(frame) for frame in found] == [list(NAMES)] * 6
 
 
 @pytest.mark.usefixtures('known')
 @pytest.mark.parametrize('rig', [math.inf], indirect=True)
 def test_a_silent_camera_holds_no_instant_up(cameras, heard):
     found = in_turn(cameras, heard, ('back', 'left'))
-    assert [names(one) for one in found] == [['left', 'back']] * 6
-    assert {one.left_out for one in found} == {('front',)}
+    assert [names(frame) for frame in found] == [['left', 'back']] * 6
+    assert {frame.left_out for frame in found} == {('front',)}
 
 
 @pytest.mark.usefixtures('known')
 @pytest.mark.parametrize('rig', [math.inf], indirect=True)
 def test_a_frame_that_is_too_late_makes_no_instant_of_its_own(rig, cameras, wait, heard):
-    """Those who wait for a frame may have it."""
+    """Requests that wait for a frame may use it."""
     at_s = now_s()
     cameras(at_s, {'front': 0.0, 'back': 0.0})
     wait(lambda: heard[-1].stamp_ns == round(at_s * 1e9), 'the instant without a camera')
     count, now = len(heard), time.monotonic()
     cameras(at_s, {'left': 0.0})
     assert names(rig.next_frame(now, now + 30.0)) == ['left']
-    time.sleep(0.7)  # all patience is over
+    time.sleep(0.7)  # all waiting times have passed
     assert len(heard) == count and heard[-1].left_out == ('left',)
 
 
 @pytest.mark.parametrize('rig', [0.2], indirect=True)
 def test_a_request_stays_subscribed_until_the_last_cameras_detections(rig, cameras, wait):
-    """Each camera's detections come 1.2 s after those of the camera before."""
+    """Each camera's detections arrive 1.2 s after those of the previous camera."""
     now, found = time.monotonic(), []
     asking = threading.Thread(target=lambda: found.append(rig.next_frame(now, now + 60.0)))
     asking.start()

@@ -26,7 +26,7 @@ DEPTH_ONE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
 
 
 class Ear:
-    """An AdaptiveSubscription, the publishers it may hear, and what it heard."""
+    """An AdaptiveSubscription, the available publishers, and the received messages."""
 
     def __init__(self, listener, speaker, spin_until, topic='~/topic'):
         self._listener, self._speaker, self._spin_until = listener, speaker, spin_until
@@ -43,18 +43,18 @@ class Ear:
         self._speaker.destroy_publisher(publisher)
 
     def endpoints(self):
-        """Return the identity of every subscription there is, as the publishers' node sees."""
+        """Return the identity of every subscription, as the publishers' node sees it."""
         return [bytes(info.endpoint_gid) for info in
                 self._speaker.get_subscriptions_info_by_topic(self.topic)]
 
     def policies(self):
-        """Return the reliability of every subscription there is, as the publishers' node sees."""
+        """Return the reliability of every subscription, as the publishers' node sees it."""
         return [info.qos_profile.reliability for info in
                 self._speaker.get_subscriptions_info_by_topic(self.topic)]
 
     def wait_for_policies(self, *policies):
         self.wait(lambda: self.policies() == list(policies),
-                  f'{[policy.name for policy in policies]} as the subscriptions')
+                  f'{[policy.name for policy in policies]} as the set of subscriptions')
 
     def wait_for_hearing(self, publisher, name):
         def heard():
@@ -96,7 +96,7 @@ def test_a_best_effort_publisher_beside_a_reliable_one_is_heard(ear):
 
 @pytest.mark.filterwarnings('ignore:MultiThreadedExecutor is used with a single thread')
 def test_an_event_that_comes_too_late_blocks_nothing_else(ear, context, wait):
-    """The subscription is destroyed before its event is taken: rclpy stumbles over that."""
+    """The subscription is destroyed before its event is handled, which fails in rclpy."""
     listener, executor = ear._listener, MultiThreadedExecutor(1, context=context)
     busy, release, beside = threading.Event(), threading.Event(), []
 
@@ -114,7 +114,7 @@ def test_an_event_that_comes_too_late_blocks_nothing_else(ear, context, wait):
     wait(busy.is_set, 'the only thread to be busy', spin)
     publisher = ear.offer(RELIABLE)
     for _ in range(20):
-        spin()  # the publisher's coming is an event, and waits for the thread
+        spin()  # the discovery of the publisher is an event, and waits for the thread
     ear.subscription.destroy()
     release.set()
 
@@ -126,7 +126,7 @@ def test_an_event_that_comes_too_late_blocks_nothing_else(ear, context, wait):
 
 
 def test_after_an_empty_message_it_subscribes_anew(ear):
-    """What Fast DDS leaves of an image that was on its way as the subscription came."""
+    """Fast DDS delivers an image as an empty message if it was in transit during discovery."""
     publisher = ear.offer(RELIABLE)
     ear.wait_for_hearing(publisher, 'before')
     former, = ear.endpoints()

@@ -33,7 +33,7 @@ S = 1_000_000_000
 
 
 class Simulation:
-    """A node in simulated time, and what publishes /clock."""
+    """A node in simulated time, and a publisher of /clock."""
 
     def __init__(self, make_node, spin_until):
         self.node = make_node(parameter_overrides=[Parameter('use_sim_time', value=True)])
@@ -45,7 +45,7 @@ class Simulation:
         self._spin_until([self.node, self.world], condition, what, work)
 
     def set_time(self, *moments):
-        """Publish each time [s] until the node's clock shows it."""
+        """Publish each time [s] until the node's clock has it."""
         for seconds in moments:
             message = Clock(clock=stamp(seconds))
             self.spin_until(lambda m=message: self.node.get_clock().now().to_msg() == m.clock,
@@ -59,7 +59,7 @@ def simulation(make_node, spin_until):
 
 @pytest.fixture
 def jumps(simulation):
-    """Watch the simulation's clock; its attribute forgot counts."""
+    """Watch the simulated clock; the attribute forgot counts."""
     forgot = []
     jumps = TimeJumps(simulation.node, lambda: forgot.append(simulation.node.get_clock().now()))
     jumps.forgot = forgot
@@ -88,7 +88,7 @@ def test_time_that_goes_on_is_no_jump(simulation, jumps):
     (3 * (100.0, 101.0), [100.0, 100.0])])  # a bag that loops
 def test_each_jump_back_is_seen_once(simulation, jumps, moments_s, jumps_s):
     simulation.set_time(*moments_s)
-    assert [one.nanoseconds for one in jumps.forgot] == [round(one * S) for one in jumps_s]
+    assert [time.nanoseconds for time in jumps.forgot] == [round(jump_s * S) for jump_s in jumps_s]
 
 
 def test_messages_from_before_a_jump_are_refused(simulation, jumps):
@@ -98,10 +98,10 @@ def test_messages_from_before_a_jump_are_refused(simulation, jumps):
     after = time.monotonic()
     with pytest.raises(TimeJumpError, match=r' 5\.000 s'):
         jumps.check(stamp(99.9), before)
-    assert is_refused(jumps, 95.0, before), 'its counterparts may be from before'
+    assert is_refused(jumps, 95.0, before), 'its counterparts may be from before the jump'
     assert is_refused(jumps, 99.9, after), 'it waited in the middleware'
     assert not is_refused(jumps, 95.0, after) and not is_refused(jumps, 94.9, after)
-    assert is_refused(jumps, 99.9, after + 60.0), 'so it did for long'
+    assert is_refused(jumps, 99.9, after + 60.0), 'it waited for a long time'
     simulation.set_time(99.9)
     assert not is_refused(jumps, 99.9, after), 'time went on'
 
@@ -136,7 +136,7 @@ PARAMETERS = RelocalizerParameters(base_frame='base_link', tf_timeout_s=0.0, gra
 
 
 class Inputs:
-    """Everything that the relocalizer listens to, and a robot that publishes it."""
+    """All topics that the relocalizer subscribes to, and a robot that publishes them."""
 
     def __init__(self, simulation):
         node = simulation.node
@@ -175,15 +175,15 @@ class Inputs:
             self._publishers[message_type].publish(message)
 
     def pair(self, simulation, stamp_s, *message_types):
-        """Publish parts of a frame until they wait for the others."""
+        """Publish parts of a frame until they wait for the other parts."""
         heard = self.frames._pairing.last_stamp_ns
         names = {Image: 'image', CameraInfo: 'camera_info', Detection2DArray: 'detections'}
-        for one in message_types:
-            simulation.spin_until(lambda n=names[one]: heard.get(n) == round(stamp_s * S),
-                                  names[one], lambda t=one: self.publish(stamp_s, t))
+        for kind in message_types:
+            simulation.spin_until(lambda n=names[kind]: heard.get(n) == round(stamp_s * S),
+                                  names[kind], lambda t=kind: self.publish(stamp_s, t))
 
     def run(self, stamp_s):
-        """Return which run of odometry covers a time."""
+        """Return the run of odometry that covers a time."""
         return self.odometry.pose_at(stamp(stamp_s)).run
 
     def up(self, stamp_s):
@@ -205,13 +205,13 @@ def test_what_was_heard_before_a_jump_is_forgotten(simulation, restart_s):
     simulation.spin_until(lambda: inputs.is_known(100.0), 'odometry and vertical',
                           lambda: inputs.publish(100.0, Odometry, Imu))
     run = inputs.run(100.0)
-    # The boxes of an image that was lost: the same stamp comes again.
+    # The boxes of a lost image: the same stamp comes again.
     inputs.pair(simulation, restart_s, Detection2DArray, CameraInfo)
-    inputs.pair(simulation, 98.0, Detection2DArray, CameraInfo)  # no copies are on their way now
+    inputs.pair(simulation, 98.0, Detection2DArray, CameraInfo)  # no copies are in transit now
     simulation.set_time(restart_s)
     assert not inputs.is_known(100.0)
     inputs.pair(simulation, restart_s, Image)
-    assert not inputs.complete, 'an image of now with boxes from before'
+    assert not inputs.complete, 'a new image with boxes from before the jump'
     simulation.spin_until(lambda: inputs.is_known(restart_s), 'odometry and vertical',
                           lambda: inputs.publish(restart_s, Odometry, Imu))
     assert inputs.run(restart_s) != run, 'frames across the jump are not fused'
@@ -221,7 +221,7 @@ def test_what_was_heard_before_a_jump_is_forgotten(simulation, restart_s):
 
 def order_of(*stamps_s, order=None, stream='camera'):
     order = order or StampOrder()
-    return [order.goes_back(stream, round(one * S)) for one in stamps_s]
+    return [order.goes_back(stream, round(stamp_s * S)) for stamp_s in stamps_s]
 
 
 @pytest.mark.parametrize(('stamps_s', 'expected'), [
@@ -238,7 +238,7 @@ def test_streams_have_stamps_of_their_own_until_one_jumps():
     assert order_of(100.0, order=order, stream='odom') == [False]
     assert order_of(5.0, 6.0, order=order, stream='arm') == [False, False]
     assert order_of(50.0, order=order, stream='odom') == [True]
-    # All are forgotten by one: the other is not taken for another jump.
+    # One jump resets all of them: it is not counted twice.
     assert order_of(1.0, order=order, stream='arm') == [False]
     order.clear()
     assert order_of(1.0, order=order, stream='odom') == [False]
@@ -253,7 +253,7 @@ def test_a_stamp_that_is_no_time(given, problem):
 
 
 def named(*messages, stamps=None):
-    """Take in stamps and contents, .1 s apart; return which are named, and the stamps."""
+    """Feed stamps and contents, .1 s apart; return the reported ones, and the stamps."""
     stamps = stamps or MessageStamps()
     return [stamps.add(stamp(one), content, 500.0 + 0.1 * number)
             for number, (one, content) in enumerate(messages)], stamps
@@ -264,9 +264,9 @@ def named(*messages, stamps=None):
     ([(1.0, 'a'), (1.1, 'b'), (1.2, 'c')], [True] * 3, True),
     ([(1.1, 'a'), (1.0, 'b'), (1.2, 'c')], [True] * 3, True),  # out of order
     ([(1.0, 'a'), (1.0, 'a'), (1.1, 'b'), (1.1, 'b'), (1.2, 'c')], [True] * 5, True),  # twice
-    ([(1.0, one) for one in 'abcd'], [True, False, False, False], False),  # it stands still
+    ([(1.0, letter) for letter in 'abcd'], [True, False, False, False], False),  # it stands still
     ([(1.0 + row // 2, one) for row, one in enumerate('abcdefgh')], [True] + [False] * 7, False),
-    ([(0.0, one) for one in 'abc'], [False] * 3, False),
+    ([(0.0, letter) for letter in 'abc'], [False] * 3, False),
     ([(0.0, 'a'), (1.0, 'b'), (1.1, 'c'), (1.2, 'd')], [False, False, False, True], True),
     ([(1.0, 'a'), (1.0, 'a'), (1.0, 'b'), (1.0, 'b')], [True, True, False, True], False),
     ([(1.0, 'a'), (1.1, 'b'), (1.2, 'c'), (900.0, 'd')], [True] * 4, False)])  # another clock

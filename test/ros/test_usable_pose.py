@@ -10,7 +10,7 @@ from rclpy.time import Time
 
 from cliploc_ros.ros.handoff import usable_pose
 
-# x, xy, yx, y and yaw: all that AMCL reads
+# x, xy, yx, y and yaw: the elements that AMCL reads
 AMCL_READS = [0, 1, 6, 7, 35]
 
 
@@ -33,7 +33,7 @@ def test_a_covariance_stays_one_and_is_never_zero(numbers, scale):
     assert np.linalg.eigvalsh(covariance).min() > -1e-9
     np.testing.assert_array_equal(covariance - np.diag(np.diag(covariance)),
                                   given_covariance - np.diag(np.diag(given_covariance)))
-    # what was large enough is as true as it was
+    # large enough values are unchanged
     large = np.diag(given_covariance) > 1e-4
     np.testing.assert_array_equal(np.diag(covariance)[large], np.diag(given_covariance)[large])
 
@@ -50,4 +50,4 @@ def test_the_stamp_is_the_images_but_not_later_than_now(image_s, now_s, publishe
     usable = usable_pose(pose, Time(seconds=now_s))
     assert usable.header.stamp.sec == published_s
     assert usable.header.frame_id == 'map'
-    assert pose.header.stamp.sec == image_s, 'what is published elsewhere is not touched'
+    assert pose.header.stamp.sec == image_s, 'the published message is not changed'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The vertical as base and IMU tell it."""
+"""The vertical from the base and from the IMU."""
 
 import numpy as np
 import pytest
@@ -66,9 +66,9 @@ TILTED_UP = CAMERA_FROM_BASE[:3, :3] @ TILT.inv().apply([0, 0, 1])
     ((0.0, 0.0, 0.0), TILT.as_quat(), 0.0, TILTED_UP),  # not filled
     # 3 degrees off: a cheap accelerometer
     ((GRAVITY[0] + 0.5, *GRAVITY[1:]), TILT.as_quat(), 0.0, TILTED_UP),
-    # rclcpp, rclpy and every driver that fills the acceleration alone send w = 1
+    # rclcpp, rclpy and every driver that fills only the acceleration send w = 1
     (GRAVITY, (0, 0, 0, 1), 0.0, TILTED_UP),
-    # a simulator without noise: a covariance of zeros or of its own
+    # a simulator without noise: a covariance of zeros or a real one
     ((0.0, 0.0, 9.81), (0, 0, 0, 1), 0.0, (0, -1, 0)),
     ((0.0, 0.0, 9.81), (0, 0, 0, 1), 1e-6, (0, -1, 0))])
 def test_an_orientation_counts_more_than_an_acceleration_but_not_a_default_one(
@@ -94,7 +94,7 @@ def test_an_orientation_that_contradicts_gravity_is_refused(source, quat_xyzw, a
 
 
 def test_a_wrong_orientation_stays_refused_when_the_robot_starts(source):
-    """It was seen to be wrong at rest; now the accelerometer cannot show it."""
+    """It was detected at rest; now the accelerometer cannot show it."""
     wrong = Rotation.from_euler('y', 60, degrees=True).as_quat()
     for number in range(20):
         acceleration = (0.0, 0.0, 9.81) if number < 15 else (4.0, 0.0, 9.81)
@@ -104,7 +104,7 @@ def test_a_wrong_orientation_stays_refused_when_the_robot_starts(source):
 
 
 def test_a_message_out_of_order_costs_nothing(source):
-    """Drivers stamp in several threads; one that is more than a second late is a jump."""
+    """Drivers stamp in several threads; a stamp that is more than a second late is a jump."""
     for seconds in (49.92, 49.93, 49.929, 49.94, 50.05, 50.02):
         source.take(imu((5.0 if seconds < 50 else -5.0, 0.0, 9.81), seconds=seconds))
     assert len(source._samples) == 6
@@ -132,7 +132,7 @@ def test_it_listens_from_open_to_close(source, make_node, spin_until):
     publisher = talker.create_publisher(Imu, 'imu', 10)
     source.open('base_frame')
     assert source._subscription is None
-    for _ in range(2):  # opened twice, closed twice: it is all the same
+    for _ in range(2):  # opening or closing it twice has no effect
         source.open('imu')
     spin_until([talker, source._node], lambda: len(source._samples),
                'a message', work=lambda: publisher.publish(imu()))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures are made for those who look, and else not at all."""
+"""Pictures are made only for subscribers."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def visualization(make_node):
 def test_what_nobody_looks_at_is_not_computed(visualization):
     _, shown = visualization
     shown.set_map(ROOM)
-    # there is nothing to compute it from
+    # there is no input to compute it from
     shown.show(HEADER, None, None, None)
     assert not shown.wants_debug_image
 
@@ -47,8 +47,8 @@ def test_each_is_made_for_itself(visualization, make_node, spin_until, topic, me
     found = Relocalizer(ROOM, RelocalizerOptions(matching='class', algorithm='bf')).relocalize(
         [Observation(CAMERA, see_room(ROOM))])
     if topic == 'debug_image':
-        spin_until([node, viewer], lambda: shown.wants_debug_image, 'it to be wanted')
-        shown.show(HEADER, None, None, None)  # the others are not looked at
+        spin_until([node, viewer], lambda: shown.wants_debug_image, 'a subscriber')
+        shown.show(HEADER, None, None, None)  # the others have no subscriber
         return
     spin_until([node, viewer], lambda: heard, 'what is shown',
                lambda: shown.show(HEADER, ROOM, found, CAMERA_FROM_BASE))

@@ -27,7 +27,7 @@ def worker(reports):
 
 
 class Gate:
-    """A task that runs until it is let through."""
+    """A task that runs until it is released."""
 
     def __init__(self):
         self.entered, self._open = threading.Event(), threading.Event()
@@ -74,7 +74,7 @@ def test_a_defect_is_reported_with_its_traceback_and_survived(worker, reports, e
 
 
 def test_a_task_whose_time_is_up_before_its_turn_never_runs(worker, gate):
-    """Else requests that time out would pile up behind a slow task."""
+    """Otherwise requests that time out would accumulate behind a slow task."""
     running, ran = gate.hold(worker), []
     for number in range(3):
         with pytest.raises(TimeUpError):
@@ -103,7 +103,7 @@ def test_stop_does_not_wait_for_a_long_task_but_drops_what_waits(worker, gate):
 
 
 class Announcing(Worker):
-    """Says when a task is in the queue."""
+    """Signals that a task is in the queue."""
 
     def __init__(self, report):
         super().__init__(report)
@@ -132,7 +132,7 @@ def test_whoever_waits_in_run_learns_that_the_node_stops(gate, is_running):
     asker.start()
     assert worker.queued.wait(PATIENCE_S)
     worker.stop()
-    asker.join(PATIENCE_S / 2)  # before the gate gives up
+    asker.join(PATIENCE_S / 2)  # before the gate times out
     assert [type(error) for error in learned] == [StoppedError]
     gate.open()
 

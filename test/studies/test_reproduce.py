@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper with one command, from a server of this machine, on the demo's room and networks."""
+"""Reproduce the paper with one command, from a local server, with the demo's room and networks."""
 
 import csv
 import fcntl
@@ -38,13 +38,13 @@ pytestmark = pytest.mark.full
 PROJECT = Path(__file__).resolve().parents[2]
 SHIPPED = yaml.safe_load((PROJECT / 'studies/reproduce.yaml').read_text())
 ARCHIVE = 'rgbd_dataset_freiburg3_demo.tgz'
-# huggingface_hub writes 10 MiB at once: the archive is longer, and held back after more.
+# huggingface_hub writes 10 MiB at a time, so the archive is longer and is interrupted later.
 FILLER_BYTES, HELD_BYTES = 12 * 2**20, 11 * 2**20
 PATIENCE_S = 120
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Sends files, or the rest of them; holds one back after its first bytes."""
+    """Sends files or their remaining parts; interrupts one after its first bytes."""
 
     def do_GET(self):
         server, name = self.server, self.path.strip('/')
@@ -100,7 +100,7 @@ def archive_of_walk():
 
 
 def sources_of(address, **changes):
-    """Return sources on a server; few classes are mapped, for the test to be short."""
+    """Return sources on a server; few classes are mapped to keep the test short."""
     sequence = {'name': 'the demo', 'url': f'{address}/{ARCHIVE}', 'megabytes': 4.3,
                 'licence': 'Apache-2.0', 'unpacked': 9, 'queries': 4,
                 'paper': SHIPPED['sequences']['fr3']['paper']}
@@ -117,7 +117,7 @@ def sources_of(address, **changes):
 
 @pytest.fixture
 def write_sources(server, tmp_path):
-    """Write sources for the server with changes of the sequence; return their file."""
+    """Write sources for the server with changes of the sequence; return the file."""
     def write(**changes):
         file = tmp_path / 'sources.yaml'
         file.write_text(yaml.safe_dump(sources_of(
@@ -128,13 +128,13 @@ def write_sources(server, tmp_path):
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """An empty cache of the user, but for the demo's converted networks."""
+    """Set an empty cache of the user, except for the demo's converted networks."""
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
 
 
 @pytest.fixture
 def refused(run_here):
-    """Run in this process, and return the one line of the error."""
+    """Run in this process, and return the single line of the error."""
     def run(*arguments):
         done = run_here(reproduce.main, 'fr3', *arguments)
         assert done.returncode == 1
@@ -157,7 +157,7 @@ def kill_once(sources, out, condition):
 
 
 def results_of(out):
-    """Return all that does not depend on how fast the machine is."""
+    """Return all results that do not depend on the speed of the machine."""
     def lasting(row):
         return {name: value for name, value in row.items() if '_ms' not in name}
 
@@ -247,7 +247,7 @@ def test_what_cannot_be_downloaded(server, write_sources, refused, tmp_path):
     said = refused(*given)
     assert 'cannot download' in said and '404' in said and 'Check network and address' in said
     server.files['yolo.onnx'] = weights
-    # The server's file is shorter now than what was downloaded of an older one.
+    # The server's file is now shorter than the part downloaded from an older one.
     part = tmp_path / 'out/downloads/yolo.onnx.partial'
     part.write_bytes(bytes(len(weights) + 1))
     assert '416' in refused(*given)
@@ -266,7 +266,7 @@ def test_another_file_at_an_address(server, write_sources, refused, tmp_path):
     given = ('--yes', '--sources', write_sources(sha256='0' * 64), '--out', tmp_path / 'out')
     said = refused(*given)
     assert f'expected {"0" * 64}' in said and f'kept as {ARCHIVE}.refused' in said
-    # a digest that nobody knew is compared later, too
+    # a digest that was unknown at first is compared later
     (tmp_path / 'out/downloads/yolo.onnx').write_bytes(b'something else')
     assert 'yolo.onnx has SHA-256' in refused(*given)
     assert not (tmp_path / 'out/downloads/yolo.onnx').exists()
@@ -350,14 +350,14 @@ def test_the_form_of_the_shipped_sources():
     """The addresses cannot be opened here."""
     sources = reproduce.Sources.of_file(PROJECT / 'studies/reproduce.yaml')
     assert (*sources.recordings,) == ('fr2', 'fr3', 'kitchen')
-    for one in (*sources.networks, *sources.recordings.values()):
-        address = urlparse(one.url)
+    for download in (*sources.networks, *sources.recordings.values()):
+        address = urlparse(download.url)
         assert address.scheme == 'https' and address.hostname in {
             'cvg.cit.tum.de', 'download.microsoft.com', 'github.com',
             'openaipublic.azureedge.net'}
         assert Path(address.path).suffix in ('.tgz', '.zip', '.pt')
-        assert re.fullmatch('([0-9a-f]{64})?', one.sha256)
-        assert one.licence and one.megabytes > 0
+        assert re.fullmatch('([0-9a-f]{64})?', download.sha256)
+        assert download.licence and download.megabytes > 0
     encoder = sources.networks[1]
     assert encoder.sha256 in encoder.url
     paper = (PROJECT.parent / 'shared/paper/clip-loc.tex')

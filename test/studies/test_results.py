@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Results of studies: measured, written, copied into pages, and safe from edits by hand."""
+"""Results of studies: measured, written, copied into pages, and protected from manual edits."""
 
 import pytest
 

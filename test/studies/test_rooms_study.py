@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The study of real rooms, on the demo's recording and images of elsewhere."""
+"""The study of real rooms, with the demo's recording and images of another place."""
 
 import json
 import shutil
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.full
 
 @pytest.fixture(scope='module')
 def asked(tmp_path_factory):
-    """Ask the demo's room and images without poses; return the folder, and what was printed."""
+    """Run the study on the demo's room and images without poses; return folder and output."""
     folder = tmp_path_factory.mktemp('rooms')
     shutil.copytree(ASSETS / 'sequence', folder / 'demo')
     (folder / 'elsewhere' / 'images').mkdir(parents=True)
@@ -37,9 +37,10 @@ def asked(tmp_path_factory):
 
 def test_images_between_the_mapped_ones_are_found(asked):
     outcomes = json.loads((asked[0] / 'outcomes.json').read_text())
-    for way, least in (('objects', 0.4), ('both', 0.75)):  # half of the images make the map
-        errors = [one['error_m'] for one in outcomes if one['way'] == way and one['known'] == '-'
-                  and one['kind'] == 'in turn' and one['asked'] == 'demo']
+    for way, least in (('objects', 0.4), ('both', 0.75)):  # half of the images are mapped
+        errors = [outcome['error_m'] for outcome in outcomes
+                  if outcome['way'] == way and outcome['known'] == '-'
+                  and outcome['kind'] == 'in turn' and outcome['asked'] == 'demo']
         assert len(errors) == 6
         assert np.mean(np.array(errors) < 0.25) >= least
     robot = [outcome['error_m'] for outcome in outcomes
@@ -51,4 +52,4 @@ def test_nothing_is_accepted_elsewhere(asked):
     outcomes = json.loads((asked[0] / 'outcomes.json').read_text())
     elsewhere = [outcome for outcome in outcomes if outcome['asked'] == 'elsewhere']
     assert len(elsewhere) == 4 * 2 * 3  # parts, images, ways
-    assert not any(one['accepted'] for one in elsewhere)
+    assert not any(outcome['accepted'] for outcome in elsewhere)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Real odometry, IMUs and accelerometers beside the deviations that are assumed of them."""
+"""Real odometry, IMUs and accelerometers compared with the assumed deviations."""
 
 import re
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.full
 
 
 def numbers(row):
-    return [float(one) for one in re.findall(r'-?\d+\.?\d*', row.replace('test1', ''))]
+    return [float(number) for number in re.findall(r'-?\d+\.?\d*', row.replace('test1', ''))]
 
 
 def test_the_deviations_of_odometry_cover_a_real_husky(shared_data):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark runs, and its plain loop finds what the kernel finds."""
+"""The benchmark runs, and its plain loop gives the same result as the kernel."""
 
 import re
 import subprocess

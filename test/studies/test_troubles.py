@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps, detections and sensors go wrong as said, and the study counts every request."""
+"""Errors of maps, detections and sensors are applied as described; every request counts."""
 
 from dataclasses import replace
 
@@ -52,10 +52,10 @@ def test_boxes_are_of_another_image_or_convention(queries, change, level, expect
 def test_the_table_counts_each_request_once(capsys):
     assert run(['stress', '--worlds', '1', '--kinds', 'room', '--only', 'two identical']) == 0
     _, _, *rows = capsys.readouterr().out.strip().splitlines()
-    assert len(rows) == 3, 'one for each mode'
+    assert len(rows) == 3, 'one row for each mode'
     for row in rows:
         _, _, _, requests, success, found, false, *_ = row.strip('| ').split(' | ')
-        shares = [float(one) for one in success.split()]
+        shares = [float(share) for share in success.split()]
         assert int(requests) == 4
         assert 0 <= int(false) <= int(found) <= 4
         assert shares == sorted(shares) and 4 * shares[-1] == round(4 * shares[-1])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The study of the watch: simulated localizers, and recorded ones."""
+"""The study of the watch: simulated and recorded localizers."""
 
 import json
 import shutil
@@ -52,14 +52,14 @@ def looked(states, errors_m, chances):
 
 
 def test_figures_of_a_short_drive():
-    """Looks 2 s and .5 m apart; one false alarm, then wrong poses that the third look notices."""
+    """Looks 2 s and .5 m apart: one false alarm, then wrong poses that the third look detects."""
     looks = looked(['localized', 'lost', 'lost', 'localized', 'localized', 'uncertain', 'lost'],
                    [0.1, 0.1, 0.2, 0.1, 3.0, 3.0, 3.0], [0.9, 0.04, 0.3, 0.99, 0.95, 0.4, 0.01])
-    assert [one.stamp_s for one in alarms_of(looks)] == [2.0, 12.0]
+    assert [alarm.stamp_s for alarm in alarms_of(looks)] == [2.0, 12.0]
     found = summarize_watch(looks)
     assert found['alarms'] == 2
     assert found['false_alarms'] == 1
-    assert found['false_alarms_per_hour'] == pytest.approx(300.0)  # one in 12 s
+    assert found['false_alarms_per_hour'] == pytest.approx(300.0)  # one alarm in 12 s
     assert found['wrong_stretches'] == [
         {'stamp_s': 8.0, 'seconds': 4.0, 'metres': 1.0, 'looks': 3}]
     assert found['states'] == {'localized': 3, 'uncertain': 1, 'lost': 3}
@@ -76,7 +76,7 @@ def test_without_truth_nothing_is_false(tmp_path):
 
 @pytest.fixture(scope='module')
 def observations(tmp_path_factory):
-    """The first images of the demo's walk; half way the localizer jumps by 2 m."""
+    """Return the first images of the demo's walk; halfway the localizer jumps by 2 m."""
     folder = tmp_path_factory.mktemp('watched')
     shutil.copytree(ASSETS / 'sequence', folder / 'tum')
     images = folder / 'tum/rgb.txt'
@@ -122,5 +122,5 @@ def test_a_localizer_that_jumps_is_noticed(observations, tmp_path):
     assert found['false_alarms'] == 0
     stretch, = found['wrong_stretches']
     assert stretch['looks'] <= 5
-    assert 'localized' in {one['state'] for one in found['every_look'][2:7]}
+    assert 'localized' in {look['state'] for look in found['every_look'][2:7]}
     assert found['every_look'][-1]['error_m'] == pytest.approx(2.0, abs=0.1)

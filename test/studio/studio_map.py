@@ -67,7 +67,7 @@ other_node:
 
 
 def demo_studio(path):
-    """Return a studio of the demo's map, written to a path, with its walk: images and poses."""
+    """Return a studio of the demo's map, written to a path, with its walk's images and poses."""
     shutil.copy(ASSETS / 'map.yaml', path)
     folder = ASSETS / 'sequence'
     return Studio(Document(path), Recording(views_of_folder(folder), open_images(folder, None)))
@@ -87,7 +87,7 @@ def open_page(studio, host='127.0.0.1'):
 
 @contextmanager
 def person_at(chromium, studio, has_scene=False):
-    """Serve the page of a studio, and open it; yield the person at it and the server."""
+    """Serve the page of a studio, and open it; yield the person at the page and the server."""
     with open_page(studio) as (url, server):
         person = Person(chromium, url, has_scene)
         yield person, server
@@ -96,7 +96,7 @@ def person_at(chromium, studio, has_scene=False):
 
 
 def write_two_rooms(path):
-    """Write the map; its rooms are 7 m apart, and labels in them are equal."""
+    """Write the map of two rooms 7 m apart with equal labels."""
     centers = np.concatenate([_ROOM, _ROOM + np.array([7.0, 0.0, 0.0])])
     count = len(centers)
     classes = _CLASSES * 2

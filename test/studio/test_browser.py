@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The studio in a real browser, which does what a person does."""
+"""The studio in a real browser, used as a person would."""
 
 
 import numpy as np
@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.full, pytest.mark.clock,
 
 
 def test_select_type_relabel_undo_save_reload(person, studio, path):
-    """The file holds exactly what a person typed, and every other line as it was."""
+    """The file contains exactly the typed text; every other line is unchanged."""
     document, before = studio.document, path.read_text()
     person.select(document, 'mug_2')
     person.mode('Edit')
@@ -46,7 +46,7 @@ def test_select_type_relabel_undo_save_reload(person, studio, path):
 
 
 def test_boxes_are_drawn_dragged_and_linked(person, studio):
-    """A box by the mouse, its edge dragged; the next view shows where the object lies."""
+    """Draw a box with the mouse and drag its edge; the next view shows the object's place."""
     person.mode('Create')
     person.draw_box(studio, 0, (300, 200, 360, 290))
     assert np.allclose(studio.new.boxes[0], (300, 200, 360, 290), atol=2.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keys, files that change, tokens, hostile maps and lost connections, in a real browser."""
+"""Keys, changed files, tokens, hostile maps and lost connections, in a real browser."""
 
 
 import pytest
@@ -16,8 +16,8 @@ pytestmark = [pytest.mark.full, pytest.mark.clock,
 
 
 def test_a_hostile_map_is_shown_as_text(chromium, path):
-    """Ids, labels, classes, unknown fields and the coordinate frame hold HTML and long texts."""
-    # an id holds no dots
+    """Ids, labels, classes, unknown fields and coordinate frame contain HTML and long texts."""
+    # an id contains no dots
     attack = '<img src=x onerror="self[`hacked`]=1"><script>self[`hacked`]=1</script>'
     tree = yaml.safe_load((ASSETS / 'map.yaml').read_text())
     one = tree['/**']['ros__parameters']['map']

@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.full, pytest.mark.clock,
 
 
 def test_coverage_and_look_alikes(chromium, path):
-    """They are found, stale after an edit, and found again with what has changed."""
+    """They are found, become outdated by an edit, and are found again with the changes."""
     write_two_rooms(path)
     document = Document(path)
     with person_at(chromium, Studio(document)) as (person, server):
@@ -24,7 +24,7 @@ def test_coverage_and_look_alikes(chromium, path):
         person.mode('Test')
         person.click('Coverage and look-alikes')
         person.row('cup_0').click()
-        wait_for(lambda: document.selection == ('cup_0',), 'the page answers meanwhile')
+        wait_for(lambda: document.selection == ('cup_0',), 'the page stays responsive')
         page.get_by_text('pairs of places that look alike: 1').wait_for()
         person.picture('places')
         tiles = server.scene._handle_from_node_name['/coverage/tiles']
@@ -40,7 +40,7 @@ def test_coverage_and_look_alikes(chromium, path):
 
 
 def test_layers_film_and_a_click_on_the_image(person, studio):
-    """The panel of the scene switches layers and plays views; a click takes the outline there."""
+    """The scene's panel switches layers and plays views; a click sets the outline there."""
     page, handles = person.page, studio.server.scene._handle_from_node_name
     page.get_by_text('Layers and viewpoints').click()
     page.get_by_label('Cameras').click()

@@ -33,7 +33,7 @@ def document(path):
 
 
 def changed_lines(path, text=TEXT):
-    """Return the lines that the file has lost and won, without their indentation."""
+    """Return the lines that were removed and added, without indentation."""
     old, new = text.splitlines(), path.read_text().splitlines()
     return ([line.strip() for line in old if line not in new],
             [line.strip() for line in new if line not in old])
@@ -48,7 +48,7 @@ def test_an_edit_changes_its_line_only(document, path):
 
 
 def test_all_kinds_of_lines(document, path):
-    """A list over several lines, a folded text, a new field, one that goes, a new landmark."""
+    """A list over several lines, a folded text, a new field, a removed field, a new landmark."""
     document.edit(edits.set_fields, ['book_1', 'plant_1'], label='yes: "no" # <b>')
     document.edit(edits.set_fields, ['book_1'], center=[0, 0, 1e-6])
     document.edit(edits.set_fields, ['book_1'], class_id='off')
@@ -119,7 +119,7 @@ def test_what_no_map_may_hold_is_refused(document, edit, message):
 
 
 def test_merging_halves_gives_back_the_whole(document):
-    """The halves of a split lie in the whole; their union's moments are near its moments."""
+    """The halves of a split lie within the original; their joint moments are near its moments."""
     whole = document.landmarks['plant_1']
     document.edit(edits.split, 'plant_1')
     first, second = (document.landmarks[key] for key in ('plant_1', 'plant_2'))
@@ -200,7 +200,7 @@ def test_two_studios_do_not_edit_one_map(path):
 
 
 def act(document, action, number):
-    """Do one thing of a random session; return the document, which may be another one."""
+    """Do one action of a random session; return the document, which may be a new one."""
     ids, landmarks = list(document.landmarks), document.landmarks
     if action in ('undo', 'redo', 'save'):
         getattr(document, action)()

@@ -28,7 +28,7 @@ def office(shared_data):
 
 
 def draw_triple(directions, rng):
-    """Return three rows whose directions are 25 to 90 degrees apart, or None."""
+    """Return three rows with directions 25 to 90 degrees apart, or None."""
     for _ in range(200):
         rows = rng.choice(len(directions), 3, replace=False)
         cosines = (directions[rows] @ directions[rows].T)[np.triu_indices(3, 1)]
@@ -41,7 +41,7 @@ def draw_triple(directions, rng):
 def draw_boxes(office, script, rng):
     """Yield three boxes of one landmark and the rows of its other views.
 
-    The boxes come with their poses, as fit_boxes takes them. The script tells which rows may be
+    The boxes have their poses, in the format of fit_boxes. The script tells which rows may be
     drawn, and how: as the detector does unless it says more.
     """
     detections, views, landmarks, shown = office
@@ -81,7 +81,7 @@ def iou_in_other_views(office, script):
     ('its boxes that fit the landmark (IoU .8)', 0.73),
     ('simulated: a person is off by 3 % of the box on each edge', 0.75)])
 def test_three_boxes_make_a_landmark_that_fits_other_views(office, name, least):
-    """The figure is taken on the detector's own boxes, and these have .79 with the map itself."""
+    """The number refers to the detector's boxes, which have .79 with the map itself."""
     detections, views = office[:2]
     rng = np.random.default_rng(1)
 

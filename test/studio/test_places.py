@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Coverage and look-alike places of the studio, without a browser."""
+"""Coverage and places that look alike in the studio, without a browser."""
 
 import re
 import threading
@@ -49,7 +49,7 @@ def test_an_edit_changes_the_figures_and_the_positions_stay(studio):
     assert any(line.endswith('alike: 0 (was 1)') for line in lines)
     assert any(re.search(r'\d+ of \d+ \(was \d+ of \d+\)', line) for line in lines)
     again = find_places(document.landmarks, None, after, silent)
-    assert again.figures == after.figures, 'equal maps, equal figures'
+    assert again.figures == after.figures, 'equal maps give equal numbers'
 
 
 def test_the_time_is_bounded(studio):
@@ -60,7 +60,7 @@ def test_the_time_is_bounded(studio):
 
 
 def test_positions_that_only_keyframes_reach_are_told_apart(studio):
-    """In the words of the check, and in a colour of their own."""
+    """The words are those of the check, with a separate colour."""
     landmarks = studio.document.landmarks
     without = find_places(landmarks, None, None, silent)
     figure = 'where a robot is localized'
@@ -86,7 +86,7 @@ def test_positions_that_only_keyframes_reach_are_told_apart(studio):
 
 
 def test_a_search_is_stopped_and_grows_old(studio):
-    """The first share that is told comes from the search's thread; then it waits for the test."""
+    """The first progress report comes from the search's thread, which then waits for the test."""
     document = studio.document
 
     def search():
@@ -107,6 +107,6 @@ def test_a_search_is_stopped_and_grows_old(studio):
     document.edit(edits.delete, ['cup_0'])
     assert studio.is_stale
     document.undo()
-    assert not studio.is_stale, 'the map is as it was'
+    assert not studio.is_stale, 'the map is unchanged'
     document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
     assert not studio.is_stale, 'a lock changes nothing'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The studio's actions and its gate, without a browser."""
+"""The studio's actions and access control, without a browser."""
 
 import shutil
 import urllib.error
@@ -30,7 +30,7 @@ def studio(tmp_path):
 
 @pytest.fixture
 def office(tmp_path, shared_data):
-    """The shared office with its boxes; no images."""
+    """Return the shared office with its boxes, without images."""
     folder = shared_data / 'tum_fr3_office'
     path = tmp_path / 'map.yaml'
     shutil.copy(folder / 'map.yaml', path)
@@ -44,16 +44,16 @@ def test_outlines_lie_in_the_image(studio):
     recording = studio.recording
     outlines = recording.outlines(studio.document.landmarks, 3)
     assert recording.image(3).shape == (480, 640, 3) and recording.image(-1) is None
-    assert [one.distance_m for one in outlines] == sorted(one.distance_m for one in outlines)
+    assert [each.distance_m for each in outlines] == sorted(each.distance_m for each in outlines)
     assert all((outline.bbox_xyxy[:2] < (640, 480)).all() and (outline.bbox_xyxy[2:] > 0).all()
                for outline in outlines)
 
 
 def test_sightings_are_sharp_whole_and_from_several_sides(studio):
-    """A view that a blur makes useless does not come first."""
+    """A view that is too blurred is not shown first."""
     document, recording = studio.document, studio.recording
     first = recording.sightings(document.landmarks, 'mug_1')
-    assert all(one.is_whole and not one.is_detected for one in first)
+    assert all(shot.is_whole and not shot.is_detected for shot in first)
     best, images = first[0].view, recording.images
 
     class Blurred:
@@ -86,7 +86,7 @@ def test_moved_landmarks_come_back_by_refitting(office):
 
 
 def test_the_review_goes_from_the_worst_to_the_end(office):
-    """A moved landmark is fixed, a duplicate merged; each decision leads to the next one."""
+    """A moved landmark is fixed, a duplicate merged; each decision leads to the next finding."""
     document, review = office.document, office.review
     twin, moved = (document.landmarks[key] for key in ('book_2', 'tv_1'))
     document.edit(edits.create, 'a twin', 'book', twin.center + 0.01, twin.basis)
@@ -112,7 +112,7 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
 def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     document = office.document
     before = office.relocalize_all()
-    accepted = sum(one.verdict == 'accepted' for one in office.answers.values())
+    accepted = sum(answer.verdict == 'accepted' for answer in office.answers.values())
     assert 'simulated' in before and '(was' not in before and accepted > 10
     accepted_view = next(view for view, one in office.answers.items()
                          if one.verdict == 'accepted')
@@ -124,7 +124,7 @@ def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     office.delete()
     after = office.relocalize_all()
     assert f'(was {accepted})' in after
-    assert sum(one.verdict == 'accepted' for one in office.answers.values()) < accepted
+    assert sum(answer.verdict == 'accepted' for answer in office.answers.values()) < accepted
     print(f'as given: {before}; every other landmark deleted: {after}')
 
 
@@ -140,7 +140,7 @@ def answer(url, **headers):
 
 
 def opens(host, origin, path='/'):
-    """Return whether a WebSocket of a page from an origin opens."""
+    """Return whether a WebSocket from a page of an origin opens."""
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
@@ -155,7 +155,7 @@ def opens(host, origin, path='/'):
 @pytest.mark.needs('viser')
 @pytest.mark.parametrize('host', ['127.0.0.1', '0.0.0.0'])
 def test_only_who_has_the_token_opens_the_page(tmp_path, host):
-    """Not another user of this machine, nor a page of another site."""
+    """Neither another user of this machine nor a page of another site has access."""
     with open_page(Studio(Document(tmp_path / 'map.yaml')), host) as (url, _):
         base, token = url.rstrip('/').rsplit('/', 1)
         assert len(token) >= 32 and answer(url) == 200
@@ -180,7 +180,7 @@ def test_the_address_on_the_command_line_of_a_browser_opens_the_page_once(tmp_pa
 
 
 def test_an_address_beyond_ascii_is_refused():
-    """As websockets reads it: an error here would be answered as one of the server."""
+    """As websockets reads it: an error here would be reported as a server error."""
     gate = Gate('127.0.0.1')
     assert gate.admit(Request('/\udcff\udcfe/', Headers({'Host': '127.0.0.1'}))) is None
     assert gate.admit(Request(f'{gate.path}\udcff', Headers({'Host': '127.0.0.1'})))

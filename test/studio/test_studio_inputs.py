@@ -26,7 +26,7 @@ COUNT = 20
 
 @pytest.fixture(params=['sqlite3', 'mcap'])
 def bag(request, tmp_path):
-    """Images that are recorded 0.4 s after they were taken, the last two at once."""
+    """Return images recorded 0.4 s after their stamps, the last two at once."""
     path = tmp_path / 'bag'
     with BagWriter(path, request.param) as writer:
         writer.add_topic('/camera_info', bag_messages.CAMERA_INFO)
@@ -69,7 +69,7 @@ def test_the_layer_comes_with_its_map(tmp_path, capsys):
 
 
 def test_a_map_of_keyframes_alone_gets_its_first_landmark(tmp_path, capsys):
-    """The keyframes stay those of the map."""
+    """The keyframes stay the same as in the map."""
     path = tmp_path / 'bare.yaml'
     write_bare_map(path, make_layer(LandmarkMap.empty('map')))
     walk = Path(__file__).parents[2] / 'demo/assets/sequence'

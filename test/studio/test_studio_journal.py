@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The journal of the map studio: what is left of a session that was killed."""
+"""The journal of the map studio: the remains of a session that was killed."""
 
 import re
 import signal
@@ -64,7 +64,7 @@ def journal_of(path):
 
 
 def test_replay_between_announcing_and_writing(path):
-    """A studio that was killed while it saved: either content has the right edits."""
+    """The studio was killed while saving: either content has the correct edits."""
     document = Document(path)
     document.edit(edits.set_fields, ['cup_1'], label='first')
     document.edit(edits.mark, ['book_1'], 'lock', is_locked=True)

@@ -18,7 +18,7 @@ from cliploc_ros.errors import MapError
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 
-IDS = ('plant_1', 'gone_1', 'cup_1', 'book_1')  # not in the map's order, and one too many
+IDS = ('plant_1', 'gone_1', 'cup_1', 'book_1')  # not in the map's order, with one extra
 SIZE = 16
 
 
@@ -39,7 +39,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def rows(path):
-    """Mean and medoids by landmark, as they were at first."""
+    """Return the original mean and medoids by landmark."""
     return rows_of(path)
 
 
@@ -60,14 +60,14 @@ def change_all(document):
 
 
 def check_all(path, rows):
-    """A merged landmark has the mean by support, each half the whole's rows, a new one none."""
+    """A merged landmark has the weighted mean, each half the original rows, a new one none."""
     found = rows_of(path)
     assert sorted(found) == ['book_1', 'cup_1', 'plant_1', 'plant_2']
     mean = rows['cup_1'][0].astype(float) + 3.0 * rows['book_1'][0].astype(float)
     np.testing.assert_allclose(found['cup_1'][0], mean / np.linalg.norm(mean), atol=2e-3)
     both = np.concatenate([rows['cup_1'][1], rows['book_1'][1]])
     assert len(found['cup_1'][1]) == 5
-    assert all((both == one).all(axis=1).any() for one in found['cup_1'][1])
+    assert all((both == medoid).all(axis=1).any() for medoid in found['cup_1'][1])
     assert is_equal(found['plant_1'], rows['plant_1'])
     assert is_equal(found['plant_2'], rows['plant_1'])
     assert not found['book_1'][0].any() and not len(found['book_1'][1]), 'not the old book'

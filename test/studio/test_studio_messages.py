@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages that no page of ours sends: they are refused, and the page goes on for everybody."""
+"""Messages that the page never sends are refused, and the page keeps working for everybody."""
 
 import io
 import json
@@ -58,7 +58,7 @@ def page(tmp_path):
     ({'x': []}, [{}]), ('x' * 100_000, [{}]), ('_start', [{'name': 'save', 'values': {}}])],
     ids=lambda value: '' if isinstance(value, list) else str(value)[:20])
 def test_hostile_messages_are_refused(page, caplog, action, hostile):
-    """Neither an internal error nor a picture of the page that cannot be made."""
+    """There is neither an internal error nor an impossible picture."""
     from cliploc_ros.offline.studio.parts import parts_of
 
     desk, document = page.desk, page.desk.studio.document

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Phrases that the demo's CLIP chooses for landmarks, and what it saw of a new one."""
+"""Phrases that the demo's CLIP suggests for landmarks, also for a new one."""
 
 import shutil
 import time
@@ -29,7 +29,7 @@ def opened(*arguments):
 
 
 def wait_for_phrases(studio):
-    """Return what is offered in the end, and the notes until then."""
+    """Return the final suggestions, and the notes until then."""
     deadline, notes = time.monotonic() + PATIENCE_S, set()
     while True:
         found, note = studio.phrases('bowl_1')
@@ -53,19 +53,19 @@ def test_clip_offers_phrases_for_what_the_images_show(path):
     truth = studio.document.landmarks['bowl_1'].label
     studio.document.edit(edits.set_fields, ['bowl_1'], label='something')
     studio.document.select(['bowl_1'])
-    assert studio.phrases('bowl_1').phrases[0] != truth, "the class's labels as long as CLIP loads"
+    assert studio.phrases('bowl_1').phrases[0] != truth, 'labels of the class while CLIP loads'
     found, notes = wait_for_phrases(studio)
     print(f'{truth}: {found}')
     assert len(found) == 5 and truth in found
     assert len(notes) == 1 and studio.phrases('bowl_1').note == ''
     studio.document.edit(edits.set_fields, ['bowl_1'], center=[1, 1, 1])
-    assert studio.phrases('bowl_1').phrases == found, 'a drag asks nothing'
+    assert studio.phrases('bowl_1').phrases == found, 'a drag requests no phrases'
     studio.stop()
     studio.document.close()
 
 
 def observed(tmp_path, object_id):
-    """Write an observation file: the true boxes of one object, with their embeddings."""
+    """Write an observation file with the true boxes of one object, and their embeddings."""
     options = ClipOptions(pretrained=CLIP[1])
     encoder = ClipEncoder(resolve_clip_weights(options), options)
     views, images = views_of_folder(WALK), open_images(WALK, None)
@@ -84,7 +84,7 @@ def observed(tmp_path, object_id):
 
 
 def test_a_new_landmark_has_the_mean_of_its_boxes(path, tmp_path):
-    """And CLIP offers phrases for it, without its images."""
+    """CLIP also suggests phrases for it, without its images."""
     file, embeddings = observed(tmp_path, 'bowl_1')
     new = tmp_path / 'new.yaml'
     studio = opened(new, '--observations', file, *CLIP)
@@ -92,7 +92,7 @@ def test_a_new_landmark_has_the_mean_of_its_boxes(path, tmp_path):
         studio.show_view(view)
         box = studio.recording.detections.detections_of(view).bboxes_xyxy[0]
         studio.new.draw(view, box[:2], box[2:])
-    assert studio.new.class_id == 'bowl', 'of the box that the detector has there'
+    assert studio.new.class_id == 'bowl', 'the class of the detected box there'
     studio.new.create('something', 'bowl')
     found, _ = wait_for_phrases(studio)
     assert len(found) == 5

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The studio's scene: surfaces, walls, labels, colours, and where a person looks from."""
+"""The studio's scene: surfaces, walls, labels, colours, and the viewpoint of a person."""
 
 import io
 from contextlib import redirect_stdout
@@ -45,7 +45,7 @@ def studio(tmp_path):
 
 
 def test_depth_becomes_a_cloud_below_the_ceiling():
-    """A wall 2 m ahead, red at its left, of a camera 1 m above the floor at x = 3."""
+    """A camera at x = 3, 1 m above the floor, sees a wall 2 m ahead that is red on the left."""
     image = np.zeros((48, 64, 3), dtype=np.uint8)
     image[:, :32, 0] = 200
     depth = DepthImage(np.full((48, 64), 2.0, dtype=np.float32))
@@ -96,17 +96,17 @@ def test_walls_lie_where_the_grid_has_them(server, yaw):
     in_grid = Rotation.from_euler('z', -yaw).apply(points - [-1.0, 2.0, 0.0])
     cells = {(int(y), int(x)) for x, y in np.floor(in_grid[:, :2] / 0.1)}
     assert cells == {(4, 33), (20, 7)}
-    assert turn.apply([0.0, 0.0, 1.0])[2] == pytest.approx(-1.0), 'its face is up'
+    assert turn.apply([0.0, 0.0, 1.0])[2] == pytest.approx(-1.0), 'its face points up'
 
 
 def test_other_answers_take_the_place_of_the_first_ones(server, studio, recwarn):
-    """Viser warns of a node that went with its parent."""
+    """Viser warns of a node that was removed with its parent."""
     layers = Layers(server.scene)
     for view in (0, 5):
         layers.show('Answers', studio.recording.relocalize(
             studio.document.landmarks, [view], None), draw_answers)
     layers.show('Answers', None, draw_answers)
-    assert not [str(one.message) for one in recwarn]
+    assert not [str(warning.message) for warning in recwarn]
 
 
 def test_up_is_found_where_the_map_is_in_a_cameras_frame():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The studio's walls: the files of nav2_map_server, sound and damaged."""
+"""The studio's walls: files of nav2_map_server, valid and damaged."""
 
 import cv2
 import numpy as np

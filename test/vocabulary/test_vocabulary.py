@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Phrases: what the grammar makes, what is shipped for COCO, and what a user's file adds."""
+"""Phrases of the grammar, of the shipped vocabulary for COCO, and of a user's file."""
 
 import re
 import time
@@ -53,7 +53,7 @@ def test_shipped_phrases_are_english(name):
     for phrase in phrases:
         assert re.fullmatch(r"[a-z][a-z' -]+[a-z]", phrase)
         assert not re.search(r'\ba [aeio]|\ban [^aeiou]|  ', phrase), phrase
-        assert len(phrase.split()) <= 14  # CLIP reads 75 tokens, the demo's 22
+        assert len(phrase.split()) <= 14  # CLIP reads up to 75 tokens, the demo's CLIP 22
 
 
 def test_any_class_name_is_described():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A bond with the signatures of the real one, and its half of the heartbeat.
+"""A bond with bondpy's signatures and one half of the heartbeat.
 
 The message is a KeyValue, whose fields check their types, in place of bond/msg/Status.
 """
@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import KeyValue
 
 
 class Bond:
-    """Says that a node is alive until the bond is broken."""
+    """Reports that a node is alive until the bond is broken."""
 
     def __init__(self, node, topic, id, on_broken=None, on_formed=None):
         self.id = id
@@ -42,9 +42,9 @@ class Bond:
         self._publish('dead')
 
     def shutdown(self):
-        """Destroy what was created, behind the node's back and at once, like the real one.
+        """Destroy all entities at once without notice to the node, like the real bond.
 
-        A message that is under way is lost then; the peer of the real one misses the heartbeat.
+        Messages in transit are then lost; a peer of the real bond misses the heartbeat.
         """
         self.sub.destroy()
         if not self._ended.is_set():

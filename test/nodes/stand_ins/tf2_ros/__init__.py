@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A tf2 that knows no coordinate frame, and is late to say so, as on a busy machine."""
+"""A tf2 without coordinate frames that answers late, as on a busy machine."""
 
 import time
 
