@@ -8,8 +8,8 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 PACKAGE = 'cliploc_ros'
-# colcon installs these in lib/cliploc_ros for ros2 run. pip installs executables in bin/, which all
-# programs share; there they are named cliploc_evaluate and so on.
+# colcon installs these in lib/cliploc_ros for ros2 run. pip installs executables in bin/, which
+# all programs share; there they are named cliploc_evaluate and so on.
 COMMANDS = ('build_map', 'check_map', 'evaluate', 'export_network', 'import_map', 'studio',
             'tum_to_bag')
 # These need ROS. Without ROS they would only print an error, so a wheel does not contain them.

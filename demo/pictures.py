@@ -299,7 +299,7 @@ def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detection
                    landmark_map: LandmarkMap, pose: NDArray[np.float64]) -> None:
     axes.imshow(cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB))
     axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), xticks=[], yticks=[])
-    axes.set_title("detections (boxes), and landmarks projected from the localizer's pose (dotted)",
+    axes.set_title("detections (boxes) and landmarks projected from the localizer's pose (dotted)",
                    fontsize=10)
     for left, top, right, bottom in detections.bboxes_xyxy:
         axes.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False,

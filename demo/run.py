@@ -154,7 +154,8 @@ def run_demo(options: DemoOptions) -> list[Judged]:
         judged = _walk(options, Path(folder), sequence, domain)
         print(page.summary(judged), flush=True)
         index = _draw(options, landmark_map, sequences, judged)
-        print(f'pictures: {index.resolve()} ({time.monotonic() - start:.0f} s in total)', flush=True)
+        print(f'pictures: {index.resolve()}; total time {time.monotonic() - start:.0f} s',
+              flush=True)
         if rviz is not None:
             print('close RViz to end the demo')
             rviz.wait()

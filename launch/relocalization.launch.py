@@ -19,8 +19,9 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 
-# Launch files that include each other share their arguments. Therefore the names differ from those of
-# Nav2's bringup, except for namespace, use_sim_time, autostart and log_level, which mean the same.
+# Launch files that include each other share their arguments. Therefore the names differ from those
+# of Nav2's bringup, except for namespace, use_sim_time, autostart and log_level, which mean the
+# same.
 
 # Topics and services. Each is remapped by the argument with the same name.
 NAMES = {
@@ -34,7 +35,7 @@ NAMES = {
     'imu': 'IMU, the source of the vertical with gravity:=imu',
     'initialpose': 'the pose that AMCL subscribes to',
     'amcl_pose': 'the pose that AMCL publishes; it confirms that AMCL has taken initialpose',
-    'request_nomotion_update': 'service of AMCL that makes it process a scan while the robot is at rest',
+    'request_nomotion_update': 'service of AMCL: process a scan while the robot is at rest',
     'reinitialize_global_localization': "service of the relocalizer that Nav2's behaviour tree "
                                         'calls; AMCL has a service of this name, too',
 }

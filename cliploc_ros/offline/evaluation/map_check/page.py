@@ -202,11 +202,12 @@ def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
     rest = len(landmarks) - _MOST_LANDMARKS
     more = html.note(f'{rest} more landmarks are in the JSON file') if rest > 0 else ''
     return html.table(head, rows) + more + html.note(
-        'frames: number of frames with a detection of the landmark, of the frames that should show '
-        'it. seen: their share. baseline: largest angle between two views. deviation: standard '
-        'deviation of the centre along its worst axis. offset: distance between the centre and the '
-        'centre of a fit to the boxes. IoU: median over the boxes. thinness: smallest semi-axis '
-        'divided by the largest. In brackets: normalized distance of overlapping landmarks.')
+        'frames: number of frames with a detection of the landmark, of the frames that should '
+        'show it. seen: their share. baseline: largest angle between two views. deviation: '
+        'standard deviation of the centre along its worst axis. offset: distance between the '
+        'centre and the centre of a fit to the boxes. IoU: median over the boxes. thinness: '
+        'smallest semi-axis divided by the largest. In brackets: normalized distance of '
+        'overlapping landmarks.')
 
 
 def _look_alikes(report: CheckReport) -> str:
