@@ -41,9 +41,8 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
     yield ('grid', 'Expected relocalization, top view. A cell is a camera position. Its shade '
            'shows the share of headings with a correct, accepted pose, among the headings with '
            'three or more detectable landmarks. Ticks show the headings at which a wrong pose '
-           'was accepted. '
-           'Positions inside landmarks and beyond all objects are omitted. Numbers refer to the '
-           'advice.', png_of(_grid_figure(canvas), _DPI))
+           'was accepted. Positions inside landmarks and beyond all objects are omitted. '
+           'Numbers refer to the advice.', png_of(_grid_figure(canvas), _DPI))
     if report.recording is not None and report.recording.trials:
         yield ('frames', 'Recorded frames, each relocalized in a map that was fitted without '
                'the frames of that time. The dot is the camera, the wedge its heading. Times '
