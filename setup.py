@@ -8,31 +8,31 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 PACKAGE = 'cliploc_ros'
-# colcon puts these into lib/cliploc_ros for ros2 run. pip puts executables into bin/, where all
-# programs share one name space: there they are named cliploc_evaluate and so on.
+# colcon installs these in lib/cliploc_ros for ros2 run. pip installs executables in bin/, which
+# all programs share; there they are named cliploc_evaluate and so on.
 COMMANDS = ('build_map', 'check_map', 'evaluate', 'export_network', 'import_map', 'studio',
             'tum_to_bag')
-# These need ROS. Without it they would only print that, so a wheel has none of them.
+# These need ROS. Without ROS they would only print an error, so a wheel does not contain them.
 ROS_COMMANDS = ('doctor', 'prepare', 'replay', 'wake_up')
 NODES = ('detector', 'relocalizer')
 BUILDS_WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel'}.isdisjoint(sys.argv)
 
-# script/requirements*.txt have the same versions. OpenCV is no requirement of its own: pip's and
-# apt's packages of it have different names.
+# script/requirements*.txt have the same versions. OpenCV is required by extras only, because its
+# packages in pip and apt have different names.
 REQUIRED = ['PyYAML>=6,<7', 'numba>=0.59,<1', 'numpy>=1.26,<3', 'scipy>=1.11,<2', 'setuptools',
             'tqdm>=4.66,<5']
 OPENCV = 'opencv-python-headless>=4.6,<6'
 RUNTIME = [OPENCV, 'ftfy>=6,<7', 'huggingface_hub>=0.30,<4', 'openvino>=2025.0,<2028',
            'pillow>=10,<15', 'tokenizers>=0.20,<1']
 EXTRAS = {
-    # Detector and CLIP as ONNX networks: all that looks at images.
+    # Detector and CLIP as ONNX networks.
     'runtime': RUNTIME,
     # The same in PyTorch: to export networks, to train, and for a GPU.
     'models': [
         *RUNTIME, 'onnx>=1.17,<2', 'open_clip_torch>=3.0,<4', 'safetensors>=0.4,<1',
         'torch>=2.4,<3', 'torchvision>=0.19,<1', 'ultralytics-opencv-headless>=8.4,<9',
     ],
-    # The programs that make, check and measure maps.
+    # The programs that make, check and evaluate maps.
     'evaluate': [OPENCV, 'matplotlib>=3.8,<4', 'rosbags>=0.11,<0.12'],
     'studio': [OPENCV, 'rosbags>=0.11,<0.12', 'viser==1.1.1'],
     'cluster': ['distributed>=2024.8,<2028'],
@@ -41,7 +41,7 @@ EXTRAS['all'] = sorted({name for extra in EXTRAS.values() for name in extra})
 EXTRAS['test'] = ['hypothesis>=6.100,<7', 'pytest>=7.4,<10', 'pytest-rerunfailures>=14,<17',
                   'pytest-xdist>=3.5,<4']
 EXTRAS['docs'] = ['myst-parser>=4,<6', 'sphinx>=8,<10', 'sphinx-rtd-theme>=3,<4']
-# A placeholder, as the address of the maintainers: the project has no public repository yet.
+# A placeholder, like the maintainers' address: the project has no public repository yet.
 REPOSITORY = 'https://example.org/cliploc_ros'
 
 
@@ -51,7 +51,7 @@ def files(folder: str, pattern: str) -> list[str]:
 
 
 def console_scripts() -> list[str]:
-    """Return the executables under the names that their folder asks for."""
+    """Return the entry points, with the names that suit their folder."""
     if BUILDS_WHEEL:
         return [f'cliploc_{name} = {PACKAGE}.cli.{name}:main' for name in COMMANDS]
     modules = [f'cli.{name}' for name in COMMANDS + ROS_COMMANDS]

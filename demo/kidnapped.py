@@ -237,14 +237,14 @@ def run_kidnapped(options: DemoOptions) -> list[Step]:
 def _kidnap(robot: KidnappedRobot, before: Sequence[View], after: Sequence[View]) -> list[Step]:
     """Let the robot drive, move it elsewhere, and wait until its localizer is correct again."""
     steps: list[Step] = []
-    carried_s, first = 0.0, 0
+    moved_s, first = 0.0, 0
 
     def tell(text: str, at_s: float | None = None, looks: int | None = None) -> None:
         step = Step(robot.now_s if at_s is None else at_s,
                     robot.looks if looks is None else looks, text)
         steps.append(step)
-        when = f'{step.time_s - carried_s:5.1f} s {step.looks - first:3d} looks' \
-            if carried_s else 'before'
+        when = f'{step.time_s - moved_s:5.1f} s {step.looks - first:3d} looks' \
+            if moved_s else 'before'
         print(f'{when:>17}: {text}', flush=True)
 
     robot.begin(before[0])
@@ -252,15 +252,15 @@ def _kidnap(robot: KidnappedRobot, before: Sequence[View], after: Sequence[View]
         pass
     robot.stand(before[-1], lambda: robot.state == WatchState.LOCALIZED, 'the watch to agree')
     tell(f'the watch agrees with the localizer, {robot.error_m:.2f} m from the truth')
-    carried_s, first = robot.now_s, robot.looks
+    moved_s, first = robot.now_s, robot.looks
     robot.put(after[0])
-    tell(f'moved by {robot.error_m:.2f} m, unknown to odometry and localizer')
+    tell(f'moved by {robot.error_m:.2f} m; odometry and localizer do not notice')
     way = robot.drive(after)
     last = next((view for view, _ in zip(after[1:], way, strict=False)
                  if robot.lost and robot.looks >= robot.lost[1] + _LOOKS_LOST), None)
     if robot.lost is None or last is None:
-        raise DemoError('the watch did not report the robot lost before its walk ended')
-    tell('the watch reports it lost; the robot drives on', *robot.lost)
+        raise DemoError('the watch did not report the robot lost before the recording ended')
+    tell('the watch reports the robot lost; it drives on', *robot.lost)
     stopped_s = robot.now_s
     tell('the robot stops')
     if robot.relocalized_s or robot.delivered_s:

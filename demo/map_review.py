@@ -194,29 +194,29 @@ def section(review: MapReview, summaries: Mapping[str, Summary], images: int) ->
     objects, landmark_map = review.objects, review.landmark_map
     head, *rows = _success_rows(summaries)
     parts = [
-        f'<p><code>build_map</code> built it from {images} images of a mapping walk, with the '
-        'poses of that walk. The wake-ups come later: objects have moved, and the light has '
-        f'changed. An object is found if a landmark of its class lies within {NEAR_M * 100:.0f} '
-        'cm of it. All other landmarks are false.</p>',
+        f'<p><code>build_map</code> built this map from {images} images of a mapping walk and '
+        'their poses. Between the walk and the wake-ups, objects moved and the light changed. '
+        f'An object is found if a landmark of its class lies within {NEAR_M * 100:.0f} cm of '
+        'it. All other landmarks are false.</p>',
         figure(PICTURE, 'Found, missed and false objects. The dotted line is the mapping walk.',
                'built map and true objects from three sides'),
-        '<p>One look at each image of the wake-ups, in the built map and in the true map:</p>',
+        '<p>One localization of each image of the wake-ups, in the built and in the true map:</p>',
         table(head, rows)]
     if review.missed:
-        parts += ['<h2>Missed objects</h2>', table(('object', 'label', 'why'), (
+        parts += ['<h2>Missed objects</h2>', table(('object', 'label', 'reason'), (
             (objects[row].object_id, objects[row].label, reason)
             for row, reason in review.missed.items()))]
     if review.false:
-        parts += ['<h2>False objects</h2>', table(('landmark', 'label', 'what is there'), (
+        parts += ['<h2>False objects</h2>', table(('landmark', 'label', 'object at its place'), (
             (landmark_map.landmark_ids[landmark], landmark_map.labels[landmark], instead)
             for landmark, instead in review.false.items()))]
     found = table(
-        ('object', "a person's label", 'landmark', "the map's label", '#off by', '#size'),
+        ('object', 'true label', 'landmark', 'label in the map', '#position error', '#size error'),
         ((objects[hit.object_row].object_id, objects[hit.object_row].label,
           landmark_map.landmark_ids[hit.landmark], landmark_map.labels[hit.landmark],
           f'{hit.offset_m * 100:.1f} cm', f'{hit.size_ratio - 1:+.0%}')
          for hit in sorted(review.found, key=lambda hit: -hit.offset_m)))
-    return fold(f'The map that was built: {review.summary()}', *parts,
+    return fold(f'The built map: {review.summary()}', *parts,
                 fold('All found objects, the least accurate first', found))
 
 
@@ -247,13 +247,13 @@ def draw_map_review(review: MapReview, map_from_camera: NDArray[np.float64], pat
     legend = drawn.add_subplot(grid[0, 1])
     legend.set_axis_off()
     legend.legend(loc='upper left', frameon=False, fontsize=11, handles=[
-        Patch(facecolor=ACCEPTED, alpha=0.45, label=f'landmark of an object: {len(review.found)}'),
+        Patch(facecolor=ACCEPTED, alpha=0.45, label=f'correct landmark: {len(review.found)}'),
         Patch(facecolor=BAD, alpha=0.45, label=f'false landmark: {len(review.false)}'),
         Patch(facecolor='none', edgecolor=_MISSED, linewidth=2.0,
               label=f'missed object: {len(review.missed)}'),
         Patch(facecolor='none', edgecolor=_TRUTH, linewidth=0.6, label='true object'),
         Line2D([], [], color='#666666', marker='.', linestyle=':',
-               label='mapping walk, with the direction of each view')])
+               label='mapping walk and viewing directions')])
     spread_names(drawn)
     write_file(path, drawn.savefig)
 

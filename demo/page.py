@@ -25,21 +25,21 @@ _BRIEF = [_COLUMNS[column][0] for column in _BRIEF_COLUMNS]
 
 _SYNTHETIC = """\
 <p class="note"><b>This world is synthetic.</b> A program rendered the room, its objects and the
-images; detector and CLIP are small networks trained on renders of similar rooms. Nodes, messages
-and search are the same as on a robot. The page shows that the system works end to end,
-<em>not</em> how well it recognizes real objects in real light. To measure that, run the nodes on
-your own recordings.</p>"""
+images. Detector and CLIP are small networks trained on renders of similar rooms. Nodes, messages
+and search are the same as on a robot. The page shows that the system works end to end. It does
+<em>not</em> show how well the system recognizes real objects in real light. To measure that, run
+the nodes on your own recordings.</p>"""
 
 _HOW = """\
 <p class="note">The two nodes published the boxes, the hypotheses and the numbers in the table. The
-errors are relative to the recording's ground truth, which the nodes never see. The matches of
-boxes and landmarks are not published. For the pictures the demo therefore repeats the search on
-the same detections with the same code, networks, options and seed, and compares its pose with the
-published pose ({repeated}).</p>"""
+errors are relative to the recording's ground truth, which the nodes do not receive. The nodes do
+not publish the matches of boxes and landmarks. For the pictures the demo therefore repeats the
+search on the same detections with the same code, networks, options and seed, and compares its pose
+with the published pose ({repeated}).</p>"""
 
 _LIST = """\
 <p class="note">CLIP is the cosine similarity of crop and label, rank its place among all labels of
-the map, IoU the overlap of box and projected landmark. ✓ and ✗ compare a match with the object
+the map, and IoU the overlap of box and projected landmark. ✓ and ✗ compare a match with the object
 that the renderer drew there. A ✗ can also mean that the object was moved after mapping, or is not
 in the map.</p>"""
 
@@ -97,14 +97,14 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
     numbers = [(f'{len(accepted)} of {len(judged)}', 'wake-ups accepted', bool(accepted)),
                (str(wrong), f'wrong by more than {WRONG_M:g} m', not wrong)]
     if errors:
-        numbers.append((f'{100 * np.median(errors):.1f} cm', 'off the truth (median)', not wrong))
+        numbers.append((f'{100 * np.median(errors):.1f} cm', 'median position error', not wrong))
     page_file = folder / 'index.html'
     write_text(page_file, page(
         'cliploc_ros: a robot wakes up', first_screen(
             [verdict(f'{summary(judged)}.', not wrong), tiles(numbers), _SYNTHETIC,
              '<h2>Wake-ups</h2>', table(_BRIEF, ([row[column] for column in _BRIEF_COLUMNS]
                                                  for row in rows))],
-            [figure(TOP_VIEW, 'The map from above. A line joins each estimate to its ground '
+            [figure(TOP_VIEW, 'Top view of the map. A line joins each estimate to its ground '
                     'truth. Refused poses were not published.', 'map with the estimated poses')]),
         section,
         fold(f'All figures; method {method}', table([name for name, _ in _COLUMNS], rows)),

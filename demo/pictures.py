@@ -63,11 +63,11 @@ def draw_wake_up(review: Review, landmark_map: LandmarkMap, path: Path) -> None:
         _draw_image(figure.add_axes((0.008, 0.075, 0.552, 0.84)), review, landmark_map, numbers)
     figure.legend(loc='lower left', bbox_to_anchor=(0.0, 0.0), ncol=4, frameon=False, fontsize=9,
                   handles=[
-        Line2D([], [], color=_BOX, linewidth=2, label='box with its landmark'),
-        Line2D([], [], color='#888888', linewidth=2, linestyle='--', label='box without landmark'),
+        Line2D([], [], color=_BOX, linewidth=2, label='box matched to a landmark'),
+        Line2D([], [], color='#888888', linewidth=2, linestyle='--', label='unmatched box'),
         Line2D([], [], color=_ELLIPSE, linewidth=2, label='matched landmark, projected'),
         Line2D([], [], color='#B8A800', linewidth=1.5, linestyle=':',
-               label='any other landmark of the map')])
+               label='other landmark of the map')])
     if review.beside:
         write_file(path, figure.savefig)
         return
@@ -138,8 +138,8 @@ def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap, number
             line += 1
         line += 0.3
     if not review.repeated:
-        panel.text(0, line, 'The repeated search for this picture found another pose: '
-                            'its matches are not shown.', fontsize=9, va='top')
+        panel.text(0, line, 'The search repeated for this picture found another pose. '
+                            'Its matches are not shown.', fontsize=9, va='top')
         return
     for name, x in _COLUMNS.items():
         if review.similarities is not None or name not in ('CLIP', 'rank'):
@@ -166,13 +166,13 @@ def _list_matches(panel: Axes, review: Review, landmark_map: LandmarkMap, number
     rest = [f'{number} {review.detections.class_ids[row]}' for row, number in numbers.items()
             if row not in matched]
     if rest:
-        text = textwrap.fill('Without a landmark: ' + ', '.join(rest), _LINE_CHARS)
+        text = textwrap.fill('Unmatched boxes: ' + ', '.join(rest), _LINE_CHARS)
         panel.text(0, line + 0.4, text, fontsize=8.5, va='top', color='#555555')
 
 
 def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
                   path_xyz: NDArray[np.float64], path: Path) -> None:
-    """Draw map, the camera's walk (t, 3) [m], and a line from each estimate to its truth.
+    """Draw map, the camera's walk (t, 3) [m], and a line from each estimate to the truth.
 
     A refused hypothesis outside the map is not drawn, but its number is red.
     """
@@ -197,12 +197,12 @@ def draw_top_view(judged: Sequence[Judged], landmark_map: LandmarkMap,
         _draw_wake_up(axes, wake_up, pose)
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=_TRUTH, marker='o', markersize=9, markerfacecolor='none',
-               label='ground truth and view'),
+               label='true pose and view'),
         Line2D([], [], color=ACCEPTED, marker='o', markersize=5.5,
-               label='accepted estimate,\njoined to its truth'),
+               label='accepted estimate,\njoined to the true pose'),
         Line2D([], [], color=BAD, marker='X', linestyle=(0, (4, 3)),
                label='refused: best hypothesis,\nnot published'),
-        Line2D([], [], color='#999999', linewidth=1.0, label='the walk')]
+        Line2D([], [], color='#999999', linewidth=1.0, label='path of the camera')]
     handles += [Patch(facecolor=color, edgecolor='#333333', alpha=0.55, label=name)
                 for name, color in class_colors.items()]
     figure.legend(handles=handles, loc='outside right upper', frameon=False, fontsize=9)
@@ -299,7 +299,7 @@ def _draw_expected(axes: Axes, file: Path, camera: Camera, detections: Detection
                    landmark_map: LandmarkMap, pose: NDArray[np.float64]) -> None:
     axes.imshow(cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB))
     axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), xticks=[], yticks=[])
-    axes.set_title("detections (boxes), and landmarks seen from the localizer's pose (dotted)",
+    axes.set_title("detections (boxes) and landmarks projected from the localizer's pose (dotted)",
                    fontsize=10)
     for left, top, right, bottom in detections.bboxes_xyxy:
         axes.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False,
@@ -316,7 +316,7 @@ def _draw_ways(axes: Axes, landmark_map: LandmarkMap, moments: Sequence[Moment])
         for number, part in enumerate(np.split(way, jumps)):
             axes.plot(*part.T, color=color, linestyle=style, linewidth=2.0,
                       label=None if number else
-                      {'truth': 'the robot', 'localized': 'its localizer'}[name])
+                      {'truth': 'true path', 'localized': 'path of the localizer'}[name])
         for row in jumps:
             axes.annotate('', way[row], way[row - 1], arrowprops={
                 'arrowstyle': '->', 'color': color, 'linestyle': ':'})

@@ -125,7 +125,7 @@ def own_ros_domain() -> Iterator[int]:
         except OSError:
             reservation.close()
     else:
-        raise DemoError('all ROS domains of this machine are in use: end other demos or test runs')
+        raise DemoError('all ROS domains of this machine are in use: end another demo or test run')
     with reservation:
         os.environ['ROS_DOMAIN_ID'] = str(domain)
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'

@@ -64,7 +64,7 @@ class Judged:
         """Return the outcome in words."""
         if not self.wake_up.accepted:
             return 'refused' if self.error is None else (
-                f'refused, the best hypothesis is {self.error[0]:.2f} m off')
+                f'refused, {self.error[0]:.2f} m error of the best hypothesis')
         if self.error is None:
             return 'accepted'
         return f'accepted, {self.error[0]:.3f} m and {self.error[1]:.1f}° from the truth'

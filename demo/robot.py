@@ -145,7 +145,7 @@ class Robot(Node):
         self._wait(answered)
         answer_s, answer = time.monotonic() - start, future.result()
         if not answer.message.startswith(('accepted', 'refused')):
-            raise DemoError(f'the relocalizer gave no answer: {answer.message}')
+            raise DemoError(f'the relocalizer neither accepted nor refused: {answer.message}')
         self._wait(lambda: stamp in self._hypotheses
                    and all(stamp in heard for heard in self._detections.values()))
         return WakeUp(stamp, answer.success, answer.message, self._hypotheses[stamp],
@@ -162,8 +162,8 @@ class Robot(Node):
         while not condition():
             self._check()
             if time.monotonic() > deadline:
-                raise DemoError(f'nothing arrived over ROS for {_PATIENCE_S:g} s: does a firewall '
-                                'block UDP on this machine?')
+                raise DemoError(f'no ROS message arrived for {_PATIENCE_S:g} s: check whether a '
+                                'firewall blocks UDP on this machine')
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
     def _on_detections(self, camera: str, msg: Detection2DArray) -> None:

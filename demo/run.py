@@ -150,13 +150,14 @@ def run_demo(options: DemoOptions) -> list[Judged]:
             rviz = stack.enter_context(running(
                 ['rviz2', '-d', config, '-f', landmark_map.frame_id], options.out / 'rviz2.log'))
         elif options.rviz:
-            print('RViz (rviz2) is not installed or not sourced here: continuing without it')
+            print('RViz (rviz2) is not installed or not sourced: continuing without it')
         judged = _walk(options, Path(folder), sequence, domain)
         print(page.summary(judged), flush=True)
         index = _draw(options, landmark_map, sequences, judged)
-        print(f'pictures: {index.resolve()} ({time.monotonic() - start:.0f} s in all)', flush=True)
+        print(f'pictures: {index.resolve()}; total time {time.monotonic() - start:.0f} s',
+              flush=True)
         if rviz is not None:
-            print('close RViz to end')
+            print('close RViz to end the demo')
             rviz.wait()
     return judged
 

@@ -4,12 +4,12 @@
 
 # ros2 launch cliploc_ros relocalization.launch.py map_file:=office.yaml \
 #     image:=/camera/image_raw camera_info:=/camera/camera_info base_frame:=base_footprint
-# With several cameras, topics are in the namespace of their camera: front/image_raw and so on.
+# With several cameras, each camera's topics are in its namespace: front/image_raw and so on.
 # ros2 launch cliploc_ros relocalization.launch.py map_file:=office.yaml \
 #     cameras:='[front, left, right]' image:=image_raw base_frame:=base_footprint
 
 from pathlib import Path
-from typing import List  # noqa: UP035  launch knows this form
+from typing import List  # noqa: UP035  launch accepts only this form
 
 import yaml
 from launch import LaunchContext, LaunchDescription
@@ -19,11 +19,11 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 
-# Launch files that include each other share their arguments. Therefore the arguments differ from
-# those of Nav2's bringup, except namespace, use_sim_time, autostart and log_level, which have the
-# same meaning there.
+# Launch files that include each other share their arguments. Therefore the names differ from those
+# of Nav2's bringup, except for namespace, use_sim_time, autostart and log_level, which mean the
+# same.
 
-# Topics and services. The argument with the same name remaps each of them.
+# Topics and services. Each is remapped by the argument with the same name.
 NAMES = {
     'image': 'raw images of the camera driver; image/compressed is remapped accordingly',
     'camera_info': 'camera_info of the camera driver',
@@ -34,17 +34,17 @@ NAMES = {
     'odom': 'odometry, which shows motion; without it the robot is assumed to be at rest',
     'imu': 'IMU, the source of the vertical with gravity:=imu',
     'initialpose': 'the pose that AMCL subscribes to',
-    'amcl_pose': 'the pose that AMCL publishes, which shows that it has taken initialpose',
-    'request_nomotion_update': 'service of AMCL that processes a scan while the robot is at rest',
+    'amcl_pose': 'the pose that AMCL publishes; it confirms that AMCL has taken initialpose',
+    'request_nomotion_update': 'service of AMCL: process a scan while the robot is at rest',
     'reinitialize_global_localization': "service of the relocalizer that Nav2's behaviour tree "
                                         'calls; AMCL has a service of this name, too',
 }
 _OF_CAMERA = ('image', 'camera_info', 'detections', 'depth', 'depth_camera_info')
-# For an argument that is not given, the file `parameters` is used, then the default.
+# An argument that is not given takes its value from the file `parameters`, else its default.
 DETECTOR_PARAMETERS = {
     'profile': 'detector and CLIP: auto, accurate, balanced or fast',
     'model': 'weights of the detector',
-    'vocabulary': 'classes of a YOLO-World or YOLOE: map, or names',
+    'vocabulary': 'classes of a YOLO-World or YOLOE: map, or a list of names',
     'map_file': 'map of objects: a path, or package://PACKAGE/PATH',
     'cameras': 'names of several cameras, which are the namespaces of their topics: [front, left]',
     'image_transport': 'raw or compressed',
@@ -61,8 +61,8 @@ RELOCALIZER_PARAMETERS = {
     'gravity': 'source of the vertical: none, base_frame or imu',
     'matching': 'hybrid, clip or class; class needs no CLIP',
     'mode': 'on_request or continuous',
-    'watch': "source of the localizer's pose that is watched: none, tf or amcl_pose",
-    'on_lost': 'report, or relocalize as soon as the robot is at rest',
+    'watch': "source of the localizer's pose for the watch: none, tf or amcl_pose",
+    'on_lost': 'report; or relocalize once the robot is at rest',
     'require_localizer': 'false: a request succeeds without AMCL, for ~/pose or publish_tf',
     'clip_model': 'open_clip architecture',
     'clip_pretrained': 'tag or file of the weights',
@@ -72,9 +72,9 @@ RELOCALIZER_PARAMETERS = {
     'use_sim_time': 'true: use the time of /clock',
 }
 OTHERS = {
-    'parameters': ('', 'parameter file of both nodes; other arguments override it'),
-    'namespace': ('', 'namespace of both nodes, different for each robot or camera'),
-    'tf': ('/tf', 'tf: use transforms in the namespace, as Nav2 does for several robots'),
+    'parameters': ('', 'parameter file of both nodes; the other arguments override it'),
+    'namespace': ('', 'namespace of both nodes; use a different one for each robot or camera'),
+    'tf': ('/tf', 'tf: use the transforms in the namespace, as Nav2 does for several robots'),
     'detector': ('true', 'false: another program publishes detections'),
     'log_level': ('info', 'debug, info, warn or error'),
 }

@@ -16,8 +16,8 @@ ARGUMENTS = {
     'namespace': ('', 'namespace of the relocalizer'),
     'relocalizer': ('relocalizer', 'name of the relocalizer in the namespace'),
     'spin': ('spin', "action of Nav2's behavior_server"),
-    'wake_up_timeout': ('60.0', 'no turn begins after this time [s]'),
-    'wake_up_turn_deg': ('45.0', 'angle of the turn between requests [deg]; 0: never turn'),
+    'wake_up_timeout': ('60.0', 'after this time, no further turn starts [s]'),
+    'wake_up_turn_deg': ('45.0', 'angle of the turn between requests [deg]; 0: do not turn'),
     'wake_up_watch': ('false', 'true: wake up again whenever the relocalizer finds the robot '
                                'lost'),
     'log_level': ('info', 'debug, info, warn or error'),

@@ -2,20 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 # shellcheck shell=bash
 #
-# Shared by setup and test: messages, stamps, and steps that explain their failures.
+# Shared by the scripts: messages, stamps of finished steps, and steps that explain their failures.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 venv=$root/.venv
 logs=$root/build/setup
 
-# Some containers set it. Hundreds of processes would then compile their imports, each again.
+# Some containers set this variable. Each of hundreds of processes would then compile its imports.
 unset PYTHONDONTWRITEBYTECODE
 
 say() { printf '==> %s\n' "$*"; }
 die() { printf '%s: %s\n' "script/$(basename "$0")" "$*" >&2; exit 1; }
 
-# Only one setup runs in a tree. pip unpacks its gigabytes beside the environment, because /tmp is
-# often a small file system of its own.
+# A lock allows only one setup per source tree. pip unpacks gigabytes beside the environment, because
+# /tmp is often a small, separate file system.
 enter_build_folder() {
   mkdir -p "$logs" || die "cannot write to $root"
   touch "$root/build/COLCON_IGNORE"
@@ -27,7 +27,7 @@ enter_build_folder() {
   mkdir "$TMPDIR"
 }
 
-# A step is done if its stamp holds the hash of the step's input. It is written only on success.
+# A step is done if its stamp contains the hash of its input. The stamp is written only on success.
 hash_of() { find "$@" -type f -not -path '*/__pycache__/*' -print0 | sort -z | xargs -0 sha256sum | sha256sum; }
 is_done() { [[ -f $1 && $(<"$1") == "$2" ]]; }
 set_done() { printf '%s\n' "$2" > "$1"; }
@@ -43,19 +43,19 @@ show_large_downloads() { grep --line-buffered -oE 'Downloading [^ ]+ \([0-9.]+ [
 
 explain_failure() {
   if grep -qiE 'no space left on device|disk quota exceeded' "$1" || (( $(free_mb) < 100 )); then
-    die "the disk is full ($(free_mb) MB left for $root): make room and run it again, it continues"
+    die "the disk is full ($(free_mb) MB left for $root): make room and run it again; it continues with this step"
   fi
   if grep -qE 'NewConnectionError|NameResolutionError|ConnectTimeout|ReadTimeout|ConnectionResetError|ProxyError|SSLError|IncompleteRead|ProtocolError|incomplete-download' "$1"; then
-    die "the download broke off or there is no network: run it again, it continues (log: $1)"
+    die "the download failed or there is no network: run it again; it continues with this step (log: $1)"
   fi
   tail -n 20 "$1" >&2
-  die "this step failed, see above (whole log: $1)"
+  die "this step failed, see above (complete log: $1)"
 }
 
 free_mb() { df --output=avail -m "$root" | tail -n 1 | tr -d ' '; }
 
-# pip_install_locked VENV REQUIREMENTS [PIP OPTION...]: the releases of the lock of this kind of
-# machine, whose hashes have to agree; UNLOCKED=1 takes the newest that the requirements allow.
+# pip_install_locked VENV REQUIREMENTS [PIP OPTION...]: install the releases in the lock file for this
+# kind of machine and check their hashes. UNLOCKED=1: the newest releases that the requirements allow.
 pip_install_locked() {
   local prefix=$1 file=$2
   shift 2
@@ -66,31 +66,31 @@ pip_install_locked() {
   fi
 }
 
-# pip_install VENV REQUIREMENTS [PIP OPTION...]: install once for each content of the file.
+# pip_install VENV REQUIREMENTS [PIP OPTION...]: install, unless the file has not changed since.
 pip_install() {
   local prefix=$1 file=$2 name hash constraint=()
   shift 2
   name=$(basename "$file" .txt)
   hash=$(hash_of "$file" "$root"/script/constraints*.txt)
-  # In a lock, and only there, all is pinned.
+  # Lock files pin every package; other files need the constraints.
   [[ $file == */lock/* ]] || constraint=(--constraint "$root/script/constraints.txt")
   is_done "$prefix/.$name.done" "$hash" && return
   say "installing script/$name.txt with pip"
-  # Python compiles a module when it is first used, and most of them never are.
+  # Python compiles a module at its first use, and most modules are never used.
   run_step "$(basename "$prefix")-$name" "$prefix/bin/python" -m pip install --resume-retries 20 \
     --no-compile --disable-pip-version-check --no-input "${constraint[@]}" --requirement "$file" "$@"
   set_done "$prefix/.$name.done" "$hash"
 }
 
-# make_venv PYTHON FOLDER [VENV OPTION...]: also completes one that was interrupted.
+# make_venv PYTHON FOLDER [VENV OPTION...]: make a virtual environment, or complete an interrupted one.
 make_venv() {
   local python=$1 prefix=$2
   shift 2
   is_done "$prefix/.venv.done" "$prefix" && return
-  say "making ${prefix#"$root/"} with $("$python" --version)"
+  say "creating ${prefix#"$root/"} with $("$python" --version)"
   run_step "$(basename "$prefix")" "$python" -m venv "$@" "$prefix"
   touch "$prefix/COLCON_IGNORE"
-  # From 25.2 on, pip resumes a broken download within one run.
+  # Since 25.2, pip resumes an interrupted download within one run.
   run_step "$(basename "$prefix")-pip" "$prefix/bin/python" -m pip install --upgrade 'pip>=25.2'
   set_done "$prefix/.venv.done" "$prefix"
 }

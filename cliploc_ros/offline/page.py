@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """HTML pages: a common style and common parts, without scripts or network requests.
 
-Functions escape the texts that they get; parts are HTML already.
+Functions escape the texts in their arguments. Parts are already HTML.
 """
 
 from base64 import b64encode

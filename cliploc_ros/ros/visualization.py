@@ -33,7 +33,7 @@ from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_array_msg
 
-#: Greatest number of landmarks shown: RViz is slow with more.
+#: Greatest number of landmarks shown: RViz is slow with more landmarks.
 MAX_SHOWN = 5000
 _TEXT_HEIGHT_M = 0.08
 _LINE_WIDTH_M = 0.01
@@ -43,7 +43,7 @@ _KEYFRAMES = ColorRGBA(r=0.0, g=0.59, b=0.53, a=0.9)
 _FRUSTUM_M = 0.12
 _TEXT = (255, 255, 255)
 _RADIUS_PX = 3
-# Greatest number of lines between matched points: more would hide the images.
+# Greatest number of lines between matched points: more lines would hide the images.
 _MOST_LINES = 20
 _UNMATCHED, _BOX, _ELLIPSE = (255, 255, 255), (86, 180, 233), (230, 159, 0)
 # White text on these colours has a contrast of 5 or more.

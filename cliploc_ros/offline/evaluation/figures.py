@@ -170,13 +170,13 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
         'success_by_boxes': _drawn('detections in the image', success, _success_by_boxes,
                                    summaries),
         'precision_over_recall': _drawn(
-            'recall: right poses that are accepted',
-            f'precision: accepted poses within {_SUCCESS_M:g} m', _precision_over_recall,
+            'recall: accepted share of the correct poses',
+            f'precision: share of accepted poses within {_SUCCESS_M:g} m', _precision_over_recall,
             searched),
         'reliability': _drawn('confidence', f'share of poses within {_SUCCESS_M:g} m',
                               draw_reliability, reliable, 'installed calibration'),
-        'consistency': _drawn('squared error in its own covariance (NEES)',
-                              'share of accepted poses below', _consistency, searched),
+        'consistency': _drawn('normalized estimation error squared (NEES)',
+                              'cumulative share of accepted poses', _consistency, searched),
         'time_by_stage': _drawn('mean time [ms]', '', _time_by_stage, searched, observing_ms),
         'top_view': _top_view(landmark_map, queries,
                               [result for result in results if result.method == best.method],
@@ -268,7 +268,7 @@ def _best_iteration(axes: Axes, summaries: Sequence[Summary]) -> None:
         patch.set(facecolor=_style(summary.method)[0], alpha=0.6)
     axes.set_yticks(range(1, len(summaries) + 1), [summary.method for summary in summaries])
     axes.invert_yaxis()
-    axes.set_title('median, quartiles, whiskers of 1.5 interquartile ranges', fontsize=9)
+    axes.set_title('box: median and quartiles; whiskers: 1.5 interquartile ranges', fontsize=9)
 
 
 def _success_by_boxes(axes: Axes, summaries: Sequence[Summary]) -> None:
@@ -340,7 +340,7 @@ def _consistency(axes: Axes, summaries: Sequence[Summary]) -> None:
     for (name, squares), color in zip(judged.items(), cycle(_JUDGED_COLORS), strict=False):
         axes.plot(levels, np.searchsorted(np.sort(squares), levels, side='right') / len(squares),
                   color=color, linewidth=1.4,
-                  label=f'{name}: {within_ellipsoid(squares):.3f} within')
+                  label=f'{name}: {within_ellipsoid(squares):.3f} in the 95 % ellipsoid')
     axes.set(xlim=(0, levels[-1]), ylim=(0, 1.02))
 
 
@@ -359,7 +359,7 @@ def _time_by_stage(axes: Axes, summaries: Sequence[Summary], observing_ms: Mappi
     search = np.array([summary.mean_search_ms for summary in summaries])
     axes.barh(rows, search, left=start, color=[_style(summary.method)[0] for summary in summaries])
     for row, total, own in zip(rows, start + search, search, strict=True):
-        axes.annotate(f'search {own:,.1f}' + (f', all {total:,.1f}' if total > own else ''),
+        axes.annotate(f'search {own:,.1f}' + (f', total {total:,.1f}' if total > own else ''),
                       (total, row), xytext=(3, 0), va='center', fontsize=8,
                       textcoords='offset points')
     axes.set_yticks(rows, [summary.method for summary in summaries])
@@ -384,10 +384,10 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results:
     frame = landmark_map.frame_id
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal',
              xlabel=f'x in {frame} [m]', ylabel=f'y in {frame} [m]',
-             title=f'{method}: estimates joined to their truth')
+             title=f'{method}: estimates joined to the true poses')
     draw_map(axes, landmark_map)
     axes.plot(positions[:, 0], positions[:, 1], 'o', markersize=6, markerfacecolor='none',
-              color='#222222', label='truth', zorder=6)
+              color='#222222', label='true pose', zorder=6)
     for label, color, marker, verdict in (('accepted', '#0072B2', 'o', True),
                                           ('refused', '#D55E00', 'X', False)):
         chosen = [result for result in first

@@ -14,10 +14,10 @@ _TOP_VIEW = 'top_view'
 # Columns of the first screen: method, success, accepted, false accepts.
 _BRIEF = (0, 1, 2, 5, 7)
 CAPTIONS = {
-    _TOP_VIEW: 'The map from above. A line joins each estimate of this method to its truth.',
-    'success_over_threshold': 'Share of poses within a distance of the truth, accepted or not.',
+    _TOP_VIEW: 'Top view of the map. A line joins each estimate of this method to the true pose.',
+    'success_over_threshold': 'Share of poses, accepted or not, within a distance of the truth.',
     'success_by_boxes': 'Success by the number of detections in the image.',
-    'precision_over_recall': 'Precision and recall at other thresholds of the confidence.',
+    'precision_over_recall': 'Precision and recall for all thresholds of the confidence.',
     'reliability': 'Calibration of the confidence, with 95 % intervals.',
     'consistency': 'Calibration of the covariance.',
     'time_by_stage': 'Mean time of an answer, by stage.',
@@ -49,6 +49,6 @@ def write_report(folder: Path, summaries: Sequence[Summary], rows: Sequence[Sequ
     write_text(folder / PAGE, html.page(
         'Evaluation',
         html.first_screen([said, html.tiles(numbers), html.table(head, brief)], [top_view]),
-        html.fold('The whole table', html.table(rows[0], rows[1:]), *map(html.note, remarks)),
+        html.fold('Complete table', html.table(rows[0], rows[1:]), *map(html.note, remarks)),
         html.fold('Input and options', html.table(('', ''), about)),
         html.fold('Figures', html.side_by_side(drawn.values()), is_open=True)))

@@ -74,11 +74,11 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
           views: ViewPainter | None) -> str:
     missed = len(report.failures)
     said = html.verdict('The map reaches all thresholds.' if report.passed else
-                        'Keyframes only: objects carry nothing.'
+                        'Keyframes only: the map misses the threshold for objects alone.'
                         if report.verdict == 'keyframes only' else
                         f'The map misses {missed} of {len(report.measures)} thresholds.',
                         report.passed)
-    said += html.items(f'Localized {text}' for text in report.carried)
+    said += html.items(str(item) for item in report.carried)
     told = [measure for name in _TELLING for measure in report.measures
             if measure.name.startswith(name)][:_NUMBERS]
     first, *others = (html.figure(png, caption, picture) for picture, caption, png in pictures)
@@ -89,7 +89,7 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
          html.bars(_bar(measure) for measure in report.measures),
          '<h2>What to do first</h2>', *cards[:FIRST_ADVICE]], [first])]
     if later := cards[FIRST_ADVICE:]:
-        parts.append(html.fold(f'{len(later)} more to do', *later))
+        parts.append(html.fold(f'{len(later)} more recommendations', *later))
     faulty = sum(grade(landmark) == 'faulty' for landmark in report.landmarks)
     parts += [html.fold('All figures', html.table(('', ''), _figures(report))),
               html.fold('Pictures', *others),
@@ -104,7 +104,7 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
                 for number, fold in enumerate(report.recording.folds, start=1)]
         parts += [html.fold('Held-out boxes', html.note(
             'The recording is split into blocks of time. The boxes of each block are compared '
-            'with landmarks that were fitted to the other blocks.'), html.table((
+            'with the landmarks fitted to the other blocks.'), html.table((
                 '#fold', '#frames', '#landmarks', '#boxes', '#explained', '#median IoU'), rows)),
                   html.fold('Systematic residuals', _corrections(report.recording))]
     return html.page(f'Check of {name}', *parts,
@@ -149,9 +149,9 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
             (f'recorded frames, cross-validated, {report.evidence}',
              _verdicts(recording.judged) + (
                  '' if len(recording.judged) == len(recording.trials) else
-                 f'; of all frames {_verdicts(recording.trials)}: the objects of the others are '
-                 'in no other part of the recording')),
-            *([('of these by objects alone', str(count_by_objects(recording.judged)['accepted']))]
+                 f'; of all frames {_verdicts(recording.trials)}: the objects of the other frames '
+                 'are in no other part of the recording')),
+            *([('accepted by objects alone', str(count_by_objects(recording.judged)['accepted']))]
               if any(trial.by_objects for trial in recording.trials) else []),
             ('the same poses with simulated boxes', _verdicts(recording.simulated)),
             ('noise of box edges', f'{recording.edge_scale:.2f} times that assumed by build_map')]
@@ -162,7 +162,7 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
              (f'grid positions{near} with a heading accepted by objects alone',
               f'{report.grid.accepted_positions:.0%} of {int(report.grid.is_near.sum())}')]
     if report.accepted_positions != report.grid.accepted_positions:
-        rows.append((f'these positions, {report.evidence}', f'{report.accepted_positions:.0%}'))
+        rows.append((f'the same positions, {report.evidence}', f'{report.accepted_positions:.0%}'))
     if (layer := report.keyframes) is not None:
         rows.append(('keyframes', f'{layer.keyframes} with {layer.points} points'))
         if len(layer.recorded):
@@ -200,13 +200,14 @@ def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
             (check.landmark_id, grade(check)), (label, 'text'), (faults, 'text'), *texts,
             ', '.join(f'{name} ({distance:.2f})' for name, distance in check.overlaps)])
     rest = len(landmarks) - _MOST_LANDMARKS
-    more = html.note(f'and {rest} more in the JSON file') if rest > 0 else ''
+    more = html.note(f'{rest} more landmarks are in the JSON file') if rest > 0 else ''
     return html.table(head, rows) + more + html.note(
-        'frames: frames that show the landmark, of the frames that should show it. seen: their '
-        'share. baseline: greatest angle between two views. deviation: standard deviation of the '
-        'centre on its worst axis. offset: distance of the centre from that of a fit to its '
-        'boxes. IoU: median over its boxes. thinness: least semi-axis divided by the greatest. In '
-        'brackets: normalized distance of overlapping landmarks.')
+        'frames: number of frames with a detection of the landmark, of the frames that should '
+        'show it. seen: their share. baseline: largest angle between two views. deviation: '
+        'standard deviation of the centre along its worst axis. offset: distance between the '
+        'centre and the centre of a fit to the boxes. IoU: median over the boxes. thinness: '
+        'smallest semi-axis divided by the largest. In brackets: normalized distance of '
+        'overlapping landmarks.')
 
 
 def _look_alikes(report: CheckReport) -> str:
@@ -218,8 +219,8 @@ def _look_alikes(report: CheckReport) -> str:
         rows.append((str(number), f'{pair.first[0]:.1f}, {pair.first[1]:.1f}',
                      f'{pair.second[0]:.1f}, {pair.second[1]:.1f}', f'{pair.turn_deg:.0f}',
                      f'{len(pair.matched)} of {pair.landmarks}', str(pair.same_labels), pairs))
-    return html.table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#landmarks alike',
-                       '#with equal labels', 'which'), rows)
+    return html.table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#matched landmarks',
+                       '#with equal labels', 'pairs'), rows)
 
 
 def _corrections(recording: RecordingCheck) -> str:
@@ -228,11 +229,11 @@ def _corrections(recording: RecordingCheck) -> str:
     rows = [(correction.cause, correction.name, f'{correction.value:+.2f} {correction.unit}',
              f'{correction.deviation:.2f} {correction.unit}', f'{correction.effect_px:.1f}',
              f'{correction.explained:.1%}', '' if not correction.is_significant else (
-                 'may follow from the strongest cause' if correction.follows
+                 'may be an effect of the strongest cause' if correction.follows
                  else 'significant'))
             for correction in recording.corrections]
     return (html.note('The correction that fits the edges of the boxes best, estimated for each '
-                      'cause alone. A turned mount and a shifted principal point have much the '
-                      'same effect.')
-            + html.table(('cause', 'what', '#correction', '#deviation', '#effect [px]',
-                          '#cost that the cause explains', ''), rows))
+                      'cause alone. A turned mount and a shifted principal point have nearly '
+                      'the same effect.')
+            + html.table(('cause', 'quantity', '#correction', '#deviation', '#effect [px]',
+                          '#explained cost', ''), rows))

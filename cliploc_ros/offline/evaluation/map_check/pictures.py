@@ -38,20 +38,20 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
                   ) -> Iterator[tuple[str, str, bytes]]:
     """Yield the name, the caption and the PNG of each picture."""
     canvas = _Canvas(landmark_map, report)
-    yield ('grid', 'Expected relocalization from above. A cell is a camera position. Its shade '
-           'is the share of headings with a correct, accepted pose, of those with three or more '
-           'detectable landmarks. Ticks show the headings at which a wrong pose was accepted. '
-           'Positions inside landmarks and beyond all objects are left out. Numbers refer to the '
-           'advice.', png_of(_grid_figure(canvas), _DPI))
+    yield ('grid', 'Expected relocalization, top view. A cell is a camera position. Its shade '
+           'shows the share of headings with a correct, accepted pose, among the headings with '
+           'three or more detectable landmarks. Ticks show the headings at which a wrong pose '
+           'was accepted. Positions inside landmarks and beyond all objects are omitted. '
+           'Numbers refer to the advice.', png_of(_grid_figure(canvas), _DPI))
     if report.recording is not None and report.recording.trials:
         yield ('frames', 'Recorded frames, each relocalized in a map that was fitted without '
-               'frames of that time. The dot is the camera, the wedge its heading. Times '
-               'mark the longest runs of refused frames.',
+               'the frames of that time. The dot is the camera, the wedge its heading. Times '
+               'mark the longest sequences of refused frames.',
                png_of(_frames_figure(canvas, report.recording.trials), _DPI))
         yield ('time', 'The same frames over time: the number of mapped landmarks that were '
                'detected, and the verdict.', png_of(_time_figure(report.recording.trials), _DPI))
-    yield ('landmarks', 'The landmarks from above. Landmarks with a fault are named, or only '
-           'those with a serious fault if there are many.',
+    yield ('landmarks', 'Top view of the landmarks. Landmarks with a fault are named. If there '
+           'are many, only landmarks with a serious fault.',
            png_of(_landmarks_figure(canvas), _DPI))
     if report.look_alikes:
         yield ('look_alikes', 'Places that look alike, joined in pairs.',
@@ -108,7 +108,7 @@ def _add_legend(figure: Figure, handles: Sequence[Line2D | Patch]) -> None:
 def _grid_figure(canvas: _Canvas) -> Figure:
     grid = canvas.report.grid
     height = grid.positions[0, 2] if len(grid.positions) else 0.0
-    figure, axes = canvas.figure(f'Where a robot is accepted, camera {height:.2f} m high', 'none',
+    figure, axes = canvas.figure(f'Expected accepted poses, camera {height:.2f} m high', 'none',
                                  alpha=0.9)
     shown = canvas.shown
     side, inset = grid.spacing_m, 0.06 * grid.spacing_m
@@ -153,7 +153,7 @@ def _grid_figure(canvas: _Canvas) -> Figure:
                       bbox={'boxstyle': 'circle,pad=0.25', 'facecolor': INK, 'edgecolor': 'white'})
     bar = figure.colorbar(ScalarMappable(Normalize(0, 100), _HEAT), ax=axes, shrink=0.7,
                           pad=0.02)
-    bar.set_label('right pose accepted\n[% of headings that show 3 landmarks]', fontsize=9)
+    bar.set_label('correct pose accepted\n[% of headings that show 3 landmarks]', fontsize=9)
     _add_legend(figure, handles)
     return figure
 
@@ -207,7 +207,7 @@ def _time_figure(trials: Sequence[Trial]) -> Figure:
         handles.append(Patch(label=f'{verdict} ({chosen.sum()})', **style))
         none = chosen & (counts == 0)
         axes.plot(stamps[none], np.zeros(none.sum()), 'x', color=color, clip_on=False, zorder=5)
-    axes.set(xlabel='time from the first frame [s]', ylabel='landmarks detected')
+    axes.set(xlabel='time from the first frame [s]', ylabel='detected landmarks')
     axes.legend(handles=handles, frameon=False, fontsize=9, ncols=3, loc='lower right',
                 bbox_to_anchor=(1.0, 1.0))
     return figure
@@ -245,7 +245,7 @@ def _look_alikes_figure(canvas: _Canvas) -> Figure:
                   color=page.LOOK_ALIKE, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4)
     _add_legend(figure, [
         Line2D([], [], color=page.LOOK_ALIKE, marker='o', markersize=12, markerfacecolor='none',
-               linestyle=(0, (4, 2)), label=f'pair of places, {RADIUS_M:g} m around'),
+               linestyle=(0, (4, 2)), label=f'pair of places, radius {RADIUS_M:g} m'),
         Patch(facecolor='#BBBBBB', edgecolor='#444444', alpha=0.5, label='landmark')])
     return figure
 

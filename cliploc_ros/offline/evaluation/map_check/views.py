@@ -80,7 +80,7 @@ class ViewPainter:
         for frame in np.argsort(different):
             if different[frame] < _MOST_DIFFERENT:
                 yield int(frame), 'this view' if different[frame] < _SAME else (
-                    f'a view {far_m[frame]:.1f} m and {off_deg[frame]:.0f} degrees off')
+                    f'a view {far_m[frame]:.1f} m and {off_deg[frame]:.0f} degrees away')
 
     def _boxes(self, frame: int) -> NDArray[np.float64]:
         return self._detections.bboxes_xyxy[slice(

@@ -7,9 +7,9 @@
 const $ = id => document.getElementById(id);
 const SVG = 'http://www.w3.org/2000/svg';
 const MODES = ['review', 'edit', 'create', 'test'];
-// Greatest number of rows in the list; the others are found by a search.
+// Greatest number of rows in the list. A search finds the other landmarks.
 const MOST_ROWS = 300;
-// Time between the pictures of the film; the server sends the number of views between them.
+// Time between the pictures of the film. The server sends the number of views between two pictures.
 const PICTURE_MS = 200;
 const STEPS_M = [0.01, 0.05, 0.1, 0.5];
 const person = Array.from(crypto.getRandomValues(new Uint8Array(12)),
@@ -18,14 +18,14 @@ const base = location.pathname.replace(/[^/]*$/, '');
 const state = {file: {}, rows: [], selection: {ids: [], one: null}, review: {}, log: {lines: []}, test: {}, layers: {},
                view: null, new: null};
 let mode = 'review', socket = null, followed = null, step = 0.1, gesture = 0, wantsCheck = true, follows = false, film = null, isFlat = false;
-// Visible part of the image, in its pixels; null: the whole image. A goal is applied once its view is shown.
+// Visible part of the image [px]; null: the whole image. A goal is applied once its view is shown.
 let zoom = null, goal = null, shownView = -1, drag = null, typedNew = {};
 const shares = {review: 0.6, edit: 0.5, create: 0.72, test: 0.5};
 
 // ---- to and from the server
 
 function send(name, values = {}) {
-  // A view chosen by the user is kept when the views of the selection arrive later.
+  // Keep a view that the user chose when the views of the selection arrive later.
   if (name === 'show_view' && state.selection?.one) followed = state.selection.one.id;
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({do: name, ...values}));
 }
@@ -77,8 +77,8 @@ const capital = text => text[0].toUpperCase() + text.slice(1);
 const buttons = (...children) => el('div', {className: 'buttons'}, ...children);
 const note = text => text ? el('p', {className: 'note'}, text) : null;
 
-// An input for a text or numbers. Typed input is not overwritten until it is sent. Numbers are shown
-// rounded, and keep their exact values unless they are edited.
+// An input field for a text or for numbers. Typed input is not overwritten until it is sent. Numbers
+// are shown rounded, but keep their exact values unless they are edited.
 function field(name, values, apply, {isText = false, isOff = false, digits = 3, list = '', of = ''} = {}) {
   const shown = values.map(value => isText ? value : String(Number(value.toFixed(digits))));
   const inputs = values.map((value, place) => el('input', {
@@ -208,7 +208,7 @@ function showCard() {
     el('div', {className: 'head'}, el('span', {}, one.id),
        toggle(one.is_locked ? 'locked' : 'open', one.is_locked ? 'Unlock' : 'Lock', 'L',
               doing('lock', {ids})),
-       toggle('fly', 'Fly to it', 'G', doing('fly'))),
+       toggle('fly', 'Fly to the landmark', 'G', doing('fly'))),
     field('Label', [one.label], set('label'), {isText: true, ...off}),
     mode === 'edit' && one.phrases.length ? el('div', {className: 'chips'}, ...one.phrases.map(
       text => button(text, () => set('label')(text), {off: one.is_locked, hint: text}))) : null,
@@ -240,13 +240,13 @@ const PANELS = {
       note(`${done} of ${total}: ${accepted} accepted, ${fixed} fixed, ${deleted} deleted`),
       buttons(button('Accept', doing('accept'), {key: 'A', kind: 'main', off: !one}),
               button('Fix', doing('fix'), {key: 'F', off: !one || !state.file.has_boxes,
-                                           hint: 'merge a duplicate, or fit a landmark to its boxes'}),
+                                           hint: 'merge a duplicate, or fit the landmark to its boxes'}),
               button('Delete', doing('discard'), {key: 'D', kind: 'danger', off: !one}),
               button('Skip', doing('step', {count: 1}), {key: 'N'})),
       one && one.decision ? el('p', {className: 'note done'}, one.decision) : null,
       one && one.is_checked ? (one.faults.length
         ? el('ul', {className: 'faults'}, ...one.faults.map(text => el('li', {}, text)))
-        : el('p', {className: 'note done'}, 'no fault found')) : note(one && 'new since the check'),
+        : el('p', {className: 'note done'}, 'no fault found')) : note(one && 'added after the check'),
       one?.support != null ? note(`detected in ${one.support} ${one.support === 1 ? 'frame' : 'frames'}`
         + (one.ratio === null ? '' : `, ${Math.round(100 * one.ratio)} % of the frames that should show it`)) : null,
       done === total ? buttons(button('Check again', doing('check'), {off: busy})) : null];
@@ -254,17 +254,17 @@ const PANELS = {
   edit() {
     const {ids, one} = state.selection, boxes = state.file.has_boxes;
     const by = value => () => send('edit', {field: 'by', value, gesture: 'by'});
-    if (!ids.length) return [note('Select a landmark in the list, the image or the scene. Use Shift to select several.')];
+    if (!ids.length) return [note('Select a landmark in the list, the image or the scene. Hold Shift to select several.')];
     return [
       one ? el('div', {className: 'buttons nudge'}, ...['x', 'y', 'z'].flatMap((axis, place) =>
         [-1, 1].map(sign => button(`${axis}${sign < 0 ? '−' : '+'}`, by(axisStep(place, sign)),
                                    {off: one.is_locked, hint: 'move'}))),
-        el('select', {title: 'Step of a move; arrow keys and page keys also move the landmark',
+        el('select', {title: 'Step size; arrow keys and page keys also move the landmark',
                       onchange: event => { step = Number(event.target.value); showPanel(); }},
            ...STEPS_M.map(value => el('option', {value, selected: value === step}, `${100 * value} cm`)))) : null,
       buttons(ids.length > 1 ? button('Merge', doing('merge'), {key: 'M', kind: 'main'})
                              : button('Refit to boxes', doing('refit'), {key: 'R', kind: 'main', off: !boxes, hint: 'fit it to the boxes of the recording'}),
-              one ? button('Split', doing('split'), {hint: 'two halves of the longest axis'}) : null,
+              one ? button('Split', doing('split'), {hint: 'cut it in half along its longest axis'}) : null,
               button('Delete', doing('delete'), {key: 'Del', kind: 'danger'}))];
   },
   create() {
@@ -275,7 +275,7 @@ const PANELS = {
     const input = (name, text, list) => field(text, [value(name)], typed => { typedNew[name] = typed; showPanel(); }, {isText: true, list});
     return [
       note(['Draw a box around the object, or click a box of the detector.',
-            'In other views, the object lies on the dashed line. Draw its box there.',
+            'In another view, the object lies on the dashed line. Draw its box there.',
             'The dashed ellipse is the fit. A third box improves it.'][Math.min(count, 2)]),
       made.doubt ? el('p', {className: 'note', style: 'color:var(--bad)'}, made.doubt) : null,
       el('div', {className: 'chips'}, ...made.boxes.map(([view]) => button(
@@ -283,8 +283,8 @@ const PANELS = {
       input('label', 'Label'), input('class_id', 'Class', 'classes'),
       buttons(button('Create', create, {key: '↵', kind: 'main', off: count < 2}),
               button('Next view', doing('next_view'), {key: 'C', off: !count, hint: 'a view from another side'}),
-              button('Forget box', doing('forget', {view: state.view.view}), {key: 'Del', off: !hasBox}),
-              button('Forget all', doing('forget'), {off: !count}))];
+              button('Remove box', doing('forget', {view: state.view.view}), {key: 'Del', off: !hasBox}),
+              button('Remove all boxes', doing('forget'), {off: !count}))];
   },
   test() {
     const test = state.test, is = name => test.running.includes(name), views = state.file.views,
@@ -293,9 +293,9 @@ const PANELS = {
       buttons(button('Relocalize the recording', doing('relocalize_all'), {kind: 'main', off: !views || is('relocalize_all')}),
               button('Relocalize here', doing('relocalize_here'), {off: !views}),
               is('search_places') ? button('Stop', doing('stop_search'), {kind: 'danger'})
-                : button('Coverage and look-alikes', doing('search_places'), {hint: 'simulated views all over the map, up to a minute'})),
+                : button('Coverage and look-alikes', doing('search_places'), {hint: 'simulate views all over the map; takes up to a minute'})),
       is('search_places') ? el('progress', {max: 1, value: test.share}) : null,
-      test.is_stale ? note('Results of the map before the last edits: search again.') : null,
+      test.is_stale ? note('These are results of the map before the last edits: search again.') : null,
       ...test.lines.map(note),
       ...test.legend.map(([color, text]) => el('div', {}, el('span', {style: `color:${color}`}, '■ '), text)),
       ...['Coverage', 'Look-alikes'].filter(name => name in state.layers).map(layerBox),
@@ -341,7 +341,7 @@ function showRows() {
       side(isHidden ? 'unseen' : 'seen', isHidden ? 'Show' : 'Hide', isHidden, 'hide'),
       side(isLocked ? 'locked' : 'open', isLocked ? 'Unlock' : 'Lock', isLocked, 'lock'));
   }));
-  if (found.length > MOST_ROWS) $('rows').append(note(`${found.length - MOST_ROWS} more: use Find`));
+  if (found.length > MOST_ROWS) $('rows').append(note(`${found.length - MOST_ROWS} more landmarks: use Find`));
   $('rows').scrollTop = top;
   $('rows').querySelector('[aria-selected=true]')?.scrollIntoView({block: 'nearest'});
 }
@@ -357,8 +357,8 @@ function showView() {
   shownView = view.view;
   applyZoom();
   if (document.activeElement !== $('slider')) $('slider').value = view.view;
-  $('where').textContent = `view ${view.view}${view.camera ? ` camera ${view.camera}` : ''}`;
-  $('empty').textContent = state.file.images ? '' : 'No images: start the studio with --images; the boxes are shown';
+  $('where').textContent = `view ${view.view}${view.camera ? `, camera ${view.camera}` : ''}`;
+  $('empty').textContent = state.file.images ? '' : 'No images, only boxes: start the studio with --images to show images';
   const colors = Object.fromEntries(state.rows.map(row => [row[0], row[7]]));
   const chosen = new Set(state.selection.ids), scale = pixel();
   const ellipse = ([cx, cy, rx, ry, turn], name, color) => drawn('ellipse', {
@@ -520,16 +520,16 @@ const layerBox = name => box(name, state.layers[name], is_shown => send('show_la
 
 function showLayers() {
   fill($('layers'), [
-    buttons(button('Everything', doing('overview'), {key: 'O'}),
+    buttons(button('Whole map', doing('overview'), {key: 'O'}),
             button('From above', doing('from_above'), {key: 'B'}),
             button('Selection', doing('fly'), {key: 'G'})),
-    box('Without perspective', isFlat, is_flat => { isFlat = is_flat; send('flatten', {is_flat}); }),
+    box('Orthographic view', isFlat, is_flat => { isFlat = is_flat; send('flatten', {is_flat}); }),
     ...Object.keys(state.layers).map(layerBox),
     ...(state.file.views ? [box('Follow the view', follows, followView),
                             button(film ? 'Stop' : 'Play the recording', playOrStop)] : [])]);
 }
 
-// Hides the cameras, which would block the view.
+// Hides the cameras, which would cover the view.
 function followView(isOn) {
   follows = isOn;
   send('show_layer', {name: 'Cameras', is_shown: !isOn});
@@ -557,11 +557,11 @@ function showLog() {
 const KEYS = {
   all: {'ctrl+z': ['undo', doing('undo')], 'ctrl+y': ['redo', doing('redo')], 'ctrl+s': ['save', doing('save')],
         ',': ['previous view', () => stepView(-1)], '.': ['next view', () => stepView(1)],
-        v: ['best views of the landmark', bestView], t: ['move the scene\'s camera to the view', doing('look_through')],
-        g: ['fly to the landmark', doing('fly')], o: ['show everything', doing('overview')],
+        v: ['best view of the landmark, then the next best', bestView], t: ['move the scene\'s camera to the view', doing('look_through')],
+        g: ['fly to the landmark', doing('fly')], o: ['show the whole map', doing('overview')],
         b: ['show the map from above', doing('from_above')], l: ['lock, unlock', () => send('lock')],
         h: ['hide, show', () => send('hide', {ids: state.selection.ids})], 0: ['whole image', () => { zoom = null; showView(); }],
-        '/': ['find', () => $('find').focus()], '?': ['keys', () => showKeys()], n: ['next landmark', doing('step', {count: 1})],
+        '/': ['find', () => $('find').focus()], '?': ['keyboard shortcuts', () => showKeys()], n: ['next landmark', doing('step', {count: 1})],
         p: ['previous landmark', doing('step', {count: -1})],
         ...Object.fromEntries(MODES.map((name, row) => [row + 1, [name, () => setMode(name)]]))},
   review: {a: ['accept, select the next', doing('accept')], f: ['fix: merge a duplicate, or fit to boxes', doing('fix')],
@@ -572,7 +572,7 @@ const KEYS = {
          ...Object.fromEntries(['arrowleft', 'arrowright', 'arrowdown', 'arrowup', 'pagedown', 'pageup'].map((key, row) => [
            key, [`move along ${'xyz'[row >> 1]}`, () => send('edit', {field: 'by', value: axisStep(row >> 1, row % 2 ? 1 : -1), gesture: 'by'})]]))},
   create: {enter: ['create', () => create()], c: ['next view for a box', doing('next_view')],
-           delete: ['forget the box of this view', () => send('forget', {view: state.view?.view})],
+           delete: ['remove the box of this view', () => send('forget', {view: state.view?.view})],
            arrowleft: ['previous view', () => stepView(-1)], arrowright: ['next view', () => stepView(1)]},
   test: {arrowleft: ['previous view', () => stepView(-1)], arrowright: ['next view', () => stepView(1)]}};
 
@@ -587,7 +587,7 @@ const SIGNS = {arrowleft: '←', arrowright: '→', arrowup: '↑', arrowdown: '
 function showKeys() {
   const table = keys => el('table', {}, ...Object.entries(keys).map(([key, [text]]) => el(
     'tr', {}, el('td', {}, el('kbd', {}, SIGNS[key] || key.split('+').map(capital).join('+'))), el('td', {}, capital(text)))));
-  fill($('keys'), [el('b', {}, capital(mode)), table(KEYS[mode]), el('b', {}, 'Always'), table(KEYS.all)]);
+  fill($('keys'), [el('b', {}, capital(mode)), table(KEYS[mode]), el('b', {}, 'In all modes'), table(KEYS.all)]);
   $('keys').showModal();
 }
 
@@ -646,11 +646,11 @@ $('splitter').onpointerup = () => { document.body.classList.remove('dragging'); 
 document.addEventListener('click', event => { if (!$('menu').contains(event.target)) $('menu').open = false; });
 window.addEventListener('resize', () => { resize(); showView(); });
 window.addEventListener('keydown', keyDown, true);
-// keys also work in the scene, where they take precedence over those of viser
+// The keys also work in the scene, where they take precedence over viser's keys.
 $('frame').onload = () => {
   const scene = $('frame').contentWindow;
   scene.addEventListener('keydown', keyDown, true);
-  // hide viser's notices, which repeat the log, and its panel for developers: both cover the scene
+  // Hide viser's notices, which repeat the log, and its developer panel: both cover the scene.
   const style = scene.document.createElement('style');
   style.textContent = '.mantine-Notifications-root, .mantine-Paper-root { display: none !important }';
   scene.document.head.append(style);
