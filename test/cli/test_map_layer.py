@@ -42,7 +42,7 @@ def test_images_that_do_not_overlap_give_an_error_or_a_note(tmp_path):
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     options = make_parser().parse_args([*WALK, '--keyframes', '50', '360', '--out',
                                         str(tmp_path / 'a.yaml')])
-    why = 'no keyframe: of 1 images none has'
+    why = 'no keyframe: of 1 images, none has'
     layer, note = make_layer(options, read_frames(options), landmark_map)
     assert layer is None and why in note
     options.keyframe_layer = True

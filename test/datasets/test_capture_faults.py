@@ -86,7 +86,7 @@ def test_folders_without_poses_or_images(shots, tmp_path):
     assert found.count == 4
     (tmp_path / 'moved/walk' / shots[0].path.name).unlink()
     notes = read_folder(folder, FolderOptions(scale=1.0, images=tmp_path / 'moved')).notes
-    assert any('1 of 4 images' in note for note in notes)
+    assert any('1 of 4 listed images' in note for note in notes)
 
 
 def test_the_unit_must_be_known(shots, tmp_path):

@@ -80,7 +80,7 @@ def test_prepare_shows_progress_and_costs(prepared, robot):
     folder, output = prepared
     for text in ('==> detector: weights and network', '==> relocalizer: map', 'done after',
                  'cost of a request on this machine', 'the verdict on this picture: ',
-                 'need neither network nor compiler', f'carry {folder}'):
+                 'need neither network nor compiler', f'copy {folder}'):
         assert text in output
     stages = [line.split()[0] for line in output.splitlines() if len(line.split()) == 3]
     assert set(stages[-3:]) == {'detection', 'CLIP', 'search'}

@@ -32,7 +32,7 @@ def test_a_symbol_has_one_value_in_a_phrase_and_phrases_are_told_once():
 
 @pytest.mark.parametrize(('rules', 'message'), [
     ({'phrases': ['a {brand}']}, 'add the rule brand'),
-    ({'phrases': ['{a}'], 'a': ['{b}'], 'b': ['{a}']}, 'does not end'),
+    ({'phrases': ['{a}'], 'a': ['{b}'], 'b': ['{a}']}, 'rules refer to each other'),
     ({'phrases': ['{second}'], 'colour': ['red']}, None),
     ({'phrases': ['{colour} {second}'], 'colour': ['red']}, 'needs two colours'),
     ({'phrases': ['{a} {b} {c} {d}'], **{name: [f'{name}{i}' for i in range(1000)]
