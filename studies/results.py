@@ -103,7 +103,7 @@ def run() -> int:
     for name in options.names:
         if 'DATA' in commands[name] and not options.data.is_dir():
             raise OptionsError(f'--data {options.data}: no such folder; for its content see '
-                               'studies/README.md, "Data of the results"')
+                               'studies/README.md, "Results"')
         measure(name, commands[name], options.data.resolve())
     return 0
 
