@@ -48,7 +48,7 @@ from cliploc_ros.units import NS_PER_S
 #: crop on a CPU.
 BATCH = 4
 # Time that a request needs after its last crops: for searches, in units of the time budget and at
-# most this share of the time left, and for the answer [s]. Guesses.
+# most this share of the time left, and for the answer [s]. Chosen.
 _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
 _NO_LOOKS = Looks()
 _NO_ROWS = np.empty(0, dtype=np.int64)

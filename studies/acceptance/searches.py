@@ -32,7 +32,7 @@ EARLY_LOOKS = 5
 #: Looks of a robot that does not move.
 LOOKS = 20
 _PERIOD_NS = 100_000_000
-# Differences between two runs of a detector on images of the same view. Guesses.
+# Differences between two runs of a detector on images of the same view. Chosen.
 _MISSED_SHARE = 0.2
 _SHIFT_SHARE = 0.02  # of the box's sides, standard deviation
 _CHANGES = TROUBLES | PRIORS | FAMILIES

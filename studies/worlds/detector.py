@@ -39,7 +39,7 @@ _CONFUSED, _CONFUSION_BETA = (0.1, 0.5), (0.6, 3.4)
 # Boxes in an image that no landmark explains: .3 to .7 (fr3), .2 to .4 (kitchen). Some of them
 # show objects that the map lacks.
 _FALSE_BOXES = (0.0, 0.4)
-# A guess, since half objects and neighbours cannot be distinguished in recordings.
+# Chosen, since half objects and neighbours cannot be distinguished in recordings.
 _SPLIT = (0.0, 0.05)
 # Size of vectors, and share of their squared length that distinguishes objects of one model.
 _SIZE, _OWN_SHARE = 128, 0.1

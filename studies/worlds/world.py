@@ -42,7 +42,7 @@ _MISSING = (0.0, 0.25)
 # Share of landmarks that overlap another of their class: .03 to .12 in automatic maps, counting
 # both of each pair; none in maps that a person has checked.
 _DOUBLED = (0.0, 0.06)
-# Guesses: no recording has changes or wrong labels.
+# Chosen: no recording has changes or wrong labels.
 _MOVED, _MOVED_M, _MISLABELLED = (0.0, 0.1), (0.3, 3.0), (0.0, 0.06)
 
 

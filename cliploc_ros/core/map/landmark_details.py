@@ -10,7 +10,7 @@ from typing import Any
 
 from cliploc_ros.errors import MapError
 
-#: Minimum share of a landmark's boxes for a class to yield candidates. A guess.
+#: Minimum share of a landmark's boxes for a class to yield candidates. Chosen.
 LEAST_CLASS_SHARE = 0.1
 #: Labels that describe one landmark, with their weights.
 WeightedLabels = tuple[tuple[str, float], ...]

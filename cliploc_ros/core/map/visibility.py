@@ -33,24 +33,24 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 
 #: A detector finds a landmark only if the image shows this share of its box.
 SHOWN_SHARE = 0.6
-#: A landmark is out of view if nearer landmarks hide more than this share of it. A guess.
+#: A landmark is out of view if nearer landmarks hide more than this share of it. Chosen.
 HIDDEN_SHARE = 0.4
 # A detector is expected to find landmarks within this distance [m] whose boxes have at least these
 # sides [px] and are visible to at least this share. Conservative guesses.
 _REACH_M, _LEAST_SIDE_PX, _SURE_SHARE = 6.0, 20.0, 0.75
 # A landmark is beside a place if the angle between their directions is smaller than this, and in
-# front of it if its distance is less than this share of the place's distance. Guesses.
+# front of it if its distance is less than this share of the place's distance. Chosen.
 _BESIDE_COSINE, _BESIDE_SHARE = np.cos(np.radians(20.0)), 0.8
 #: Number of sides of a landmark, sectors of equal angle about the vertical.
 SIDES = 8
 # Prior of the share of looks that find a present landmark: mean over all landmarks, weight of this
 # mean in looks, and weight of the overall share (or of the map's seen_ratio) in looks where a
-# single landmark is judged. Guesses.
+# single landmark is judged. Chosen.
 _FOUND, _OF_FOUND, _OF_SHARE = 0.75, 10.0, 3.0
 # Limits of this share.
 _SHARES = (0.1, 0.95)
 # Prior probability that a landmark is gone, and share of looks in which a detection matches a
-# landmark that is gone by chance. Guesses.
+# landmark that is gone by chance. Chosen.
 _GONE, _BY_CHANCE = 0.05, 0.05
 # A landmark is reported at this probability. The number of counted sightings is limited, so that a
 # landmark that is removed after a day is soon reported.

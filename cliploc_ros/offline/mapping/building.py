@@ -53,7 +53,7 @@ SETTLING_ROUNDS = 3
 _REBUILDS = 1
 REFINEMENTS = 3
 _REASONS_SHOWN = 10
-#: A map that explains a smaller share of the boxes of its classes is refused. A guess: valid
+#: A map that explains a smaller share of the boxes of its classes is refused. Chosen: valid
 #: recordings of a few frames reach .3, poses that are off by a metre .2.
 LEAST_EXPLAINED = 0.2
 

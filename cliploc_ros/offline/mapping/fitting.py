@@ -30,7 +30,7 @@ from cliploc_ros.offline.mapping.views import Views
 
 #: Scale of the Cauchy loss, in standard deviations of an edge.
 LOSS_SCALE = 1.5
-# Standard deviation of the logarithm of a semi-axis about the mean of the three. A guess.
+# Standard deviation of the logarithm of a semi-axis about the mean of the three. Chosen.
 _AXIS_SPREAD = 0.7
 # An ellipsoid that is not entirely in front of a camera costs as much as four edges this far off.
 _BEHIND_RESIDUAL = 20.0

@@ -28,7 +28,7 @@ _LABELS = 6
 _CLIP_SCALE = 100.0
 # Greatest number of crops that describe a landmark, evenly spaced: it bounds the memory.
 _MOST_CROPS = 512
-# A further medoid has to raise the mean cosine of crops and nearest medoids by this. A guess.
+# A further medoid has to raise the mean cosine of crops and nearest medoids by this. Chosen.
 _LEAST_MEDOID_GAIN = 0.005
 
 

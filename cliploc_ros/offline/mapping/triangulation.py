@@ -32,7 +32,7 @@ from cliploc_ros.offline.mapping.sizes import log_sizes
 from cliploc_ros.offline.mapping.views import Views
 
 # Distance of the centre behind the visible surface, as a share of the radius that the box
-# suggests, and its standard deviation. Guesses: the share is 1 for a ball, 0 for a picture on a
+# suggests, and its standard deviation. Chosen: the share is 1 for a ball, 0 for a picture on a
 # wall.
 _CENTER_SHARE, _CENTER_SIGMA = 0.6, 0.5
 # Relative error of the measured depth.

@@ -20,14 +20,14 @@ from cliploc_ros.offline.mapping.check.report import SERIOUS, Advice, CheckRepor
 _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
 # Shorter runs of refused frames, and smaller areas of the grid, get no advice.
 _MIN_SPAN = 2
-# Cosine of the angle between views of one side: 45 degrees, a guess.
+# Cosine of the angle between views of one side: 45 degrees, chosen.
 _ONE_SIDE = 0.7
 _FEW_LANDMARKS = 3
 # More views are needed if landmarks have fewer frames (median) and more than this share of the
-# boxes belongs to none. Guesses, between maps of fr3 from every 10th and from every 30th frame.
+# boxes belongs to none. Chosen, between maps of fr3 from every 10th and from every 30th frame.
 _FEW_FRAMES, _MANY_UNEXPLAINED = 12, 0.12
 # A wrong pose within this distance of the pose that a look-alike implies is due to the look-alike
-# [m]. A guess.
+# [m]. Chosen.
 _SAME_POSE_M = 1.0
 # Distance from which a camera sees a place: twice the radius of a place [m].
 _SIGHT_M = 2.0 * RADIUS_M

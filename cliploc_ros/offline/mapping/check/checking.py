@@ -59,7 +59,7 @@ _NOTES = (
 _NO_RECORDING = (
     'no recording: the detector is assumed to find 60 % of the objects in view within 5 m, in '
     'images of 640 x 480 px with a focal length of 525 px')
-# Greatest difference in height between a robot's camera and those of the recording [m]. A guess.
+# Greatest difference in height between a robot's camera and those of the recording [m]. Chosen.
 _HEIGHT_MARGIN_M = 0.3
 
 

@@ -35,7 +35,7 @@ _MOST_WORDS = 3
 _MIN_THINNESS = 0.05
 # A landmark is missing if this number of frames should show it and none does.
 _MIN_EXPECTED = 10
-# A landmark is misplaced if its boxes put it farther away than all three limits. Guesses.
+# A landmark is misplaced if its boxes put it farther away than all three limits. Chosen.
 _MIN_OFFSET_M, _OFFSET_SHARE, _OFFSET_SIGMAS = 0.1, 0.3, 4.0
 
 

@@ -13,7 +13,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.options import CheckOptions
 
 _MARGIN_M = 0.5
-# Without a recording. Guesses.
+# Without a recording. Chosen.
 _GUESSED_MARGIN_M = 1.5
 _GUESSED_HEIGHT_M = 0.3   # above the median landmark
 _GUESSED_PITCH_DEG = -10.0

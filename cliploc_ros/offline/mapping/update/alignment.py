@@ -27,22 +27,22 @@ from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.pose_noise import significant_pose_errors
 from cliploc_ros.offline.mapping.views import Views
 
-# Least deviation of a position [m]: objects are not ellipsoids. A guess.
+# Least deviation of a position [m]: objects are not ellipsoids. Chosen.
 _LEAST_SIGMA_M = 0.01
-# Deviation of a centre if the map does not give it [m]. A guess.
+# Deviation of a centre if the map does not give it [m]. Chosen.
 _UNKNOWN_SIGMA_M = 0.05
 # An object has moved if it is displaced by more than all three: [m], in units of its old and new
 # shape (1: they touch), and in standard deviations of both positions. A smaller displacement only
-# means a better fit. Guesses.
+# means a better fit. Chosen.
 _LEAST_MOVE_M, LEAST_MOVE_SHAPES, LEAST_MOVE_SIGMAS = 0.1, 0.6, 4.0
 #: A recording that confirms fewer landmarks does not belong to the map.
 MIN_CONFIRMED = 3
 _ROUNDS = 4
 # Least IoU of the first association, which tolerates an offset.
 _LOOSE_IOU = 0.1
-# Deviations of the weak prior on an offset. Guesses.
+# Deviations of the weak prior on an offset. Chosen.
 _OFFSET_SIGMA_M, _OFFSET_SIGMA_DEG = 0.5, 5.0
-# Objects that were nudged by this much do not disturb the alignment [m]. A guess.
+# Objects that were nudged by this much do not disturb the alignment [m]. Chosen.
 _NUDGE_M = 0.02
 _SETTLED_M = 1e-3
 _LOSS_SCALE = 2.0

@@ -23,20 +23,20 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.alignment import OldMap, has_moved
 from cliploc_ros.offline.mapping.update.judging import Judgement, Shown
 
-# Gains, in nats. Guesses: one dissimilar appearance does not outweigh an object in its place, but
+# Gains, in nats. Chosen: one dissimilar appearance does not outweigh an object in its place, but
 # two exchanged ones do; appearance decides whether a new object is a missing one.
 _IN_PLACE_GAIN, _NEAR_GAIN, _ELSEWHERE_GAIN = 8.0, 6.0, 4.0
 _MAX_LOOK_GAIN = 5.0
 # Among similar objects the nearest is chosen: the gain falls with log(1 + distance / length [m]).
 _WAY_GAIN, _WAY_M = 1.2, 0.3
-# A landmark that is only doubtful has not moved farther than this [m]. A guess.
+# A landmark that is only doubtful has not moved farther than this [m]. Chosen.
 _MAX_DOUBTED_MOVE_M = 1.5
 # A landmark that was seen in a greater share of the viewpoints has not moved: false detections
-# appear in fewer viewpoints. A guess.
+# appear in fewer viewpoints. Chosen.
 _MOST_SEEN_IF_MOVED = 0.05
 # A match is ambiguous if the gain of another landmark is lower by less than this.
 _AMBIGUOUS_GAIN = 1.0
-# Deviation of the logarithm of an object's size, and the greatest difference. Guesses.
+# Deviation of the logarithm of an object's size, and the greatest difference. Chosen.
 _SIZE_SIGMA, _MAX_SIZE_CHANGE = 0.25, 0.8
 # Least number of objects in their places from which to learn the similarity of embeddings.
 _FEWEST_LOOKS = 8

@@ -37,12 +37,12 @@ from cliploc_ros.offline.mapping.views import Views
 _FACTOR_RANGE = (0.3, 2.0)
 _RATIO_RANGE = (0.02, 0.95)
 # Least number of landmarks, and of viewpoints of each, to estimate the scatter of the ratios;
-# least weight of a usual ratio [views]. Guesses.
+# least weight of a usual ratio [views]. Chosen.
 _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
 _FEW_LANDMARKS, _FEW_VIEWS, _LEAST_WORTH = 5, 3, 0.5
 # Share of the objects that are usually still in their place; share of the views in which an object
 # is detected, if neither map nor recording give it; share of the views with a false detection in
-# an empty place. Guesses, like all values below.
+# an empty place. Chosen, like all values below.
 _STAYS, _SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.9, 0.03
 # The seen ratio counts as this number of views at most: an object may be hard to see from one
 # side.
@@ -61,7 +61,7 @@ LEAST_VIEWS = 5
 # that were displaced in the map (at most 0.17) and those that were not (at least 0.2, except for 3
 # of 47).
 _MIN_NEW_SHARE, _MIN_SHARE_IN_PLACE = 0.4, 0.15
-# Least baseline of a find that may be a moved landmark, however rarely it was detected. A guess.
+# Least baseline of a find that may be a moved landmark, however rarely it was detected. Chosen.
 _MIN_MOVED_BASELINE_DEG = 10.0
 
 

@@ -55,9 +55,9 @@ _ROWS_SHOWN = 40
 # Least offset of the recording's coordinate frame from the map's that is reported [m] [deg].
 _LEAST_OFFSET_M, _LEAST_OFFSET_DEG = 0.03, 1.0
 # A recording that confirms a smaller share of the landmarks whose place it shows, or fewer than
-# MIN_CONFIRMED, does not belong to the map. A guess.
+# MIN_CONFIRMED, does not belong to the map. Chosen.
 _MIN_CONFIRMED_SHARE = 0.3
-# Nor does a recording in which a smaller share of the landmarks' boxes fits them well. A guess,
+# Nor does a recording in which a smaller share of the landmarks' boxes fits them well. Chosen,
 # between blocks of TUM fr3 (0.96; 0.45 if the map is off by 10 cm on each axis) and a simulated
 # table with poses off by 5 cm and a degree (0.28).
 _MIN_WELL_SHARE = 0.35
