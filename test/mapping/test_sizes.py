@@ -15,7 +15,6 @@ from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.sizes import (
     log_sizes,
-    reasons_by_size,
     scale_by_sizes,
     size_of_class,
 )
@@ -111,13 +110,3 @@ def test_the_size_of_a_class_decides_only_where_boxes_of_one_side_do_not():
     unknown = make_views(one_side)  # as without depth
     assert longest(unknown, *start) > size.most_m > longest(with_sizes(one_side), *start)
     assert longest(with_sizes(all_sides), *start) == pytest.approx(1.6, rel=0.03)
-
-
-def test_landmarks_far_longer_than_their_class_stay_out_unless_the_scale_is_wrong():
-    names = ['cell phone', 'chair', 'oven', 'unknown thing']
-    extents_m = np.array([1.12, 0.9, 0.7, 9.0])
-    phone, *others = reasons_by_size(names, extents_m)
-    assert 'it is 1.1 m long, too long for its class' in phone
-    assert others == [None] * 3
-    assert reasons_by_size(names, 4.0 * extents_m) == [None] * 4
-    assert reasons_by_size([], np.empty(0)) == []

@@ -29,7 +29,6 @@ from cliploc_ros.offline.mapping.pose_noise import (
     significant_pose_errors,
 )
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.sizes import reasons_by_size
 from cliploc_ros.offline.mapping.systematic import MountCorrection, refine_mount
 from cliploc_ros.offline.mapping.triangulation import (
     SUPPORT_IOU,
@@ -245,13 +244,9 @@ class _Builder(NamedTuple):
             self.tell('fitting landmarks', number / _DISCOVERY_ROUNDS)
             landmarks, shown = self._settle(views, Landmarks.joined(landmarks, found))
         evidence = gather_evidence(views, landmarks, shown)
-        names = [self.detections.class_names[number] for number in landmarks.classes]
-        extents_m = 2.0 * np.linalg.norm(landmarks.bases, axis=1).max(axis=1)
-        reasons = [reason or too_long for reason, too_long in zip(
-            reasons_against(landmarks, evidence, self.options),
-            reasons_by_size(names, extents_m), strict=True)]
+        reasons = reasons_against(landmarks, evidence, self.options)
         left_out = tuple(LeftOut(
-            names[row], rounded(landmarks.centers[row]),
+            self.detections.class_names[landmarks.classes[row]], rounded(landmarks.centers[row]),
             int(evidence.support[row]), int(evidence.viewpoints[row]), reason)
             for row, reason in enumerate(reasons) if reason is not None)
         landmarks = landmarks.select(np.array([reason is None for reason in reasons],

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sizes of objects by class: evidence on landmarks, and on the scale of a map."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 from importlib.resources import files
 from typing import NamedTuple
@@ -19,9 +19,6 @@ from cliploc_ros.offline.vocabulary.vocabulary import common_name
 # Least number of classes to estimate the scale of a map, and the least factor that is reported:
 # ellipsoids enclose objects loosely, or only parts of them. Chosen.
 _LEAST_CLASSES, _OFF = 3, 1.8
-# A landmark this many times longer than nearly all objects of its class is not one of them: its
-# boxes show several things. On five recordings nothing right exceeds 1.4, faults begin at 1.66.
-_TOO_LONG = 1.5
 
 
 class Size(NamedTuple):
@@ -39,29 +36,6 @@ class Size(NamedTuple):
 def size_of_class(name: str) -> Size | None:
     """Return the size of objects of a class, ignoring the case of its name; None if unknown."""
     return _sizes().get(common_name(name))
-
-
-def reasons_by_size(names: Sequence[str], extents_m: NDArray[np.float64]) -> list[str | None]:
-    """Return for each landmark why its size speaks against it; None if it does not.
-
-    If half of the landmarks or more are too long, the scale of the recording is wrong, not the
-    landmarks.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Classes of n landmarks.
-    extents_m : ndarray (n,)
-        Their longest extents [m].
-    """
-    sizes = [size_of_class(name) for name in names]
-    too_long = [size is not None and extent_m > _TOO_LONG * size.most_m
-                for size, extent_m in zip(sizes, extents_m.tolist(), strict=True)]
-    if 2 * sum(too_long) >= len(names) - sizes.count(None):
-        return [None] * len(names)
-    return [f'it is {extent_m:.1f} m long, too long for its class: its boxes show several objects'
-            if is_too_long else None
-            for extent_m, is_too_long in zip(extents_m.tolist(), too_long, strict=True)]
 
 
 def log_sizes(names: Iterable[str]) -> NDArray[np.float64]:
