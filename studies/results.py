@@ -45,13 +45,15 @@ _TAIL = re.compile(r'<!-- sha256 of the lines above: ([0-9a-f]{64}) -->\n\Z')
 def section(name: str, heading: str) -> str:
     """Return a section of a result, without its heading.
 
-    ValueError: the file was edited by hand, or has no such section.
+    ValueError: the file is missing or was edited by hand, or has no such section.
     """
-    text = (FOLDER / f'{name}.md').read_text()
+    path = FOLDER / f'{name}.md'
+    text = path.read_text() if path.exists() else ''
     found = _TAIL.search(text)
     body = text[:found.start()] if found else text
     if found is None or _digest(body) != found[1]:
-        raise ValueError(f'results/{name}.md was edited: run python -m studies.results {name}')
+        raise ValueError(f'results/{name}.md is missing or was edited: run '
+                         f'python -m studies.results {name}')
     sections = dict(re.findall(r'^## (.+)\n\n((?:(?!## ).*\n)*)', body, re.MULTILINE))
     if heading not in sections:
         raise ValueError(f'results/{name}.md has no section {heading}, but {", ".join(sections)}')

@@ -163,6 +163,8 @@ def evaluate(options: argparse.Namespace) -> int:
     if options.level and folder_of(options) is None:
         raise OptionsError('--level is for folders of images only')
     of_case = options.bag is not None and options.bag.suffix == '.npz'
+    if of_case and options.poses:
+        raise OptionsError('--poses: no effect on a stored request, which is answered again')
     if options.queries is None and not of_case:
         from cliploc_ros.cli.sources import find_topics
 

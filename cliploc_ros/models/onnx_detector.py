@@ -258,7 +258,7 @@ class DetrHead:
             scores = (shares / shares.sum(axis=1, keepdims=True))[:, :-1]
             queries, classes = np.arange(len(scores)), scores.argmax(axis=1)
         else:
-            # As in transformers: keep the best pairs of query and class, as many as queries.
+            # Like transformers, keep the n best pairs of a query and a class for n queries.
             scores = 1.0 / (1.0 + np.exp(-logits))
             best = np.argsort(-scores, axis=None, kind='stable')[:len(scores)]
             queries, classes = np.unravel_index(best, scores.shape)

@@ -88,7 +88,6 @@ def _print(drives: Iterable[judge.Drive], count: int, wrong_poses: bool, title: 
     print_section(f'{title}: right poses', judge.right_table(right))
     if alarms:
         print_section(f'{title}: wrong poses', judge.alarm_table(alarms))
-        print_section(f'{title}, at a glance', judge.glance_table(right, alarms))
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

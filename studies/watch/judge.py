@@ -8,7 +8,6 @@ Localizers are simulated: correct up to drift, displaced, or with a wrong mount 
 import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +25,7 @@ from cliploc_ros.core.watch.watch import Watch, WatchReport, WatchState
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
 from studies.acceptance.places import observation_of
-from studies.reports import grouped, short, table
+from studies.reports import table
 from studies.worlds.world import make_drive
 
 #: Time between looks [s].
@@ -290,18 +289,6 @@ def alarm_table(found: Sequence[Alarm]) -> str:
                              if alarm.case == KIDNAPPED and alarm.is_mapped])])
     return table([f'lost within {LOOKS} looks; not localized; cases', *cases,
                   f'{KIDNAPPED} to where the map shows something'], rows)
-
-
-def glance_table(right: Sequence[Right], alarms: Sequence[Alarm]) -> str:
-    """Return a short table of all drives together."""
-    states = [state for drive in right for state in drive.states]
-    false = sum(now == WatchState.LOST != before for drive in right
-                for before, now in pairwise(drive.states))
-    by_case = grouped(alarms, ['case']).items()
-    return table(['localizer', f'`lost` within {LOOKS} looks', 'no longer `localized`'], [
-        ['right', f'{false} times in {len(states) * LOOK_S / 3600.0:.1f} h', ''],
-        *([case, short(float(np.mean([alarm.lost for alarm in own]))),
-           short(float(np.mean([alarm.noticed for alarm in own])))] for (case,), own in by_case)])
 
 
 def _share(alarms: Sequence[Alarm]) -> str:

@@ -10,6 +10,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from processes import PATIENCE_S, wait_for
 from rcl_interfaces.srv import SetParameters
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -175,6 +176,9 @@ class Tester(Node):
         """Send a request, publish a frame until the answer arrives, and return the answer."""
         future = self.ask()
         self.feed_until(future.done, frame)
+        # else the frame may still arrive during the next request, and answer it
+        for publisher in (self.images, self.infos, self.detections):
+            publisher.wait_for_all_acked(Duration(seconds=1))
         return future.result()
 
 

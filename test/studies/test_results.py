@@ -21,9 +21,11 @@ def test_an_edit_by_hand_is_noticed(tmp_path, monkeypatch):
     monkeypatch.setattr(results, 'FOLDER', tmp_path)
     path = tmp_path / 'small.md'
     results.measure('small', 'studies.acceptance judge --worlds 1 --kinds room', tmp_path)
+    with pytest.raises(ValueError, match=r'gone\.md is missing'):
+        results.section('gone', 'At a glance')
     for edited in (path.read_text().replace(' of ', ' out of ', 1), 'no digest\n'):
         path.write_text(edited)
-        with pytest.raises(ValueError, match=r'small\.md was edited: run python -m'):
+        with pytest.raises(ValueError, match=r'small\.md is missing or was edited: run python -m'):
             results.section('small', 'At a glance')
 
 
