@@ -220,11 +220,11 @@ def run_kidnapped(options: DemoOptions) -> list[Step]:
     camera = find_camera(None, walks[0].folder)[0]
     with own_ros_domain() as domain, nodes(options, domain) as check:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        robot = KidnappedRobot(camera, landmark_map.frame_id, check)
         try:
-            robot = KidnappedRobot(camera, landmark_map.frame_id, check)
             steps = _kidnap(robot, before, after)
-            robot.destroy_node()
         finally:
+            robot.destroy_node()
             rclpy.try_shutdown()
     picture = options.out / PICTURE
     assert robot.seen is not None

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run the demo's processes, which all end with the demo, even if it is killed."""
 
-import ctypes
 import itertools
 import os
 import signal
@@ -17,7 +16,6 @@ from cliploc_ros.errors import CliplocError
 
 _GRACE_S = 5.0
 _POLL_S = 0.05
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class DemoError(CliplocError):
@@ -31,10 +29,11 @@ class Process:
         arguments = [str(argument) for argument in command]
         self._name, self._log = Path(arguments[0]).name, log
         with log.open('wb') as output:
-            # If the demo is killed, the kernel ends its processes.
+            # If the demo is killed, the kernel ends its processes. A preexec_fn could do this, too,
+            # but may deadlock: the demo has threads, which hold locks while it forks.
             self._popen = subprocess.Popen(
-                arguments, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                preexec_fn=lambda: ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM))
+                ['setpriv', '--pdeathsig', 'TERM', *arguments],
+                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT)
 
     def wait_for_output(self, text: str, patience_s: float) -> None:
         """Wait until the output contains a text.

@@ -190,15 +190,15 @@ def _walk(options: DemoOptions, folder: Path, sequence: TumSequence, domain: int
         readers = {name: stack.enter_context(BagReader(folder / f'walk_{name}'))
                    for name in options.mounts}
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        robot = Robot(readers, check)
         try:
-            robot = Robot(readers, check)
             robot.connect()
             print('\n' + page.console_header(), flush=True)
             for wake_up in robot.walk(wake_up_at, options.rate):
                 judged.append(judge(wake_up, len(judged) + 1, sequence))
                 print(page.console_row(judged[-1]), flush=True)
-            robot.destroy_node()
         finally:
+            robot.destroy_node()
             rclpy.try_shutdown()
     return judged
 
