@@ -29,8 +29,8 @@ class Process:
         arguments = [str(argument) for argument in command]
         self._name, self._log = Path(arguments[0]).name, log
         with log.open('wb') as output:
-            # If the demo is killed, the kernel ends its processes. A preexec_fn could do this, too,
-            # but may deadlock: the demo has threads, which hold locks while it forks.
+            # If the demo is killed, the kernel ends its processes. A preexec_fn would do the same,
+            # but may deadlock, because the demo has threads that hold locks while it forks.
             self._popen = subprocess.Popen(
                 ['setpriv', '--pdeathsig', 'TERM', *arguments],
                 stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT)

@@ -13,7 +13,7 @@ from cliploc_ros.command import Interruption
 OPEN = Path('/proc/self/fd')
 # In a process of its own: the timer and its handler are those of the time limit of a test, and
 # other tests leave threads behind.
-WAITS = '''
+WAITS = """
 import signal, time
 from cliploc_ros.command import Interruption
 
@@ -33,7 +33,7 @@ assert time.monotonic() - start >= 0.05
 signal.setitimer(signal.ITIMER_REAL, 0.02)
 assert interruption.wait(60.0) and interruption.wait(60.0)
 assert time.monotonic() - start < 30.0
-'''
+"""
 
 
 def test_a_signal_ends_a_wait_at_any_moment_and_time_ends_it_too():
