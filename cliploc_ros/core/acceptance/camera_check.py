@@ -221,8 +221,21 @@ class Views(NamedTuple):
                        for both in zip(self, other, strict=True)))
 
     def odds(self, extent: float = 0.0) -> CameraOdds:
-        """Return the odds of the camera from all looks; for extent see odds_of."""
-        return odds_of(self.informations.sum(axis=0), self.vectors.sum(axis=0), extent)
+        """Return the odds of the camera from all looks; for extent see odds_of.
+
+        Errors of the map scatter the errors of the views more than their boxes do. The information
+        is then too large by the Birge ratio (Birge, "The Calculation of Errors by the Method of
+        Least Squares", 1932). Errors of the camera are common to all views, and do not scatter.
+        """
+        information, vector = self.informations.sum(axis=0), self.vectors.sum(axis=0)
+        prior = np.diag(_WRONG ** -2.0)
+        common, each = np.linalg.inv(information + prior), np.linalg.inv(self.informations + prior)
+        apart = self.vectors - self.informations @ common @ vector
+        freedom = (np.einsum('vij,vji->', self.informations, each)
+                   - np.einsum('ij,ji->', information, common))
+        ratio = max(1.0, (_TERMS.scatter + float(np.einsum('vi,vij,vj->', apart, each, apart)))
+                    / (_TERMS.scatter + max(0.0, float(freedom))))
+        return odds_of(information / ratio, vector / ratio, extent)
 
 
 class Extent:
