@@ -69,6 +69,7 @@ _KINDS = {'image': (0, 2, 3), 'focal length': (0,), 'aspect': (1,), 'principal p
           'stretched image': (0, 1, 2, 3), 'convention': (4, 5), 'size': (6,)}
 _OF_OTHER_PIXELS = np.array([name in ('image', 'principal point', 'stretched image')
                              for name in _KINDS])
+_UNKNOWN_INFO = 1 + list(_KINDS).index('stretched image')
 _DEVIATIONS = np.array([_RIGHT, *(np.where(np.isin(np.arange(ERRORS), errors), _WRONG, _RIGHT)
                                   for errors in _KINDS.values())])
 _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
@@ -130,7 +131,9 @@ class CameraOdds(NamedTuple):
         float
             By what factor these errors lower the probability that the pose is within 1 m.
         ndarray (6, 6)
-            What they add to the covariance.
+            What they add to the covariance: the errors of camera_info, weighted by the
+            probability that the camera is wrong. Its kind does not matter, since few looks tell
+            the kinds apart.
         """
         weights = np.exp(self.odds - self.odds.max()) * _WEIGHTS
         weights /= weights.sum()
@@ -138,7 +141,7 @@ class CameraOdds(NamedTuple):
         added[0] = 0.0  # the covariance includes the errors of a right camera
         near = shares_within(RIGHT_M, (CALIBRATION.covariance.caution * covariance
                                        + added)[:, :3, :3])
-        return float(weights @ near / near[0]), np.tensordot(weights, added, 1)
+        return float(weights @ near / near[0]), (1.0 - weights[0]) * added[_UNKNOWN_INFO]
 
 
 def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], extent: float = 0.0
