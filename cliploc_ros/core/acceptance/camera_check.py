@@ -7,7 +7,9 @@ One image hardly shows this error, because the pose adapts to it. Many images sh
 their poses differ and the error stays the same. A look is the evidence of one frame about the
 errors of its camera, with the pose eliminated, see cliploc_ros.core.fit.camera_fit. It consists of
 an information matrix and a vector, which add up over looks. Looks from one view share the errors
-of their boxes. Their mean therefore counts as one look.
+of their boxes. Their mean therefore counts as one look. Errors of the map are errors of all looks
+at an object, so the information of all looks is reduced by their scatter, see Views.odds. Poses
+that are refused give looks, too, because the few poses that a wrong camera lets pass fit it well.
 
 A camera is either right, with the small errors of any calibration, or wrong in one of a few ways
 (kinds), with large errors. The Bayes factor of wrong against right is a mean of likelihood ratios.
