@@ -4,13 +4,16 @@
 
 One localizer gets all images of a recording, or of drives through simulated worlds, in order; a
 new one is made for each image as well. Boxes or camera_info are wrong by one of several rules.
-The table counts accepted poses, and the looks until the localizer reports the camera as wrong.
+The map is the given one, or one that another program or a person could have made of the same
+objects. The table counts accepted poses, and the images until the localizer reports the camera as
+wrong.
 """
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from tqdm import tqdm
@@ -42,18 +45,57 @@ CAMERAS: dict[str, tuple[wrong_sensors.Change, float]] = {
     'focal length x .8': (wrong_sensors.scaled_focal, 0.8),
     'K x 2': (wrong_sensors.scaled_camera, 2.0),
     'K x .5': (wrong_sensors.scaled_camera, 0.5),
+    'K x 1.25': (wrong_sensors.scaled_camera, 1.25),
     'principal point + .2 widths': (wrong_sensors.shifted_center, 0.2),
     'boxes of a crop, 300 px': (wrong_sensors.middle_crop, 300.0),
     'boxes of a crop, 416 px': (wrong_sensors.middle_crop, 416.0),
+    'boxes of a letterbox, 416 px': (wrong_sensors.letterboxed, 416.0),
+    'fisheye as pinhole': (wrong_sensors.fisheye_boxes, 1.0),
     'boxes x .5': (wrong_sensors.scaled_boxes, 0.5),
     'boxes x 1.5': (wrong_sensors.scaled_boxes, 1.5),
     'boxes + .15 widths': (wrong_sensors.shifted_boxes, 0.15)}
+
+
+
+
+def _rough(landmark_map: LandmarkMap, share: float, error_m: float, seed: int = 0) -> LandmarkMap:
+    """Return a map with errors of all lengths (a share) and centres."""
+    rng, count = np.random.default_rng(seed), len(landmark_map)
+    return replace(
+        landmark_map, centers=landmark_map.centers + rng.normal(0.0, error_m, (count, 3)),
+        semi_axes=landmark_map.semi_axes * np.exp(rng.normal(0.0, share, (count, 3))))
+
+
+def _spheres(landmark_map: LandmarkMap) -> LandmarkMap:
+    """Return a map of spheres with the same volumes."""
+    radii = np.exp(np.log(landmark_map.semi_axes).mean(axis=1, keepdims=True))
+    return replace(landmark_map, semi_axes=np.tile(radii, (1, 3)))
+
+
+def _by_class(landmark_map: LandmarkMap) -> LandmarkMap:
+    """Return a map in which all objects of a class have one size, with centres off by 3 cm."""
+    classes, order = np.array(landmark_map.class_ids), landmark_map.semi_axes.argsort(axis=1)
+    lengths = np.take_along_axis(landmark_map.semi_axes, order, axis=1)
+    medians = np.array([np.median(lengths[classes == name], axis=0) for name in classes])
+    semi_axes = np.empty_like(lengths)
+    np.put_along_axis(semi_axes, order, medians, axis=1)
+    return _rough(replace(landmark_map, semi_axes=semi_axes), 0.0, 0.03)
+
+
+#: Other maps of the same objects, by name.
+MAPS: dict[str, Callable[[LandmarkMap], LandmarkMap]] = {
+    'given': lambda given: given,
+    '10 %, 3 cm off': lambda given: _rough(given, 0.1, 0.03),
+    '20 %, 5 cm off': lambda given: _rough(given, 0.2, 0.05),
+    'spheres': _spheres,
+    'one size a class': _by_class}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Look(Answer):
     """The answer to one image."""
 
+    map: str
     camera: str
     localizer: str  #: 'one', or 'new' for each image
     drive: int
@@ -76,15 +118,16 @@ def _drive(place: AnyPlace, options: argparse.Namespace
 
 
 def _looks(number: int, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
-           cameras: Sequence[str]) -> Iterator[Look]:
-    """Yield the answers on a drive, for each of the named cameras."""
-    relocalizer = Relocalizer(landmark_map, RelocalizerOptions(k=min(3, len(landmark_map))))
-    for name in cameras:
+           options: argparse.Namespace) -> Iterator[Look]:
+    """Yield the answers on a drive, for each of the chosen maps and cameras."""
+    for map_name, name in product(options.maps, options.wrong):
+        relocalizer = Relocalizer(MAPS[map_name](landmark_map),
+                                  RelocalizerOptions(k=min(3, len(landmark_map))))
         change, level = CAMERAS[name]
-        for localizer in ('new', 'one'):
+        for localizer in options.localizers:
             for fields, is_called_wrong in look_on(relocalizer, change(queries, level),
                                                    localizer == 'one'):
-                yield Look(camera=name, localizer=localizer, drive=number,
+                yield Look(map=map_name, camera=name, localizer=localizer, drive=number,
                            is_called_wrong=is_called_wrong, **fields)
 
 
@@ -106,6 +149,13 @@ def _after(looks: Sequence[Look]) -> str:
     return f'{np.median(alarms):.0f}, {max(alarms)}' if alarms else ''
 
 
+def _before(looks: Sequence[Look]) -> str:
+    """Return the number of poses that one localizer accepts before, and how many are wrong."""
+    early = [look for look in looks if look.accepted and not look.is_called_wrong
+             and look.localizer == 'one']
+    return f'{len(early)}, {sum(not look.right for look in early)}'
+
+
 def run(arguments: Sequence[str]) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__,
@@ -119,6 +169,10 @@ def run(arguments: Sequence[str]) -> int:
                         help='images of a drive (%(default)s)')
     parser.add_argument('--wrong', nargs='+', choices=CAMERAS, default=[*CAMERAS],
                         metavar='WHAT', help=f'{", ".join(CAMERAS)} (all)')
+    parser.add_argument('--maps', nargs='+', choices=MAPS, default=['given'], metavar='MAP',
+                        help=f'{", ".join(MAPS)} (given)')
+    parser.add_argument('--localizers', nargs='+', choices=['new', 'one'], default=['new', 'one'],
+                        metavar='WHICH', help='new for each image, one for all images (both)')
     parser.add_argument('--vertical', action='store_true', help='give a vertical, to 1 degree')
     options = parser.parse_args(arguments)
     places = chosen_places(options)
@@ -133,9 +187,9 @@ def run(arguments: Sequence[str]) -> int:
         landmark_map, queries = _drive(place, options)
         if options.vertical:
             queries = with_vertical(queries, VERTICAL_DEG)
-        looks += _looks(number, landmark_map, queries, options.wrong)
-    print(answer_table(looks, ['camera', 'localizer'], called_wrong=_called_wrong,
-                       after_looks_median_most=_after))
+        looks += _looks(number, landmark_map, queries, options)
+    print(answer_table(looks, ['map', 'camera', 'localizer'], called_wrong=_called_wrong,
+                       after_images_median_most=_after, accepted_wrong_before=_before))
     return 0
 
 

@@ -154,6 +154,14 @@ def middle_crop(boxes: Floats, camera: Camera, side_px: float) -> Floats:
 
 
 @_of_boxes
+def letterboxed(boxes: Floats, camera: Camera, side_px: float) -> Floats:
+    """Return boxes in the pixels of a network whose input is the image with two bars, a square."""
+    size = np.array([camera.width, camera.height])
+    scale = side_px / size.max()
+    return scale * boxes + np.tile((side_px - scale * size) / 2, 2)
+
+
+@_of_boxes
 def turned_boxes(boxes: Floats, camera: Camera, angle_deg: float) -> Floats:
     """Return the boxes of an image turned by a multiple of 90 degrees."""
     width, height = camera.width, camera.height

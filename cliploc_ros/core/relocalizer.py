@@ -22,6 +22,7 @@ from cliploc_ros.core.acceptance.contenders import (
 from cliploc_ros.core.acceptance.depth_check import DepthCheck, check_depth
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Match, find_with_rivals
 from cliploc_ros.core.geometry.transforms import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
@@ -88,8 +89,7 @@ class Relocalization:
     recognition: Recognition | None = None
     #: Check of the depths of the objects; None without depth
     depth: DepthCheck | None = None
-    #: Evidence about the cameras, from a pose that depends on boxes and would be accepted if the
-    #: cameras were right
+    #: Evidence about the cameras, from a pose that depends on boxes and is likely right
     cameras: tuple[CameraLook, ...] = ()
 
     @property
@@ -281,10 +281,11 @@ class Relocalizer:
         evidence = compared.evidence(covariance)
         seen: list[CameraLook] = []
         if compared.by_boxes is not None and self.options.refine:
-            # a wrong camera may be the cause of an uncertain position
-            if refusal(replace(evidence, near=1.0), self.options) is None:
+            # a wrong camera may be the cause of low confidence
+            if refusal(replace(evidence, near=1.0), replace(self.options, min_confidence=min(
+                    self.options.min_confidence, CALIBRATION.camera.likely))) is None:
                 seen = looks_of(joined, compared.by_boxes.finalist)
-            camera, fault = (cameras or CameraCheck()).judge(seen, covariance)
+            camera, covariance, fault = (cameras or CameraCheck()).judge(seen, covariance)
             evidence = replace(evidence, camera=camera, camera_fault=fault)
         refused = refusal(evidence, self.options)
         shown = compared.by_objects or compared.contenders[0]

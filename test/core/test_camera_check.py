@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 from scene import CAMERA, boxes_of, make_room, see_room
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
-from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, Extent
+from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, Extent, Views
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.fit.camera_fit import ERRORS, corrected, fit_camera
+from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.observation import Detections, Observation
@@ -125,6 +127,50 @@ def test_a_wrong_camera_is_refused_with_the_cause(what, rng):
     assert sum(wrong[LOOKS // 2:]) > 0 or not any(result.accepted for result in found)
 
 
+@pytest.mark.parametrize(('change', 'level', 'is_wrong'), [
+    (wrong_sensors.scaled_focal, 1.0, False), (wrong_sensors.scaled_camera, 0.5, True),
+    (wrong_sensors.letterboxed, 416.0, True), (wrong_sensors.scaled_camera, 1.4, True)])
+def test_on_a_rough_map_only_a_wrong_camera_is_called_wrong(change, level, is_wrong, rng):
+    """Errors of each object's sizes and centre are in all looks, like those of the camera."""
+    rough = replace(ROOM, semi_axes=ROOM.semi_axes * np.exp(rng.normal(0.0, 0.15, (len(ROOM), 3))),
+                    centers=ROOM.centers + rng.normal(0.0, 0.04, (len(ROOM), 3)))
+    localizer = Localizer(Relocalizer(rough, RELOCALIZER.options))
+    found = localized(localizer, change([query(rng) for _ in range(LOOKS)], level))
+    assert bool(localizer.cameras.faults) == is_wrong
+    assert any(result.cameras and not result.accepted for result in found) == is_wrong
+
+
+def test_views_that_contradict_each_other_are_weak_evidence(rng):
+    """The mean of the errors is the same; errors of the map scatter, those of a camera do not."""
+    def log_odds(scatter):
+        views, information = Views(), 400.0 * np.eye(ERRORS)
+        for number, focal in enumerate(0.2 + scatter * np.array([-1.0, 1.0, -1.0, 1.0])):
+            views = views.with_look(CameraLook(
+                '', True, make_transform(np.eye(3), np.array([number, 0.0, 0.0])), information,
+                information[0] * focal, np.zeros((6, ERRORS))))
+        return views.odds().log_odds
+    assert log_odds(0.0) > CALIBRATION.camera.sure > log_odds(0.25) > 0.0
+    assert log_odds(0.02) == pytest.approx(log_odds(0.0), abs=0.1), 'as boxes alone scatter'
+
+
+def test_the_covariance_has_the_errors_of_a_camera_until_it_is_verified(rng):
+    first, *queries = [query(rng) for _ in range(LOOKS)]
+    for change, level in ((wrong_sensors.scaled_camera, 1.2), (wrong_sensors.scaled_focal, 0.8)):
+        found, = localized(Localizer(RELOCALIZER), change([first], level))
+        assert normalized_square(found.map_from_camera, found.covariance,
+                                 first.map_from_camera) < chi2.ppf(0.95, 6)
+    localizer = Localizer(RELOCALIZER)
+    before, = localized(localizer, [first])
+    localized(localizer, queries)
+    after, = localized(localizer, [first])
+    sizes = [np.linalg.eigvalsh(found.covariance).max() for found in (before, after)]
+    assert sizes[1] < 0.5 * sizes[0]
+    # what verified cameras may still be off by
+    share, covariance, _ = localizer.cameras.judge(after.cameras, np.eye(6))
+    assert share > 0.99
+    assert (np.linalg.eigvalsh(covariance - np.eye(6)) > -1e-9).all()
+
+
 def test_looks_from_one_view_count_once(rng):
     localizer, pose = Localizer(RELOCALIZER), place(rng)
     looks = wrong_sensors.scaled_focal([query(rng, pose=pose) for _ in range(30)], 1.3)
@@ -191,7 +237,8 @@ def test_a_view_that_stays_the_same_has_no_border(rng):
 
 
 def test_nothing_is_known_of_a_new_camera():
-    assert CameraCheck().judge([], np.eye(6)) == (1.0, '')
+    share, covariance, fault = CameraCheck().judge([], np.eye(6))
+    assert (share, fault) == (1.0, '') and (covariance == np.eye(6)).all()
 
 
 @pytest.mark.parametrize(('error', 'size', 'said'), [
@@ -201,7 +248,7 @@ def test_the_error_of_a_wrong_camera_is_named(error, size, said, rng):
     check, information = CameraCheck(), 1e4 * np.eye(ERRORS)
     check.see(query(rng).observation)
     check.add([CameraLook('', True, place(rng), information, information[error] * size,
-                          np.zeros((3, ERRORS))) for _ in range(12)])
+                          np.zeros((6, ERRORS))) for _ in range(12)])
     (fault,) = check.faults
     assert said in fault
 

@@ -237,6 +237,13 @@ def turning(count):
         'y', 2.0 * step, degrees=True).as_matrix(), np.zeros(3)) for step in range(count)]
 
 
+def test_odometry_errs_as_much_to_later_frames_as_to_earlier_ones():
+    """The reference has the last instant, or the first: the way to each frame is the same."""
+    covariances = [fitted(turning(4), ROOM.centers, 0.02, stamps=stamps)[1]
+                   for stamps in ([0, 1, 2, 3], [3, 2, 1, 0])]
+    np.testing.assert_allclose(*covariances, rtol=1e-6)
+
+
 def move_landmarks(rng, pose):
     return {'centers': ROOM.centers + rng.normal(0, 0.1, ROOM.centers.shape)}
 

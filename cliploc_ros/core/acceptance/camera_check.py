@@ -7,7 +7,9 @@ One image hardly shows this error, because the pose adapts to it. Many images sh
 their poses differ and the error stays the same. A look is the evidence of one frame about the
 errors of its camera, with the pose eliminated, see cliploc_ros.core.fit.camera_fit. It consists of
 an information matrix and a vector, which add up over looks. Looks from one view share the errors
-of their boxes. Their mean therefore counts as one look.
+of their boxes. Their mean therefore counts as one look. Errors of the map are errors of all looks
+at an object, so the information of all looks is reduced by their scatter, see Views.odds. Poses
+that are refused give looks, too, because the few poses that a wrong camera lets pass fit it well.
 
 A camera is either right, with the small errors of any calibration, or wrong in one of a few ways
 (kinds), with large errors. The Bayes factor of wrong against right is a mean of likelihood ratios.
@@ -69,6 +71,7 @@ _KINDS = {'image': (0, 2, 3), 'focal length': (0,), 'aspect': (1,), 'principal p
           'stretched image': (0, 1, 2, 3), 'convention': (4, 5), 'size': (6,)}
 _OF_OTHER_PIXELS = np.array([name in ('image', 'principal point', 'stretched image')
                              for name in _KINDS])
+_UNKNOWN_INFO = 1 + list(_KINDS).index('stretched image')
 _DEVIATIONS = np.array([_RIGHT, *(np.where(np.isin(np.arange(ERRORS), errors), _WRONG, _RIGHT)
                                   for errors in _KINDS.values())])
 _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
@@ -87,7 +90,7 @@ class CameraLook(NamedTuple):
     #: (7, 7), (7,): information matrix of the errors; its product with the most likely errors
     information: NDArray[np.float64]
     vector: NDArray[np.float64]
-    #: (3, 7): how the position of the newest camera moves with each error [m]
+    #: (6, 7): how the pose of the newest camera moves with each error [m] [rad]
     moves: NDArray[np.float64]
 
 
@@ -114,22 +117,33 @@ class CameraOdds(NamedTuple):
         """Return whether the camera is certainly wrong."""
         return self.log_odds > _TERMS.sure
 
-    def share_near(self, covariance: NDArray[np.float64], moves: NDArray[np.float64]) -> float:
-        """Return by what factor camera errors lower the probability that a pose is within 1 m.
+    def effect(self, covariance: NDArray[np.float64], moves: NDArray[np.float64]
+               ) -> tuple[float, NDArray[np.float64]]:
+        """Return the effect of the errors of a possibly wrong camera on a pose.
 
         Parameters
         ----------
         covariance : ndarray (6, 6)
             Covariance of the pose if the camera is right.
-        moves : ndarray (3, 7)
+        moves : ndarray (6, 7)
             See CameraLook.
+
+        Returns
+        -------
+        float
+            By what factor these errors lower the probability that the pose is within 1 m.
+        ndarray (6, 6)
+            What they add to the covariance: the errors of camera_info, weighted by the
+            probability that the camera is wrong. Its kind does not matter, since few looks tell
+            the kinds apart.
         """
         weights = np.exp(self.odds - self.odds.max()) * _WEIGHTS
-        wider = np.tile(CALIBRATION.covariance.caution * covariance[:3, :3],
-                        (len(weights), 1, 1))
-        wider[1:] += moves @ self.squares[1:] @ moves.T
-        near = shares_within(RIGHT_M, wider)
-        return float(weights @ near / (weights.sum() * near[0]))
+        weights /= weights.sum()
+        added = moves @ self.squares @ moves.T
+        added[0] = 0.0  # the covariance includes the errors of a right camera
+        near = shares_within(RIGHT_M, (CALIBRATION.covariance.caution * covariance
+                                       + added)[:, :3, :3])
+        return float(weights @ near / near[0]), (1.0 - weights[0]) * added[_UNKNOWN_INFO]
 
 
 def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], extent: float = 0.0
@@ -158,7 +172,7 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
     inliers = one_to_one(joined.rig, verify_rig(joined.rig, pose.rotation, pose.translation),
                          pose.rotation, pose.translation)
     looks, last = [], joined.frames[-1].observation
-    moves = moves_with_cameras(joined.rig, inliers, pose.rotation, pose.translation)[:, :3]
+    moves = moves_with_cameras(joined.rig, inliers, pose.rotation, pose.translation)
     names = np.array([frame.observation.camera_name for frame in joined.frames])
     for number, frame in enumerate(joined.frames):
         pairs = inliers.pairs[inliers.starts[number]:inliers.starts[number + 1]]
@@ -173,17 +187,14 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
         left, top, right, bottom = seen.detections.bboxes_xyxy[rows].T
         is_edge = np.stack([left > low, right < high[0], top > low, bottom < high[1]], axis=1)
         fit = fit_camera(pairs, is_edge, vertical, rotation, translation, _WRONG)
-        square = max(1.0, (fit.square + _TERMS.prior_square * _TERMS.prior_residuals)
-                     / (max(0, int(is_edge.sum()) - 6 - ERRORS) + _TERMS.prior_residuals))
-        information = fit.information / square
-        vector = information @ fit.errors + fit.errors / _WRONG ** 2 / square
-        if not np.isfinite([*information.ravel(), *vector]).all():
+        vector = fit.information @ fit.errors + fit.errors / _WRONG ** 2
+        if not np.isfinite([*fit.information.ravel(), *vector]).all():
             continue  # NaN or infinity would corrupt the sum over all later looks
-        weight = _TERMS.view / max(_TERMS.view, odds_of(information, vector).log_odds)
+        weight = _TERMS.view / max(_TERMS.view, odds_of(fit.information, vector).log_odds)
         looks.append(CameraLook(
             seen.camera_name, seen.stamp_ns == last.stamp_ns,
             invert_transform(make_transform(rotation, translation)),
-            weight * information, weight * vector,
+            weight * fit.information, weight * vector,
             moves[names == seen.camera_name].sum(axis=0)))
     return looks
 
@@ -215,8 +226,21 @@ class Views(NamedTuple):
                        for both in zip(self, other, strict=True)))
 
     def odds(self, extent: float = 0.0) -> CameraOdds:
-        """Return the odds of the camera from all looks; for extent see odds_of."""
-        return odds_of(self.informations.sum(axis=0), self.vectors.sum(axis=0), extent)
+        """Return the odds of the camera from all looks; for extent see odds_of.
+
+        Errors of the map scatter the errors of the views more than their boxes do. The information
+        is then too large by the Birge ratio (Birge, "The Calculation of Errors by the Method of
+        Least Squares", 1932). Errors of the camera are common to all views, and do not scatter.
+        """
+        information, vector = self.informations.sum(axis=0), self.vectors.sum(axis=0)
+        prior = np.diag(_WRONG ** -2.0)
+        common, each = np.linalg.inv(information + prior), np.linalg.inv(self.informations + prior)
+        apart = self.vectors - self.informations @ common @ vector
+        freedom = (np.einsum('vij,vji->', self.informations, each)
+                   - np.einsum('ij,ji->', information, common))
+        ratio = max(1.0, (_TERMS.scatter + float(np.einsum('vi,vij,vj->', apart, each, apart)))
+                    / (_TERMS.scatter + max(0.0, float(freedom))))
+        return odds_of(information / ratio, vector / ratio, extent)
 
 
 class Extent:
@@ -378,28 +402,30 @@ class CameraCheck:
         record.see(observation)
 
     def add(self, looks: Sequence[CameraLook]) -> None:
-        """Add the looks of a pose that is accepted, or would be if the camera were right."""
+        """Add the looks of a pose that is likely right, accepted or not."""
         for look in looks:
             if look.is_new:
                 self._records[look.camera_name].add(look)
 
     def judge(self, looks: Sequence[CameraLook], covariance: NDArray[np.float64]
-              ) -> tuple[float, str]:
+              ) -> tuple[float, NDArray[np.float64], str]:
         """Return the effect of camera errors on a pose, without adding its looks.
 
-        The effect is the factor of CameraOdds.share_near, and a description of what is certainly
-        wrong with a camera, empty if nothing is. The covariance (6, 6) is that of the pose.
+        The effect is the factor and the covariance (6, 6) with the errors of its cameras, see
+        CameraOdds.effect, and a description of what is certainly wrong with a camera, empty if
+        nothing is. The given covariance is that of the pose if its cameras are right.
         """
-        share, fault = 1.0, ''
+        share, wider, fault = 1.0, covariance, ''
         for name in dict.fromkeys(look.camera_name for look in looks):
             its_looks = [look for look in looks if look.camera_name == name]
             record = self._records.get(name)
             views = reduce(Views.with_look, its_looks, record.views if record else Views())
             odds = views.odds(record.by_extent if record else 0.0)
-            share = min(share, odds.share_near(covariance, its_looks[-1].moves))
+            near, added = odds.effect(covariance, its_looks[-1].moves)
+            share, wider = min(share, near), wider + added
             if record is not None and odds.is_wrong:
                 fault = record.in_words(odds)
-        return share, fault or '; '.join(self.faults)
+        return share, wider, fault or '; '.join(self.faults)
 
     @property
     def faults(self) -> list[str]:
