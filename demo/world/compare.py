@@ -103,7 +103,7 @@ def run(arguments: list[str]) -> int:
     paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
     compare_methods(landmark_map, make_queries(queries, landmark_map),
                     parse_methods(['all', 'auto'], paper, len(landmark_map)), options.out,
-                    trials=options.trials, workers=options.workers, resume=True,
+                    trials=options.trials, workers=options.workers,
                     frames=queries.frames)
     return 0
 

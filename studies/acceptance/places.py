@@ -17,7 +17,6 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.observations import Queries, load_observations, load_queries
 from cliploc_ros.offline.evaluation.trials import (
-    PosedQuery,
     make_queries,
     simulate_depths,
     with_neighbours,
@@ -25,6 +24,7 @@ from cliploc_ros.offline.evaluation.trials import (
 )
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.cameras import GROUP_SIZE
 from studies.worlds.places import KINDS

@@ -77,6 +77,8 @@ _QUERIES = npz.Schema('query file', {
     'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE, npz.Check(
         'has a focal length that is not above 0',
         lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
+    'image_size': npz.Field('integers', (2,), (npz.Check(
+        'is not above 0', lambda sides: sides <= 0),), is_optional=True),
     # half precision rounds some cosines to just above 1
     'similarities': npz.Field('numbers', ('n', 'L'), (npz.FINITE, npz.Check(
         'is not a cosine, outside -1 to 1', lambda rows: (np.abs(rows) > 1.001).any(axis=1)))),
@@ -121,6 +123,7 @@ class Queries:
     landmark_ids: tuple[str, ...]  #: The landmark of each column of the similarities
     intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Of the undistorted image [px]
     frames: tuple[QueryFrame, ...]  #: In the file's order
+    image_size: tuple[int, int] | None = None  #: Width and height [px]; None if unknown
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -181,7 +184,9 @@ def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) 
             group=int(arrays['query_group'][index]), is_main=bool(arrays['is_main'][index]),
             depths=arrays['depths'][rows].astype(np.float64) if 'depths' in arrays else None,
             **{name: float(arrays[name][index]) for name in _STAGES if name in arrays}))
-    return Queries(tuple(map(str, arrays['landmark_ids'])), (fx, fy, cx, cy), tuple(frames))
+    width, height = map(int, arrays.get('image_size', (0, 0)))
+    return Queries(tuple(map(str, arrays['landmark_ids'])), (fx, fy, cx, cy), tuple(frames),
+                   (width, height) if width else None)
 
 
 def save_queries(path: str | Path, queries: Queries) -> None:
@@ -216,6 +221,8 @@ def save_queries(path: str | Path, queries: Queries) -> None:
             'stamps_ns': np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
             **{name: np.array([getattr(frame, name) for frame in frames]) for name in _STAGES},
         }
+        if queries.image_size is not None:
+            arrays['image_size'] = np.array(queries.image_size)
         if any(frame.depths is not None for frame in frames):
             arrays['depths'] = np.concatenate([
                 np.full(len(frame), np.nan) if frame.depths is None else frame.depths

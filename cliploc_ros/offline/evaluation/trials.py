@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run methods on queries: the pose of each search and its error; simulated sensors."""
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -11,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core import localizer
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.camera import Camera
@@ -28,39 +28,24 @@ from cliploc_ros.core.geometry.transforms import (
     pose_error,
     transform_from_pose,
 )
-from cliploc_ros.core.keyframes.localization import (
-    ImageFeatures,
-    ImageRecognizer,
-    KeyframeLocalizer,
-)
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.joined_map import place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
-from cliploc_ros.core.search.frame_search import SearchedFrame
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS, Method
+from cliploc_ros.offline.posed_query import PosedQuery, ask
 from cliploc_ros.units import NS_PER_S
 
 #: Result.source of a pose that another program found.
 GIVEN = 'given'
 #: Greatest difference in time between a query and its given pose [ms]: evo's default.
 GIVEN_TOLERANCE_MS = 10
-
-
-@dataclass(frozen=True)
-class PosedQuery:
-    """An observation to localize, and its true pose."""
-
-    number: int  #: Number of the frame in its query file, from 0
-    observation: Observation
-    map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
-    #: Other frames that odometry links to it, or the frames of other cameras at its instant
-    neighbours: tuple[Observation, ...] = ()
-    image: ImageFeatures | None = None  #: Local features of its image, for keyframes
 
 
 @dataclass(frozen=True)
@@ -121,8 +106,9 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
                            'recorded with another map')
     columns = [column[landmark_id] for landmark_id in landmark_map.landmark_ids]
     fx, fy, cx, cy = queries.intrinsics_fx_fy_cx_cy
-    # the file lacks the size of the image, which localization does not need
-    camera = Camera(max(1, round(2 * cx)), max(1, round(2 * cy)), fx, fy, cx, cy)
+    # files of older releases lack the size of the image
+    camera = Camera(*queries.image_size or (max(1, round(2 * cx)), max(1, round(2 * cy))),
+                    fx, fy, cx, cy)
     return tuple(
         PosedQuery(number, Observation(
             camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
@@ -160,28 +146,23 @@ def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float
 
 def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Sequence[PosedQuery],
               keyframes: KeyframeLocalizer | None = None) -> list[Result]:
-    """Run one trial of a method, numbered from 0, on some queries.
+    """Run one trial of a method, numbered from 0, on some queries; return results by stamp.
+
+    One localizer gets all queries in the order of their stamps, as on a robot, so that evidence
+    about cameras and depth accumulates. For the paper's methods, each query gets a new localizer:
+    its searches are independent.
 
     `keyframes` localizes in the keyframes of the map, if the method uses them and the query has
-    features.
+    an image.
     """
-    seed = method.options.random_seed + trial
-    relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
-    on_demand = (method.options.crops == 'on_demand'
-                 and localizer.can_do_without_crops(method.options))
-    results = []
-    for query in queries:
-        recognizer = None
-        observations = [*query.neighbours, query.observation]
-        if keyframes is not None and query.image is not None and method.keyframes:
-            recognizer = ImageRecognizer(keyframes, query.image)
-        if on_demand:
-            found, crops_share = _localize_on_demand(relocalizer, observations, recognizer)
-        else:
-            found = relocalizer.relocalize(observations, recognizer)
-            crops_share = float(method.options.needs_similarities)
-        results.append(_judge(landmark_map, method.name, trial, query, found, crops_share,
-                              recognizer))
+    relocalizer = Relocalizer(landmark_map, replace(
+        method.options, random_seed=method.options.random_seed + trial))
+    layer = keyframes if method.keyframes else None
+    localizer, results = Localizer(relocalizer, layer), []
+    for query in sorted(queries, key=lambda query: query.observation.stamp_ns):
+        if not method.accumulates:
+            localizer = Localizer(relocalizer, layer)
+        results.append(_result(localizer, landmark_map, method, trial, query))
     return results
 
 
@@ -235,34 +216,17 @@ def _error(pose: NDArray[np.float64] | None, query: PosedQuery) -> dict[str, Any
             'error_deg': float(error_deg)}
 
 
-def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observation],
-                        recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
-    """Localize as the node does: frame after frame, with crops compared on demand.
-
-    Return the result and the share of crops that were compared with labels.
-    """
-    frames: list[SearchedFrame] = []
-    count = len(relocalizer.landmark_map)
-    for observation in observations:
-        if observation.camera_name and observation is not observations[-1]:
-            frames.append(relocalizer.search(localizer.by_classes(observation, count)))
-            continue
-        frame, found = localizer.localize_on_demand(
-            relocalizer, frames, observation,
-            localizer.recorded_crops(observation, relocalizer.options),
-            recognizer=recognizer if observation is observations[-1] else None)
-        frames.append(frame)
-    crops = sum(len(frame.observation.detections) for frame in frames)
-    compared = sum(int((frame.observation.similarity_rows >= 0).sum()) for frame in frames)
-    return found, compared / max(crops, 1)
-
-
-def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery,
-           found: Relocalization, crops_share: float, recognizer: ImageRecognizer | None
-           ) -> Result:
+def _result(localizer: Localizer, landmark_map: LandmarkMap, method: Method, trial: int,
+            query: PosedQuery) -> Result:
+    """Ask a localizer about a query, and judge its answer."""
+    stages_s = list[float]()  # starts of keyframes, then search, alternately
+    found = ask(localizer, query, lambda stage: stages_s.append(time.perf_counter()))
+    keyframes_ms = 1e3 * (sum(stages_s[1::2]) - sum(stages_s[::2]))
     pose = found.map_from_camera
+    assert localizer.query is not None
+    rows = np.concatenate([frame.similarity_rows for frame in localizer.query.frames])
     return Result(
-        method=method, trial=trial, query=query.number,
+        method=method.name, trial=trial, query=query.number,
         timestamp=float(query.observation.stamp_ns) / NS_PER_S,
         boxes=len(query.observation.detections),
         solved=found.solved, accepted=found.accepted, **_error(pose, query),
@@ -271,13 +235,14 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery
         else normalized_square(pose, found.covariance, query.map_from_camera),
         inliers=len(found.matches), hypotheses=int(found.tried),
         best_iteration=int(found.best_iteration), coverage=float(found.coverage),
-        reason=found.reason, search_ms=float(found.search_ms), crops_share=crops_share,
+        reason=found.reason, search_ms=float(found.search_ms) - keyframes_ms,
+        crops_share=float(method.options.needs_similarities
+                          and (rows >= 0).sum() / max(1, len(rows))),
         map='' if pose is None else place_of(landmark_map, pose).name,
         refusal_kind=found.refusal_kind or '',
         source='' if pose is None else found.source,
         keyframe_inliers=0 if found.recognized is None else found.recognized.inliers,
-        keyframes_ms=0.0 if recognizer is None else recognizer.spent_ms,
-        keyframe_search=found.keyframe_search)
+        keyframes_ms=keyframes_ms, keyframe_search=found.keyframe_search)
 
 
 # Share of boxes without depth, measured in a kitchen; share of boxes with the depth of another
