@@ -18,7 +18,6 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.observations import Queries, load_observations, load_queries
 from cliploc_ros.offline.evaluation.trials import (
     make_queries,
-    simulate_depths,
     with_neighbours,
     with_vertical,
 )
@@ -27,6 +26,7 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.cameras import GROUP_SIZE
+from studies.worlds.depths import simulate_depths
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
 

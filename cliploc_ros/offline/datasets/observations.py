@@ -137,14 +137,6 @@ class Queries:
         """Return a frame."""
         return self.frames[index]
 
-    def main_frames(self) -> tuple[QueryFrame, ...]:
-        """Return the main frame of each query."""
-        return tuple(frame for frame in self.frames if frame.is_main)
-
-    def group(self, group: int) -> tuple[QueryFrame, ...]:
-        """Return all frames of one query, in the file's order."""
-        return tuple(frame for frame in self.frames if frame.group == group)
-
 
 def _stamps_ns(arrays: npz.Arrays) -> NDArray[np.int64]:
     """Return the exact stamps (F,) [ns]; without them, the float64 seconds rounded to 1 us.

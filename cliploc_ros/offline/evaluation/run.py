@@ -5,7 +5,8 @@
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import batched, chain
 from pathlib import Path
@@ -96,7 +97,7 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
     results, lost = list[Result](), []
     # a single part is done sooner than a process starts
     workers = workers if len(parts) > 1 else 1
-    make_search = _MakeSearch(landmark_map, noisy or [queries], layer)
+    make_search = partial(_make_search, landmark_map, noisy or [queries], layer)
     with closing(run_tasks(make_search, parts, workers=workers, scheduler=scheduler)) as finished:
         for part, found in finished:
             if found is None:
@@ -118,25 +119,20 @@ def count_trials(method: Method, trials: int, are_noisy: bool = False) -> int:
     return trials if are_noisy or not method.draws_nothing else 1
 
 
-@dataclass(frozen=True, eq=False)
-class _MakeSearch:
-    """Makes the function that runs a part, from the data that all parts share."""
+def _make_search(landmark_map: LandmarkMap, queries: Sequence[Sequence[PosedQuery]],
+                 layer: KeyframeLayer | None) -> Callable[[_Part], list[Result]]:
+    """Compile the kernels, since searches are timed; return the function that runs a part.
 
-    landmark_map: LandmarkMap
-    queries: Sequence[Sequence[PosedQuery]]  # of each trial, or one sequence for all trials
-    layer: KeyframeLayer | None = None
+    `queries` are those of each trial, or one sequence for all trials.
+    """
+    keyframes = None if layer is None else KeyframeLocalizer(layer)
+    Relocalizer(landmark_map, RelocalizerOptions(matching='class', algorithm='bf')).warm_up()
 
-    def __call__(self) -> Callable[[_Part], list[Result]]:
-        """Compile the kernels, since searches are timed, and return the function."""
-        keyframes = None if self.layer is None else KeyframeLocalizer(self.layer)
-        Relocalizer(self.landmark_map,
-                    RelocalizerOptions(matching='class', algorithm='bf')).warm_up()
-
-        def run(part: _Part) -> list[Result]:
-            queries = self.queries[part.trial % len(self.queries)]
-            return run_trial(self.landmark_map, part.method, part.trial,
-                             [queries[place] for place in part.places], keyframes)
-        return run
+    def run(part: _Part) -> list[Result]:
+        its = queries[part.trial % len(queries)]
+        return run_trial(landmark_map, part.method, part.trial,
+                         [its[place] for place in part.places], keyframes)
+    return run
 
 
 def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],

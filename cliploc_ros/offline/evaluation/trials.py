@@ -15,13 +15,6 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth import (
-    CHORD_DEVIATION,
-    SURFACE_SHARE,
-    depth_deviations,
-    depth_of,
-    half_chord,
-)
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     make_transform,
@@ -245,11 +238,6 @@ def _result(localizer: Localizer, landmark_map: LandmarkMap, method: Method, tri
         keyframes_ms=keyframes_ms, keyframe_search=found.keyframe_search)
 
 
-# Share of boxes without depth, measured in a kitchen; share of boxes with the depth of another
-# object, and the range of that depth [m]. The latter two are not measured.
-_NO_DEPTH, _SOMETHING_ELSE, _ANY_DEPTH_M = 0.1, 0.05, (0.5, 5.0)
-
-
 def with_vertical(queries: Sequence[PosedQuery], noise_deg: float = 0.0, seed: int = 0
                   ) -> tuple[PosedQuery, ...]:
     """Return queries with a known vertical, as an accelerometer measures it.
@@ -316,33 +304,6 @@ def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_
     if not any(query.neighbours for query in found.values()):
         raise OptionsError('--fuse: no query of this input has neighbouring frames in its group')
     return tuple(found[query.number] for query in queries)
-
-
-def simulate_depths(centers: NDArray[np.float64], shapes: NDArray[np.float64],
-                    map_from_camera: NDArray[np.float64], rng: np.random.Generator,
-                    scale: float = 1.0) -> NDArray[np.float64]:
-    """Return the depths (m,) [m] that an RGB-D camera would measure in m boxes; NaN: no depth.
-
-    Parameters
-    ----------
-    centers, shapes : ndarray (m, 3), (m, 6)
-        Ellipsoid of the object in each box, in the map; NaN: an object that is not in the map.
-    map_from_camera : ndarray (4, 4)
-    scale : float
-        Ratio of measured and true depth.
-    """
-    camera_from_map = invert_transform(map_from_camera)
-    rotation, translation = (np.ascontiguousarray(camera_from_map[:3, :3]),
-                             np.ascontiguousarray(camera_from_map[:3, 3]))
-    depths = rng.uniform(*_ANY_DEPTH_M, len(centers))
-    seen = np.isfinite(centers).all(axis=1) & (rng.random(len(centers)) >= _SOMETHING_ELSE)
-    for row in np.nonzero(seen)[0]:
-        share = rng.normal(SURFACE_SHARE, CHORD_DEVIATION)
-        depths[row] = (depth_of(rotation, translation, centers[row]) - share * half_chord(
-            centers[row], shapes[row], rotation, translation))
-    depths = scale * depths + rng.normal(size=len(depths)) * depth_deviations(depths)
-    depths[(rng.random(len(depths)) < _NO_DEPTH) | (depths <= 0.0)] = np.nan
-    return depths
 
 
 def _odometry(frames: Sequence[PosedQuery], noise_m: float, noise_deg: float,
