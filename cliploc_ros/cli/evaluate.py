@@ -189,7 +189,6 @@ def evaluate(options: argparse.Namespace) -> int:
     images = {} if options.queries is not None else _read_images(options)
     of_cameras = {camera: _read_queries(options, landmark_map, camera, images.get(camera))
                   for camera in images or ('',)}
-    recorded = next(iter(of_cameras.values()))
     asked = {camera: trials.make_queries(its, landmark_map, every_frame=True)
              for camera, its in of_cameras.items()}
     queries = next(iter(asked.values()))
@@ -201,13 +200,12 @@ def evaluate(options: argparse.Namespace) -> int:
                  for query in queries if query.image is not None}
         print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
 
-    draws = _with_sensors(options, queries, recorded)
+    draws = _with_sensors(options, queries)
     compare_methods(landmark_map, draws[0], methods, options.out, trials=options.trials,
                     workers=options.workers or _cores(), scheduler=options.scheduler,
                     layer=layer, noisy=draws if len(draws) > 1 else (),
                     sweep=options.sweep if options.figures else None,
-                    frames=recorded.frames, given=others,
-                    about=_describe(options, given, layer is not None),
+                    given=others, about=_describe(options, given, layer is not None),
                     remarks=[*_notes_on_maps(options), *_notes_on_detector(queries, landmark_map)])
     return 0
 
@@ -224,8 +222,8 @@ def _refuse_image_options(options: argparse.Namespace) -> None:
                            'similarities are recorded; remove them, or give --bag or a folder')
 
 
-def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
-                  recorded: 'Queries') -> 'list[tuple[PosedQuery, ...]]':
+def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]'
+                  ) -> 'list[tuple[PosedQuery, ...]]':
     """Return the queries with simulated sensors: for each trial if they have noise, else once."""
     from cliploc_ros.offline.evaluation import trials
 
@@ -238,10 +236,10 @@ def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
         if options.gravity:
             found = trials.with_vertical(found, options.gravity_noise_deg, seed)
         if options.fuse:
-            found = trials.with_neighbours(found, [frame.group for frame in recorded], noise_m,
+            found = trials.with_neighbours(found, [query.group for query in found], noise_m,
                                            noise_deg, seed)
         draws.append(tuple(query for query in found
-                           if options.frames == 'all' or recorded[query.number].is_main))
+                           if options.frames == 'all' or query.is_main))
     return draws
 
 

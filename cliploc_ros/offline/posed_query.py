@@ -7,6 +7,7 @@ the frames of a recording in order gathers the same evidence about cameras and d
 A frame that gets a new localizer is an independent question.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -32,6 +33,13 @@ class PosedQuery:
     neighbours: tuple[Observation, ...] = ()
     #: Returns the undistorted image (h, w, 3), RGB, for keyframes
     image: Callable[[], NDArray[np.uint8]] | None = None
+    group: int = 0  #: Number of the group of frames that it belongs to
+    is_main: bool = True  #: Whether it is asked about, or is only a neighbour of others
+    #: (n,): index into the landmarks, -1 where unknown; None if unknown for all. For studies only.
+    true_landmark: NDArray[np.int64] | None = None
+    #: Processing time of the image [ms]; NaN if not recorded
+    detector_ms: float = math.nan
+    clip_ms: float = math.nan
 
     def in_order(self) -> Iterator[Query]:
         """Yield the queries of a robot with this input, oldest first; the last one is the frame's.

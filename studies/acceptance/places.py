@@ -106,7 +106,7 @@ class Recording(NamedTuple):
         queries: Sequence[PosedQuery] = make_queries(found, landmark_map, every_frame=True)
         if not self.has_depth:
             queries = _without_depth(queries)
-        elif all(frame.depths is None for frame in found.frames):
+        elif all(frame.observation.depths is None for frame in found.frames):
             queries = _with_simulated_depth(queries, found, landmark_map)
         return Place(landmark_map, queries,
                      [frame.group for frame in found.frames],

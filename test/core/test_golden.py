@@ -27,7 +27,7 @@ def golden_scenes(office, office_map, queries, observe):
         if 'H' not in values:  # fewer than three boxes
             continue
         observation = observe(frame)
-        nearest = nearest_candidates(frame.similarities, 3)
+        nearest = nearest_candidates(observation.similarities, 3)
         potential = same_class(frame.class_ids, office_map.class_ids)
         potential |= candidate_mask(nearest, potential.shape)
         pairs = balanced_order(nearest).pairs

@@ -235,7 +235,7 @@ APART = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10]], dtype=n
 def compared(office_map, queries):
     """Return a frame with three separate boxes and one that nearly repeats the third."""
     boxes = np.concatenate([APART, [[201.0, 0.0, 210.0, 10.0]]])
-    camera = Camera(640, 480, *queries.intrinsics_fx_fy_cx_cy)
+    camera = queries[0].observation.camera
     detections = Detections(boxes, ('chair', *office_map.class_ids[4:5], 'none', 'none'),
                             np.ones(4))
     similarities = np.zeros((4, len(office_map)), dtype=np.float32)

@@ -115,8 +115,9 @@ def test_a_dead_worker_costs_its_part_only(results, room, questions, methods):
 
 
 def test_similarities_follow_the_maps_order(room, recording, questions):
-    turned = Queries(recording.landmark_ids[::-1], recording.intrinsics_fx_fy_cx_cy, tuple(
-        replace(frame, similarities=frame.similarities[:, ::-1]) for frame in recording.frames))
+    turned = Queries(recording.landmark_ids[::-1], tuple(replace(frame, observation=replace(
+        frame.observation, similarities=frame.observation.similarities[:, ::-1]))
+        for frame in recording.frames))
     for query, other in zip(make_queries(turned, room), questions, strict=True):
         np.testing.assert_array_equal(query.observation.similarities,
                                       other.observation.similarities)

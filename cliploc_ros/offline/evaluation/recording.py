@@ -18,9 +18,10 @@ from tqdm import tqdm
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.offline.datasets.frames import Frames, undistorted
-from cliploc_ros.offline.datasets.observations import Queries, QueryFrame, Recorded
+from cliploc_ros.offline.datasets.observations import Queries, Recorded
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.recorder import RecordingOptions, observation_file, record_once
 
@@ -56,30 +57,26 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
                     labels: LabelEmbeddings | None) -> Queries:
     """Return recorded frames as queries, each in its own group; true landmarks are unknown."""
     detections = recorded.detections
-    camera, names = detections.cameras[0], detections.class_names
-    frames = []
+    camera, frames = detections.cameras[0], []
     for frame, stamp_ns in enumerate(recorded.stamps_ns):
         rows = slice(*map(int, detections.frame_offsets[frame:frame + 2]))
         boxes = detections.bboxes_xyxy[rows]
         if detections.camera_of(frame) != camera:  # all queries have the same camera
             boxes = camera.bboxes_in_pixels(detections.camera_of(frame).normalize_bboxes(boxes))
-        similarities = np.zeros((len(boxes), len(landmark_map)))
+        similarities = np.zeros((len(boxes), len(landmark_map)), np.float32)
         if labels is not None:
             assert detections.embeddings is not None
             crops = detections.embeddings[rows].astype(np.float32)
-            similarities = np.asarray(CropSimilarities(crops, labels)).astype(np.float64)
-        frames.append(QueryFrame(
-            stamp_ns=int(stamp_ns), bboxes_xyxy=boxes,
-            class_ids=tuple(names[number] for number in detections.classes[rows]),
-            scores=detections.scores[rows], similarities=similarities,
-            true_landmark=np.full(len(boxes), -1, dtype=np.int64),
-            map_from_camera=detections.map_from_camera[frame], group=frame, is_main=True,
-            depths=None if detections.depths is None
-            else detections.depths[rows].astype(np.float64),
+            similarities = np.asarray(CropSimilarities(crops, labels))
+        frames.append(PosedQuery(
+            frame, Observation(
+                camera, replace(detections.detections_of(frame), bboxes_xyxy=boxes), similarities,
+                int(stamp_ns), depths=None if detections.depths is None
+                else detections.depths[rows].astype(np.float64)),
+            detections.map_from_camera[frame], group=frame,
             detector_ms=float(recorded.detector_ms[frame]),
             clip_ms=float(recorded.clip_ms[frame])))
-    return Queries(landmark_map.landmark_ids, (camera.fx, camera.fy, camera.cx, camera.cy),
-                   tuple(frames), (camera.width, camera.height))
+    return Queries(landmark_map.landmark_ids, tuple(frames))
 
 
 def with_images(queries: Sequence[PosedQuery], frames: Frames) -> tuple[PosedQuery, ...]:

@@ -24,10 +24,8 @@ from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import CliplocError
-from cliploc_ros.files.parallel import run_tasks
+from cliploc_ros.files.parallel import WorkersError, run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
-from cliploc_ros.offline.datasets.observations import QueryFrame
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.methods import Method
@@ -40,10 +38,6 @@ from cliploc_ros.units import NS_PER_S
 _QUERIES_A_PART = 8
 # Separates the name of a method from its number of iterations in a sweep.
 _AT = '@'
-
-
-class RunError(CliplocError):
-    """A run is incomplete."""
 
 
 class _Part(NamedTuple):
@@ -82,10 +76,8 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
 
     Raises
     ------
-    RunError
-        Workers died repeatedly at some queries.
     WorkersError
-        From the workers.
+        Workers cannot be started, or died repeatedly.
     """
     # parts that take longest come first
     parts = [
@@ -94,22 +86,18 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
         for trial in range(count_trials(method, trials, bool(noisy)))
         for places in batched(range(len(queries)), max(1, len(queries)) if method.accumulates
                               else 1 if method.draws_nothing else _QUERIES_A_PART)]
-    results, lost = list[Result](), []
+    results = list[Result]()
     # a single part is done sooner than a process starts
     workers = workers if len(parts) > 1 else 1
     make_search = partial(_make_search, landmark_map, noisy or [queries], layer)
     with closing(run_tasks(make_search, parts, workers=workers, scheduler=scheduler)) as finished:
         for part, found in finished:
             if found is None:
-                lost.append(part)
-            else:
-                results += found
-                advance(found)
-    if lost:
-        first = lost[0]
-        raise RunError(f'workers died repeatedly at {len(lost)} of {len(parts)} parts, first at '
-                       f'{first.method.name}, trial {first.trial}, queries {first.places[0]}-'
-                       f'{first.places[-1]}; run again with fewer --workers')
+                raise WorkersError(
+                    f'workers died repeatedly at {part.method.name}, trial {part.trial}, queries '
+                    f'{part.places[0]}-{part.places[-1]}; run again with fewer --workers')
+            results += found
+            advance(found)
     order = {method.name: number for number, method in enumerate(methods)}
     return sorted(results, key=lambda result: (order[result.method], result.trial, result.query))
 
@@ -137,7 +125,7 @@ def _make_search(landmark_map: LandmarkMap, queries: Sequence[Sequence[PosedQuer
 
 def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
                     methods: Sequence[Method], out: Path, *, sweep: Sequence[int] | None = (),
-                    frames: Sequence[QueryFrame] = (), remarks: Sequence[str] = (),
+                    remarks: Sequence[str] = (),
                     given: Mapping[str, TimedPoses] = MappingProxyType({}),
                     about: Mapping[str, Any] = MappingProxyType({}), **running: Any
                     ) -> list[summary.Summary]:
@@ -151,8 +139,6 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         An existing folder.
     sweep : sequence of int, optional
         Further numbers of iterations of each sampling method, for a figure. None: no figures.
-    frames : sequence of QueryFrame
-        Frames of the query file, which hold the times of detector and CLIP.
     remarks : sequence of str
         Notes on the input, shown with the table.
     given : mapping of str to TimedPoses
@@ -199,7 +185,7 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     write_text(out / 'summary.csv', summary.as_csv(summaries, summary.relative_errors(
         shown, {query.number: query.map_from_camera for query in queries})))
     pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
-                     summaries, methods, frames) if sweep is not None else []
+                     summaries, methods) if sweep is not None else []
     write_report(out, summaries, rows, remarks, pictures, facts)
     print(f'results: {out.resolve() / PAGE}', flush=True)
     return summaries
@@ -214,7 +200,7 @@ def _version() -> str:
 
 def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
           results: Sequence[Result], summaries: Sequence[summary.Summary],
-          methods: Sequence[Method], frames: Sequence[QueryFrame]) -> list[Path]:
+          methods: Sequence[Method]) -> list[Path]:
     try:
         from cliploc_ros.offline.evaluation.figures import draw_all
     except ImportError as error:
@@ -228,7 +214,7 @@ def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         name, _, count = statistics.method.partition(_AT)
         if name in iterations:
             sweep.setdefault(name, {})[int(count or iterations[name])] = statistics
-    observing = {stage: np.array([getattr(frame, name) for frame in frames])
+    observing = {stage: np.array([getattr(query, name) for query in queries])
                  for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
     return draw_all(
         out, landmark_map, queries, [result for result in results if _AT not in result.method],

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.fit.verification import MAX_FRAMES
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     make_transform,
@@ -25,7 +24,7 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.joined_map import place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.offline.datasets.observations import Queries
@@ -98,16 +97,10 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
         raise DatasetError(f"the queries lack the map's landmark '{missing[0]}'{more}: they were "
                            'recorded with another map')
     columns = [column[landmark_id] for landmark_id in landmark_map.landmark_ids]
-    fx, fy, cx, cy = queries.intrinsics_fx_fy_cx_cy
-    # files of older releases lack the size of the image
-    camera = Camera(*queries.image_size or (max(1, round(2 * cx)), max(1, round(2 * cy))),
-                    fx, fy, cx, cy)
-    return tuple(
-        PosedQuery(number, Observation(
-            camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
-            np.ascontiguousarray(frame.similarities[:, columns], dtype=np.float32),
-            frame.stamp_ns, depths=frame.depths), frame.map_from_camera)
-        for number, frame in enumerate(queries.frames) if every_frame or frame.is_main)
+    return tuple(replace(query, observation=replace(
+        query.observation, similarities=np.ascontiguousarray(
+            np.asarray(query.observation.similarities, dtype=np.float32)[:, columns])))
+        for query in queries if every_frame or query.is_main)
 
 
 def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float

@@ -207,10 +207,11 @@ class Recording:
         answers = {}
         for view in views:
             query = simulated(detections, view, shown, labels, options.random_seed)
-            elsewhere = None if keyframes is None else keyframes.elsewhere(detections, view)
-            if keyframes is not None and elsewhere is not None:
+            localizer = Localizer(relocalizer)
+            if keyframes is not None:
                 query = keyframes.with_image(query)
-            answers[view] = try_view(Localizer(relocalizer, elsewhere), query, 0, options)
+                localizer = Localizer(relocalizer, keyframes.elsewhere(detections, view))
+            answers[view] = try_view(localizer, query, 0, options)
         return answers
 
 
