@@ -187,10 +187,9 @@ def evaluate(options: argparse.Namespace) -> int:
         raise OptionsError(f'{options.map[0]} has no landmarks, and no keyframes are used')
     make_folder(options.out)
     images = {} if options.queries is not None else _read_images(options)
-    of_cameras = {camera: _read_queries(options, landmark_map, camera, images.get(camera))
-                  for camera in images or ('',)}
-    asked = {camera: trials.make_queries(its, landmark_map, every_frame=True)
-             for camera, its in of_cameras.items()}
+    asked = {camera: trials.make_queries(_read_queries(
+        options, landmark_map, camera, images.get(camera)), landmark_map, every_frame=True)
+        for camera in images or ('',)}
     queries = next(iter(asked.values()))
     if len(asked) > 1:
         queries = trials.join_cameras(asked, options.sync_tolerance)

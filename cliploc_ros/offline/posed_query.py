@@ -53,13 +53,13 @@ class PosedQuery:
         if all(frame.stamp_ns == stamp_ns for frame in self.neighbours):
             yield Query((*self.neighbours, self.observation), images, run=None)
             return
-        before = sorted(self.neighbours, key=lambda frame: frame.stamp_ns)
-        shift_ns = max(0, 2 * (before[-1].stamp_ns - stamp_ns))
-        length_s = 1.0 + (stamp_ns + shift_ns - before[0].stamp_ns) / NS_PER_S
-        for frame in before:
-            yield Query((replace(frame, stamp_ns=frame.stamp_ns - shift_ns),), (), self.number,
-                        len(before) + 1, length_s)
-        yield Query((self.observation,), images, self.number, len(before) + 1, length_s)
+        earlier = sorted(self.neighbours, key=lambda frame: frame.stamp_ns)
+        shift_ns = max(0, 2 * (earlier[-1].stamp_ns - stamp_ns))
+        length_s = 1.0 + (stamp_ns + shift_ns - earlier[0].stamp_ns) / NS_PER_S
+        for frame in [*(replace(frame, stamp_ns=frame.stamp_ns - shift_ns) for frame in earlier),
+                      self.observation]:
+            yield Query((frame,), images if frame is self.observation else (), self.number,
+                        len(earlier) + 1, length_s)
 
 
 def ask(localizer: Localizer, query: PosedQuery,

@@ -41,7 +41,12 @@ from cliploc_ros.offline.evaluation.summary import (
     summarize,
     table_rows,
 )
-from cliploc_ros.offline.evaluation.trials import Result, given_results, make_queries
+from cliploc_ros.offline.evaluation.trials import (
+    Result,
+    given_results,
+    make_queries,
+    with_neighbours,
+)
 
 PAPER = RelocalizerOptions(iterations=60)
 
@@ -121,6 +126,25 @@ def test_similarities_follow_the_maps_order(room, recording, questions):
     for query, other in zip(make_queries(turned, room), questions, strict=True):
         np.testing.assert_array_equal(query.observation.similarities,
                                       other.observation.similarities)
+
+
+def test_what_a_robot_asks_about_a_frame(questions):
+    """The robot sees the frames after its query first, and goes back in the same time."""
+    alone, = questions[5].in_order()
+    assert (alone.frames, alone.run) == ((questions[5].observation,), None)
+    rig = tuple(replace(questions[5].observation, camera_name=name) for name in 'ab')
+    instant, = replace(questions[5], neighbours=rig).in_order()
+    assert (instant.frames, instant.run) == ((*rig, questions[5].observation), None)
+    fused = with_neighbours(questions, [0] * len(questions))[5]
+    *earlier, last = fused.in_order()
+    assert last.frames == (fused.observation,)
+    seconds = [query.newest.stamp_ns // 10**9 for query in (*earlier, last)]
+    late = max(frame.stamp_ns for frame in fused.neighbours) // 10**9
+    assert seconds == sorted(set(seconds)) and seconds[-1] == 105 and len(seconds) > 2
+    assert seconds[-2] == 105 - (late - 105)
+    for query in (*earlier, last):
+        assert (query.run, query.limit) == (5, len(seconds))
+        assert query.length_s >= seconds[-1] - seconds[0]
 
 
 def test_crops_on_demand_are_a_part_of_all(room, questions):

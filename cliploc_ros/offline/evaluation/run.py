@@ -117,9 +117,8 @@ def _make_search(landmark_map: LandmarkMap, queries: Sequence[Sequence[PosedQuer
     Relocalizer(landmark_map, RelocalizerOptions(matching='class', algorithm='bf')).warm_up()
 
     def run(part: _Part) -> list[Result]:
-        its = queries[part.trial % len(queries)]
-        return run_trial(landmark_map, part.method, part.trial,
-                         [its[place] for place in part.places], keyframes)
+        return run_trial(landmark_map, part.method, part.trial, [
+            queries[part.trial % len(queries)][place] for place in part.places], keyframes)
     return run
 
 

@@ -216,27 +216,18 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
         frames = [frame for frame in fold.frames.tolist() if frame in chosen]
         if not frames:
             continue
-        of_objects = of_both = None
-        if len(fold.rows):
-            semi_axes, quats_xyzw = fold.landmarks.axes_and_quats()
-            relocalizer = make_relocalizer(replace(
-                landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
-                semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
-            of_objects = Localizer(relocalizer)
-            if keyframes is not None and fold.training[taken_at].any():
-                of_both = Localizer(relocalizer, KeyframeLocalizer(
-                    keyframes.layer.select(fold.training[taken_at])))
+        semi_axes, quats_xyzw = fold.landmarks.axes_and_quats()
+        relocalizer = make_relocalizer(replace(
+            landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
+            semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
+        of_objects, of_both = Localizer(relocalizer), None
+        if keyframes is not None and fold.training[taken_at].any():
+            of_both = Localizer(relocalizer, KeyframeLocalizer(
+                keyframes.layer.select(fold.training[taken_at])))
         for frame in frames:
             tell((len(trials) + 1) / len(chosen))
             seen = shown[slice(*detections.frame_offsets[frame:frame + 2])]
             count, known = int((seen >= 0).sum()), int(np.isin(seen, fold.rows).sum())
-            is_judged = known >= min(LANDMARKS_FOR_A_POSE, count)
-            if of_objects is None:
-                pose = detections.map_from_camera[frame]
-                trials.append(Trial('refused', pose[:3, 3], pose[:3, 2], len(seen), 0, None,
-                                    None, 'the other parts show no landmark',
-                                    float(detections.stamps_s[frame]), is_judged=is_judged))
-                continue
             query = simulated(detections, frame, shown, labels, options.random_seed)
             query = replace(query, observation=replace(query.observation, similarities=np.asarray(
                 query.observation.similarities)[:, fold.rows]))
@@ -246,7 +237,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
             if of_both is not None and query.image is not None:
                 trial = replace(try_view(of_both, query, count, options),
                                 by_objects=trial.verdict)
-            trials.append(replace(trial, is_judged=is_judged))
+            trials.append(replace(trial, is_judged=known >= min(LANDMARKS_FOR_A_POSE, count)))
     return sorted(trials, key=lambda trial: trial.stamp_s or 0.0)
 
 
@@ -325,9 +316,8 @@ def try_view(localizer: Localizer, query: PosedQuery, landmarks: int, options: C
     pose, observation = query.map_from_camera, query.observation
     up = pose[2, :3] if options.use_vertical else None  # the map's z in the camera
     result = ask(localizer, replace(query, observation=replace(observation, up_in_camera=up)))
-    estimate, error_m = result.map_from_camera, None
-    if estimate is not None:
-        error_m = float(pose_error(estimate, pose)[0])
+    estimate = result.map_from_camera
+    error_m = None if estimate is None else float(pose_error(estimate, pose)[0])
     verdict: Verdict = 'refused'
     if result.accepted and error_m is not None:
         verdict = 'misled' if error_m > options.wrong_m else 'accepted'
