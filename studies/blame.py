@@ -37,7 +37,7 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.offline.evaluation.trials import PosedQuery
+from cliploc_ros.offline.posed_query import PosedQuery
 from studies.acceptance.places import MODES, add_arguments, chosen_places
 from studies.reports import table
 

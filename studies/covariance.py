@@ -43,6 +43,7 @@ def squares_of(place: Place, seed: int) -> Iterator[tuple[str, tuple[float, ...]
 
     The three errors are those of the pose, the position and the orientation. They are chi-squared
     distributed with six, three and three degrees of freedom if the covariance is consistent.
+    Queries are independent questions: no evidence about the camera, and no looks before.
     """
     relocalizer = Relocalizer(place.landmark_map,
                               RelocalizerOptions(k=min(3, len(place.landmark_map))))

@@ -19,7 +19,7 @@ from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.transforms import RIGHT_M, pose_error
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalization
-from cliploc_ros.files.parallel import MakeWork, run_tasks
+from cliploc_ros.files.parallel import MakeWork, WorkersError, run_tasks
 from cliploc_ros.files.storage import make_folder
 from cliploc_ros.offline.evaluation.figures import (
     add_legend,
@@ -28,7 +28,6 @@ from cliploc_ros.offline.evaluation.figures import (
     save_figure,
     within_ellipsoid,
 )
-from cliploc_ros.offline.evaluation.run import RunError
 from cliploc_ros.offline.evaluation.summary import wilson_interval
 
 #: Errors below which a pose is a success [m].
@@ -43,7 +42,7 @@ Judged = tuple[NDArray[np.float64], NDArray[np.bool_]]
 def run_all(make_work: MakeWork, tasks: Sequence[Any], what: str, workers: int) -> list[Any]:
     """Return the outcomes of all tasks in order; show a progress bar.
 
-    RunError: workers died at a task; the other outcomes alone would not be a fair sample.
+    WorkersError: workers died at a task; the other outcomes alone would not be a fair sample.
 
     Parameters
     ----------
@@ -56,7 +55,7 @@ def run_all(make_work: MakeWork, tasks: Sequence[Any], what: str, workers: int) 
     with closing(run_tasks(make_work, tasks, workers=workers)) as results:
         for task, outcomes in tqdm(results, what, len(tasks), disable=None):
             if outcomes is None:
-                raise RunError(f'workers died repeatedly at one of the {what}; use fewer '
+                raise WorkersError(f'workers died repeatedly at one of the {what}; use fewer '
                                '--workers')
             found[task] = outcomes
     return [outcome for task in tasks for outcome in found[task]]

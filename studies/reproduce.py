@@ -264,20 +264,15 @@ def _reproduce(name: str, sources: Sources, networks: Sequence[str],
                 '--no-keyframe-layer', *networks, *sources.mapping])):
             raise MappingError(f'{name}: no map was built, see above: attach that text to an '
                                'issue')
-    if not _is_evaluated(evaluation):
+    if not (evaluation / PAGE).exists():
         print(f'{name}: the queries', flush=True)
         evaluate.evaluate(evaluate.make_parser().parse_args([
             '--bag', str(folder / _ASKED), '--map', str(landmark_map), '--out', str(evaluation),
-            '--trials', str(options.trials), '--resume', *networks, *sources.asking,
-            *recording.asking]))
+            '--trials', str(options.trials), *networks, *sources.asking, *recording.asking]))
 
 
 def _has_bags(folder: Path) -> bool:
     return (folder / _MAPPED).exists() and (folder / _ASKED).exists()
-
-
-def _is_evaluated(folder: Path) -> bool:
-    return (folder / PAGE).exists() and not (folder / 'unfinished.jsonl').exists()
 
 
 def unpacked(recording: Recording, folder: Path, out: Path) -> Path:

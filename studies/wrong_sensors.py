@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.offline.evaluation.trials import PosedQuery, turned
+from cliploc_ros.offline.evaluation.trials import turned
+from cliploc_ros.offline.posed_query import PosedQuery
 
 Floats = NDArray[np.float64]
 #: A function that changes queries by a level.

@@ -2,11 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A small world for evaluations: the simulated room, with queries."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, write_map
 
-from cliploc_ros.offline.datasets.observations import Queries, QueryFrame, save_queries
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.offline.datasets.observations import Queries, save_queries
+from cliploc_ros.offline.posed_query import PosedQuery
 
 QUERIES = 12
 
@@ -20,13 +24,12 @@ def make_recording(room):
         rows = np.sort(rng.permutation(len(seen))[:2 + number])
         own = np.zeros((len(rows), len(room)))
         own[np.arange(len(rows)), rows] = 0.08
-        frames.append(QueryFrame(
-            stamp_ns=(100 + number) * 10**9,
-            bboxes_xyxy=seen.bboxes_xyxy[rows] + rng.normal(0, 1.0, (len(rows), 4)),
-            class_ids=tuple(seen.class_ids[row] for row in rows), scores=seen.scores[rows],
-            similarities=rng.uniform(0.1, 0.3, own.shape) + own, true_landmark=rows,
-            map_from_camera=MAP_FROM_CAMERA, group=number, is_main=True))
-    return Queries(room.landmark_ids, (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), tuple(frames))
+        boxes = seen.bboxes_xyxy[rows] + rng.normal(0, 1.0, (len(rows), 4))
+        frames.append(PosedQuery(number, Observation(
+            CAMERA, replace(seen.select(rows), bboxes_xyxy=boxes),
+            rng.uniform(0.1, 0.3, own.shape) + own, (100 + number) * 10**9), MAP_FROM_CAMERA,
+            group=number, true_landmark=rows))
+    return Queries(room.landmark_ids, tuple(frames))
 
 
 @pytest.fixture(scope='package')

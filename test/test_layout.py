@@ -37,7 +37,7 @@ LAYERS = (
     ('ros.inputs',),
     ('ros',),
     ('nodes',),
-    ('offline.simulation', 'offline.vocabulary', 'offline.page'),
+    ('offline.simulation', 'offline.vocabulary', 'offline.page', 'offline.posed_query'),
     ('offline.mapping',),
     ('offline.datasets',),
     ('offline.recording',),

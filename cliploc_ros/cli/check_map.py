@@ -18,7 +18,6 @@ from cliploc_ros.command import option
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
-from cliploc_ros.units import NS_PER_S
 
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
@@ -111,7 +110,6 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
     from cliploc_ros.offline.evaluation.trials import make_queries
     from cliploc_ros.offline.mapping.check.checking import check_map
-    from cliploc_ros.offline.mapping.check.relocalization import PosedObservation
     from cliploc_ros.offline.mapping.tilt import tilt_note
 
     begin = time.monotonic()
@@ -135,10 +133,8 @@ def check(options: argparse.Namespace) -> int:
     layer = read_layer(options.map, landmark_map, options.keyframes)
     if not len(landmark_map):
         return _check_keyframes(layer, detections)
-    queries = [PosedObservation(one.observation, one.map_from_camera,
-                                one.observation.stamp_ns / NS_PER_S)
-               for one in make_queries(load_queries(options.queries, landmark_map.landmark_ids),
-                                       landmark_map)] if options.queries else []
+    queries = make_queries(load_queries(options.queries, landmark_map.landmark_ids),
+                           landmark_map) if options.queries else ()
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)
     with command.StageBar() as bar:

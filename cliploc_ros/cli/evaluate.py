@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.datasets.frames import Frames
     from cliploc_ros.offline.datasets.observations import Queries
     from cliploc_ros.offline.evaluation.methods import Method
-    from cliploc_ros.offline.evaluation.trials import PosedQuery
+    from cliploc_ros.offline.posed_query import PosedQuery
 
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)}: the paper's ten;
@@ -88,7 +88,6 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--out DIR', default=Path('evaluation'))
     option(parser, '--workers N',
            f'number of local processes ({_cores()} for searches, 1 for networks)', positive_int)
-    option(parser, '--resume', 'continue an unfinished run')
     option(parser, '--no-figures', dest='figures', action='store_false')
     add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does, on "
                    'the images of --bag or a folder')
@@ -148,7 +147,7 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.evaluation import trials
     from cliploc_ros.offline.evaluation.methods import parse_methods
-    from cliploc_ros.offline.evaluation.recording import with_features
+    from cliploc_ros.offline.evaluation.recording import with_images
     from cliploc_ros.offline.evaluation.run import compare_methods
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
@@ -188,26 +187,23 @@ def evaluate(options: argparse.Namespace) -> int:
         raise OptionsError(f'{options.map[0]} has no landmarks, and no keyframes are used')
     make_folder(options.out)
     images = {} if options.queries is not None else _read_images(options)
-    of_cameras = {camera: _read_queries(options, landmark_map, camera, images.get(camera))
-                  for camera in images or ('',)}
-    recorded = next(iter(of_cameras.values()))
-    asked = {camera: trials.make_queries(its, landmark_map, every_frame=True)
-             for camera, its in of_cameras.items()}
+    asked = {camera: trials.make_queries(_read_queries(
+        options, landmark_map, camera, images.get(camera)), landmark_map, every_frame=True)
+        for camera in images or ('',)}
     queries = next(iter(asked.values()))
     if len(asked) > 1:
         queries = trials.join_cameras(asked, options.sync_tolerance)
     if layer is not None:
-        queries = with_features(queries, next(iter(images.values())), layer.kind)
-        notes = {layer.camera_note(query.image.camera)
+        queries = with_images(queries, next(iter(images.values())))
+        notes = {layer.camera_note(query.observation.camera)
                  for query in queries if query.image is not None}
         print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
 
-    draws = _with_sensors(options, queries, recorded)
+    draws = _with_sensors(options, queries)
     compare_methods(landmark_map, draws[0], methods, options.out, trials=options.trials,
                     workers=options.workers or _cores(), scheduler=options.scheduler,
                     layer=layer, noisy=draws if len(draws) > 1 else (),
                     sweep=options.sweep if options.figures else None,
-                    resume=options.resume, frames=recorded.frames,
                     given=others, about=_describe(options, given, layer is not None),
                     remarks=[*_notes_on_maps(options), *_notes_on_detector(queries, landmark_map)])
     return 0
@@ -225,8 +221,8 @@ def _refuse_image_options(options: argparse.Namespace) -> None:
                            'similarities are recorded; remove them, or give --bag or a folder')
 
 
-def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
-                  recorded: 'Queries') -> 'list[tuple[PosedQuery, ...]]':
+def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]'
+                  ) -> 'list[tuple[PosedQuery, ...]]':
     """Return the queries with simulated sensors: for each trial if they have noise, else once."""
     from cliploc_ros.offline.evaluation import trials
 
@@ -239,10 +235,10 @@ def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
         if options.gravity:
             found = trials.with_vertical(found, options.gravity_noise_deg, seed)
         if options.fuse:
-            found = trials.with_neighbours(found, [frame.group for frame in recorded], noise_m,
+            found = trials.with_neighbours(found, [query.group for query in found], noise_m,
                                            noise_deg, seed)
         draws.append(tuple(query for query in found
-                           if options.frames == 'all' or recorded[query.number].is_main))
+                           if options.frames == 'all' or query.is_main))
     return draws
 
 

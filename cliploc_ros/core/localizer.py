@@ -104,17 +104,6 @@ def by_classes(observation: Observation, landmarks: int) -> Observation:
                    compared=np.empty(0, dtype=np.int64))
 
 
-def recorded_crops(observation: Observation, options: RelocalizerOptions) -> Crops | None:
-    """Return the crops of an observation that has all similarities, to be compared on demand.
-
-    None if the options compare all crops at once.
-    """
-    if options.crops != 'on_demand' or not can_do_without_crops(options):
-        return None
-    recorded = np.asarray(observation.similarities)
-    return Crops(lambda rows: recorded[rows])
-
-
 def informative_first(landmark_map: LandmarkMap, observation: Observation) -> NDArray[np.int64]:
     """Return the detections (n,), sorted by how informative their crops are, best first.
 

@@ -27,12 +27,13 @@ from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
 from cliploc_ros.offline.datasets.folders import tum_frames
 from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.observations import Queries, QueryFrame, save_queries
+from cliploc_ros.offline.datasets.observations import Queries, save_queries
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.evaluation.methods import parse_methods
 from cliploc_ros.offline.evaluation.recording import make_queries_of
 from cliploc_ros.offline.evaluation.run import compare_methods
 from cliploc_ros.offline.evaluation.trials import make_queries
+from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.networks import RunNetworks
 from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo import ASSETS
@@ -60,7 +61,7 @@ def score_detector(sequence: Path) -> float:
         return float(train_detector.score(model, data, Path(name)).box.map50)
 
 
-def score_clip(frames: Sequence[QueryFrame], truth: Sequence[TrueFrame],
+def score_clip(frames: Sequence[PosedQuery], truth: Sequence[TrueFrame],
                landmark_ids: Sequence[str]) -> tuple[float, float, int]:
     """Return CLIP's top-1 and top-3 accuracy, and the number of detected objects.
 
@@ -70,9 +71,9 @@ def score_clip(frames: Sequence[QueryFrame], truth: Sequence[TrueFrame],
     ranks = []
     for frame, true_frame in zip(frames, truth, strict=True):
         for box in true_frame.boxes:
-            ious = box_ious(box.bbox_xyxy[None], frame.bboxes_xyxy)[0]
+            ious = box_ious(box.bbox_xyxy[None], frame.observation.detections.bboxes_xyxy)[0]
             if box.object_id in landmark_ids and ious.max(initial=0.0) > SAME_OBJECT_IOU:
-                similarities = frame.similarities[int(np.argmax(ious))]
+                similarities = np.asarray(frame.observation.similarities)[int(np.argmax(ious))]
                 own = similarities[landmark_ids.index(box.object_id)]
                 ranks.append(int((similarities > own).sum()))
     counted, number = np.array(ranks), max(len(ranks), 1)
@@ -103,8 +104,7 @@ def run(arguments: list[str]) -> int:
     paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
     compare_methods(landmark_map, make_queries(queries, landmark_map),
                     parse_methods(['all', 'auto'], paper, len(landmark_map)), options.out,
-                    trials=options.trials, workers=options.workers, resume=True,
-                    frames=queries.frames)
+                    trials=options.trials, workers=options.workers)
     return 0
 
 

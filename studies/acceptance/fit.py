@@ -101,7 +101,10 @@ def make_search_world() -> Callable[[Simulated], list[Searched]]:
 
 
 def search_world(world: Simulated) -> list[Searched]:
-    """Return the cases of a world in all modes."""
+    """Return the cases of a world in all modes.
+
+    Queries are independent questions: no evidence about the camera, and no looks before.
+    """
     kind, seed = world.kind, world.seed
     place, rng = world.load(), np.random.default_rng([seed, 7])
     vertical_deg = float(rng.choice(_VERTICALS_DEG))

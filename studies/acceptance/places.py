@@ -17,16 +17,16 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.observations import Queries, load_observations, load_queries
 from cliploc_ros.offline.evaluation.trials import (
-    PosedQuery,
     make_queries,
-    simulate_depths,
     with_neighbours,
     with_vertical,
 )
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.cameras import GROUP_SIZE
+from studies.worlds.depths import simulate_depths
 from studies.worlds.places import KINDS
 from studies.worlds.world import make_world
 
@@ -106,7 +106,7 @@ class Recording(NamedTuple):
         queries: Sequence[PosedQuery] = make_queries(found, landmark_map, every_frame=True)
         if not self.has_depth:
             queries = _without_depth(queries)
-        elif all(frame.depths is None for frame in found.frames):
+        elif all(frame.observation.depths is None for frame in found.frames):
             queries = _with_simulated_depth(queries, found, landmark_map)
         return Place(landmark_map, queries,
                      [frame.group for frame in found.frames],

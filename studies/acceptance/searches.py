@@ -20,7 +20,8 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.offline.evaluation.methods import AUTO, Method
-from cliploc_ros.offline.evaluation.trials import PosedQuery, run_trial
+from cliploc_ros.offline.evaluation.trials import run_trial
+from cliploc_ros.offline.posed_query import PosedQuery
 from studies.acceptance.places import SEED, AnyPlace, Place
 from studies.acceptance.troubles import FAMILIES, PRIORS, TROUBLES, of_rows
 from studies.reports import Answer, interval, judged
@@ -69,7 +70,10 @@ def make_search() -> Callable[[Task], list[Outcome]]:
 
 
 def search(task: Task) -> list[Outcome]:
-    """Return the outcomes of all queries of a place; none if it does not support the mode."""
+    """Return the outcomes of all queries of a place; none if it does not support the mode.
+
+    Unless they are in order, queries are independent questions, each to a new localizer.
+    """
     place = _loaded(task.place)
     if task.mode not in place.modes:
         return []
@@ -91,7 +95,8 @@ def search(task: Task) -> list[Outcome]:
                     error_m=inf if result.error_m is None else result.error_m,
                     error_deg=inf if result.error_deg is None else result.error_deg,
                     nees=inf if result.nees is None else result.nees)
-            for result in run_trial(landmark_map, Method(AUTO, options), 0, changed)]
+            for query in changed
+            for result in run_trial(landmark_map, Method(AUTO, options), 0, [query])]
 
 
 def look_on(relocalizer: Relocalizer, queries: Iterable[PosedQuery], is_one: bool = True

@@ -16,7 +16,8 @@ from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform
 from cliploc_ros.core.localizer import by_classes
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Detections, Observation, Region
-from cliploc_ros.offline.evaluation.trials import PosedQuery, with_vertical
+from cliploc_ros.offline.evaluation.trials import with_vertical
+from cliploc_ros.offline.posed_query import PosedQuery
 from studies import wrong_sensors
 from studies.acceptance.places import ALL, FIVE, LEVEL, ONE, VERTICAL, VERTICAL_DEG
 from studies.worlds.cameras import GROUP_SIZE

@@ -17,8 +17,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.evaluation.trials import PosedQuery
 from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.blame import blame
 from studies.reports import Answer, judged
@@ -132,7 +132,7 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
             if other.name != room.name:
                 some = rng.permutation(len(other))[:options.elsewhere]
                 # all of these should be refused
-                found += [_outcome(task, other.name, other.queries[row], way, known, landmark_map,
+                found += [_outcome(task, other, other.queries[row], way, known, landmark_map,
                                    keyframes)
                           for row in some for way, known in product(WAYS[:3], options.known)
                           if known == NOTHING or (known == VERTICAL and other.has_poses)]
@@ -147,7 +147,7 @@ def _ask_here(task: Task, names: Sequence[str], room: Room, landmark_map: Landma
     for way, known in product((OBJECTS, BOTH, KEYFRAMES), names):
         if known not in (NOTHING, VERTICAL) and (way == KEYFRAMES or not room.has_depth):
             continue
-        yield _outcome(task, room.name, query, way, known, landmark_map, keyframes)
+        yield _outcome(task, room, query, way, known, landmark_map, keyframes)
     if baseline is not None:
         image_rgb, camera = room.raws[query.number].color()
         pose = baseline.locate(image_rgb, camera)
@@ -158,21 +158,26 @@ def _ask_here(task: Task, names: Sequence[str], room: Room, landmark_map: Landma
                       confidence=0.0, source=BASELINE, reason='', boxes=0, inliers=0, **errors)
 
 
-def _outcome(task: Task, asked: str, query: PosedQuery, way: str, known: str,
+def _outcome(task: Task, asked: Room, query: PosedQuery, way: str, known: str,
              landmark_map: LandmarkMap, keyframes: KeyframeLocalizer) -> Outcome:
+    """Ask an independent question: without evidence of earlier images about the camera.
+
+    The relocalizer is asked, not a localizer, because the features of the images are stored.
+    """
     observation = known_of(query.observation, known)
     if way == KEYFRAMES:
         observation = without_boxes(observation)
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(matching='class'))
     recognizer = None
-    if way != OBJECTS and query.image is not None:
-        recognizer = ImageRecognizer(keyframes, query.image)
+    if way != OBJECTS:
+        recognizer = ImageRecognizer(keyframes, asked.features[query.number])
     found = relocalizer.relocalize([observation], recognizer)
     outcome = Outcome(
-        room=task.room, kind=task.kind, part=task.part, asked=asked, number=query.number, way=way,
-        known=known, source=found.source, reason=found.reason, boxes=len(observation.detections),
+        room=task.room, kind=task.kind, part=task.part, asked=asked.name, number=query.number,
+        way=way, known=known, source=found.source, reason=found.reason,
+        boxes=len(observation.detections),
         inliers=len(found.matches),
-        **judged(found, query.map_from_camera if asked == task.room else None))
+        **judged(found, query.map_from_camera if asked.name == task.room else None))
     if way == OBJECTS and known == NOTHING and outcome.is_here and outcome.error_m > _FAILED_M:
         return replace(outcome, cause=blame(
             landmark_map, relocalizer, replace(query, observation=observation), _FAILED_M).cause)

@@ -36,8 +36,9 @@ from cliploc_ros.offline.datasets.frames import (
     RawFrame,
     folder_frames,
 )
-from cliploc_ros.offline.evaluation.trials import PosedQuery, with_vertical
+from cliploc_ros.offline.evaluation.trials import with_vertical
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
 from cliploc_ros.units import NS_PER_S
 from studies.acceptance.places import observation_of
@@ -152,8 +153,7 @@ class Room:
     def queries(self) -> tuple[PosedQuery, ...]:
         """Return all images as queries, with vertical and depth."""
         plain = [PosedQuery(row, observation_of(self.detections, row, raw.stamp_ns),
-                       self.detections.map_from_camera[row],
-                       image=self.features[row])
+                       self.detections.map_from_camera[row])
                  for row, raw in enumerate(self.raws)]
         if self.ups is None:
             return with_vertical(plain, _VERTICAL_DEG)

@@ -14,9 +14,10 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.offline.evaluation.trials import PosedQuery, simulate_depths
+from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
 from studies.worlds.cameras import GROUP_SIZE, drive_about, make_camera, make_groups
+from studies.worlds.depths import simulate_depths
 from studies.worlds.detector import Detector, Encoder, detect, draw_biases
 from studies.worlds.places import KINDS, Objects, Place, make_objects
 

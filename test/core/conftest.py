@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real queries and a real map for the tests of the method."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,7 @@ import pytest
 import yaml
 from scene import make_room
 
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.offline.datasets.observations import Queries, load_queries
 
 
@@ -38,12 +37,8 @@ def queries(office, office_map) -> Queries:
 @pytest.fixture(scope='session')
 def observe(queries):
     """Turn a recorded query frame into an observation."""
-    camera = Camera(640, 480, *queries.intrinsics_fx_fy_cx_cy)
-
-    def make(frame) -> Observation:
-        return Observation(camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
-                           frame.similarities, frame.stamp_ns)
-    return make
+    camera = replace(queries[0].observation.camera, width=640, height=480)
+    return lambda frame: replace(frame.observation, camera=camera)
 
 
 @pytest.fixture(scope='session')

@@ -26,7 +26,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
-from cliploc_ros.offline.evaluation.trials import PosedQuery
+from cliploc_ros.offline.posed_query import PosedQuery
 from studies import wrong_sensors
 
 ROOM = make_room()

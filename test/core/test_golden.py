@@ -21,13 +21,13 @@ def golden_scenes(office, office_map, queries, observe):
     """Return scene, B-PROSAC pairs and golden values of each query that has them."""
     golden = np.load(office / 'golden.npz')
     scenes = []
-    for number, frame in enumerate(queries.main_frames()):
+    for number, frame in enumerate(frame for frame in queries if frame.is_main):
         values = {name.removeprefix(f'q{number}_'): golden[name] for name in golden.files
                   if name.startswith(f'q{number}_')}
         if 'H' not in values:  # fewer than three boxes
             continue
         observation = observe(frame)
-        nearest = nearest_candidates(frame.similarities, 3)
+        nearest = nearest_candidates(observation.similarities, 3)
         potential = same_class(frame.class_ids, office_map.class_ids)
         potential |= candidate_mask(nearest, potential.shape)
         pairs = balanced_order(nearest).pairs

@@ -12,13 +12,14 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.localizer import (
     BATCH,
     Crops,
+    Localizer,
     informative_first,
     localize_on_demand,
-    recorded_crops,
 )
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 
 ROOM = make_room()
@@ -29,8 +30,9 @@ VIEW = Observation(CAMERA, SEEN, SURE)
 
 
 def localize(options, observation=VIEW):
-    return localize_on_demand(Relocalizer(ROOM, options), (), observation,
-                              recorded_crops(observation, options))
+    localizer = Localizer(Relocalizer(ROOM, options))
+    found = localizer.answer(Query((observation,), run=None))
+    return localizer.query.newest, found
 
 
 class Searches(Relocalizer):
@@ -105,20 +107,20 @@ def test_no_crop_is_class_matching_and_all_crops_are_hybrid(embedded):
 
 
 def test_classes_that_suffice_take_no_crop():
-    frame, found = localize(OPTIONS)
-    assert found.accepted and len(frame.observation.compared) == 0
+    seen, found = localize(OPTIONS)
+    assert found.accepted and len(seen.compared) == 0
 
 
 def test_an_early_stop_is_surer_than_the_last_one():
     """A pose that is accepted by class, but with doubt, is compared with all crops."""
     sure = localize(OPTIONS)[1].confidence
     asked = replace(OPTIONS, min_confidence=1.0 - 3.0 * (1.0 - sure))
-    frame, found = localize(asked)
-    assert found.accepted and len(frame.observation.compared) > 0
-    frame, found = localize(replace(asked, min_confidence=1.0 - 10.0 * (1.0 - sure)))
-    assert found.accepted and len(frame.observation.compared) == 0
-    frame, found = localize(replace(OPTIONS, min_confidence=1.0))
-    assert not found.accepted and len(frame.observation.compared) == len(SEEN)
+    seen, found = localize(asked)
+    assert found.accepted and len(seen.compared) > 0
+    seen, found = localize(replace(asked, min_confidence=1.0 - 10.0 * (1.0 - sure)))
+    assert found.accepted and len(seen.compared) == 0
+    seen, found = localize(replace(OPTIONS, min_confidence=1.0))
+    assert not found.accepted and len(seen.compared) == len(SEEN)
 
 
 def test_without_time_for_all_crops_a_pose_must_be_as_sure():

@@ -204,7 +204,7 @@ def test_the_likeliest_hypothesis_leads_and_without_refinement_the_greatest_scor
     likeliest = Relocalizer(office_map, RelocalizerOptions(tilt_deviation_deg=0.0))
     greatest = Relocalizer(office_map, RelocalizerOptions(refine=False))
     differ = 0
-    for frame in list(queries.main_frames())[:20:4]:
+    for frame in [frame for frame in queries if frame.is_main][:20:4]:
         found = likeliest.relocalize([observe(frame)]).hypotheses
         worth = utilities([pose.support for pose in found])
         assert (np.diff(worth) <= 0.0).all()
@@ -235,7 +235,7 @@ APART = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10]], dtype=n
 def compared(office_map, queries):
     """Return a frame with three separate boxes and one that nearly repeats the third."""
     boxes = np.concatenate([APART, [[201.0, 0.0, 210.0, 10.0]]])
-    camera = Camera(640, 480, *queries.intrinsics_fx_fy_cx_cy)
+    camera = queries[0].observation.camera
     detections = Detections(boxes, ('chair', *office_map.class_ids[4:5], 'none', 'none'),
                             np.ones(4))
     similarities = np.zeros((4, len(office_map)), dtype=np.float32)

@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Query files, observation files and records of a map's origin: read, refused and written."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 from scene import CAMERA
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.map_recording import (
     MapRecording,
@@ -128,38 +129,39 @@ def test_queries_are_read(tmp_path):
     path = save(tmp_path / 'q.npz', query_arrays())
     queries = load_queries(path, ['cup_1', 'cup_2', 'tv_1', 'lamp'])
     assert queries.landmark_ids == ('cup_1', 'cup_2', 'tv_1')
-    assert queries.intrinsics_fx_fy_cx_cy == (500, 501, 320, 240)
-    assert [len(frame) for frame in queries] == [2, 0, 1]
-    assert [frame.stamp_ns for frame in queries] == [
-        1341847980722988000, 1341847980754743000, 1341847981000000000]
     first, second, third = queries
-    assert first.class_ids == ('cup', 'tv')
-    np.testing.assert_array_equal(first.bboxes_xyxy, [[0, 0, 10, 10], [5, 6, 7, 8]])
+    seen = [frame.observation for frame in queries]
+    assert {one.camera for one in seen} == {Camera(640, 480, 500, 501, 320, 240)}
+    assert [len(one.detections) for one in seen] == [2, 0, 1]
+    assert [one.stamp_ns for one in seen] == [
+        1341847980722988000, 1341847980754743000, 1341847981000000000]
+    assert seen[0].detections.class_ids == ('cup', 'tv')
+    np.testing.assert_array_equal(seen[0].detections.bboxes_xyxy, [[0, 0, 10, 10], [5, 6, 7, 8]])
     np.testing.assert_array_equal(first.true_landmark, [0, 2])
-    assert first.similarities.shape == (2, 3)
-    assert second.bboxes_xyxy.shape == (0, 4)
-    assert second.similarities.shape == (0, 3)
+    assert seen[0].similarities.shape == (2, 3)
+    assert seen[1].detections.bboxes_xyxy.shape == (0, 4)
+    assert seen[1].similarities.shape == (0, 3)
     np.testing.assert_array_equal(second.map_from_camera[:3, 3], [1, 2, 3])
-    np.testing.assert_allclose(third.similarities, [[0.6, 0.7, 0.8]])
-    assert queries.main_frames() == (first, third)
-    assert queries.group(0) == (first, second)
+    np.testing.assert_allclose(seen[2].similarities, [[0.6, 0.7, 0.8]])
+    assert [frame.is_main for frame in queries] == [True, False, True]
+    assert first.group == second.group != third.group
     with pytest.raises(DatasetError, match=r"'cup_2'.* 1 more"):
         load_queries(path, ['cup_1'])
 
 
 def assert_same(queries, others):
     assert queries.landmark_ids == others.landmark_ids
-    assert queries.intrinsics_fx_fy_cx_cy == others.intrinsics_fx_fy_cx_cy
     for query, other in zip(queries, others, strict=True):
-        for name, value in vars(query).items():
-            np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
+        np.testing.assert_equal(asdict(query), asdict(other))
 
 
 def test_queries_come_back(tmp_path):
     queries = load_queries(save(tmp_path / 'q.npz', query_arrays()))
     # A float64 of seconds cannot hold this stamp.
-    exact = replace(queries[2], stamp_ns=1341847981000000123)
-    queries = replace(queries, frames=(*queries.frames[:2], exact))
+    frames = [replace(frame, observation=replace(
+        frame.observation, stamp_ns=stamp_ns, camera=Camera(600, 480, 500, 501, 320, 240)))
+        for frame, stamp_ns in zip(queries, (1, 2, 1341847981000000123), strict=True)]
+    queries = replace(queries, frames=tuple(frames))
     save_queries(tmp_path / 'again.npz', queries)
     assert_same(load_queries(tmp_path / 'again.npz'), queries)
     save_queries(tmp_path / 'other.npz', queries)

@@ -110,7 +110,7 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
 
 
 def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_here):
-    """Six views of each of two places: some are refused alone, but all are accepted when fused."""
+    """All frames have one pose. As on a robot at rest, the newest one replaces earlier ones."""
     recorded = changed(files, tmp_path, query_group=np.arange(12) // 6,
                        is_main=np.arange(12) % 6 == 1)
     given = ('--queries', recorded, '--map', files / 'map.yaml', '--methods', 'auto',
@@ -120,9 +120,8 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
         done = evaluate_here(*given, *more, '--out', tmp_path / name)
         assert done.returncode == 0, done.stderr
     exact, noisy = (results_of(tmp_path / name) for name in ('exact', 'noisy'))
-    assert len(exact) == 12 and all(row['accepted'] for row in exact)
-    errors = [np.median([row['error_m'] for row in rows]) for rows in (exact, noisy)]
-    assert errors[0] < errors[1] < 0.2
+    assert len(exact) == 12 and sum(row['accepted'] for row in exact) >= 6
+    assert all(row['error_m'] < 0.2 for row in exact if row['accepted'])
     # each trial has different noise
     first, second = ([row['map_from_camera'] for row in noisy if row['trial'] == trial]
                      for trial in range(2))

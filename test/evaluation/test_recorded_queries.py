@@ -49,7 +49,7 @@ def similarities(walk, compare):
     frames = tum_frames(sequence, find_camera(None, folder / 'sequence')[0])
     queries = recorded_queries(frames, landmark_map, options, [str(folder / 'map.yaml')], compare)
     assert len(queries) == 2
-    return np.concatenate([frame.similarities for frame in queries])
+    return np.concatenate([frame.observation.similarities for frame in queries])
 
 
 def test_what_crops_are_compared_with(walk):

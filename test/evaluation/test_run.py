@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of methods: with several processes, interrupted and resumed; their names and numbers."""
+"""Runs of methods: with several processes; their names and numbers."""
 
 import csv
 import multiprocessing
 import os
 import signal
-from contextlib import closing
 from dataclasses import replace
 from itertools import combinations
 
@@ -18,8 +17,7 @@ from scene import make_room
 
 from cliploc_ros.core.geometry.transforms import make_transform, quaternion_from_transform
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
-from cliploc_ros.files.log import Log
+from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation.figures import (
@@ -29,7 +27,7 @@ from cliploc_ros.offline.evaluation.figures import (
     spread_names,
 )
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS, parse_methods
-from cliploc_ros.offline.evaluation.run import count_trials, read_results, run_methods
+from cliploc_ros.offline.evaluation.run import count_trials, run_methods
 from cliploc_ros.offline.evaluation.summary import (
     Summary,
     as_csv,
@@ -43,7 +41,12 @@ from cliploc_ros.offline.evaluation.summary import (
     summarize,
     table_rows,
 )
-from cliploc_ros.offline.evaluation.trials import Result, given_results, make_queries
+from cliploc_ros.offline.evaluation.trials import (
+    Result,
+    given_results,
+    make_queries,
+    with_neighbours,
+)
 
 PAPER = RelocalizerOptions(iterations=60)
 
@@ -116,43 +119,32 @@ def test_a_dead_worker_costs_its_part_only(results, room, questions, methods):
     assert sum(map(len, parts)) == len(results)
 
 
-def test_what_is_done_is_not_run_again(results, room, questions, methods):
-    done = results[::3]
-    new = []
-    whole = run_methods(room, methods, questions, trials=3, done=done, advance=new.extend)
-    assert without_times(whole) == without_times(results)
-    assert len(new) == len(results) - len(done)
-
-
 def test_similarities_follow_the_maps_order(room, recording, questions):
-    turned = Queries(recording.landmark_ids[::-1], recording.intrinsics_fx_fy_cx_cy, tuple(
-        replace(frame, similarities=frame.similarities[:, ::-1]) for frame in recording.frames))
+    turned = Queries(recording.landmark_ids[::-1], tuple(replace(frame, observation=replace(
+        frame.observation, similarities=frame.observation.similarities[:, ::-1]))
+        for frame in recording.frames))
     for query, other in zip(make_queries(turned, room), questions, strict=True):
         np.testing.assert_array_equal(query.observation.similarities,
                                       other.observation.similarities)
 
 
-def test_an_unfinished_run_goes_on_if_it_is_the_same(results, tmp_path):
-    path = tmp_path / 'log'
-
-    def read(run):
-        with closing(Log(path, OptionsError, 'make room')) as log:
-            return read_results(log, run)
-    with closing(Log(path, OptionsError, 'make room')) as log:
-        assert read_results(log, {'trials': 3}) == []
-        log.append([result.as_dict() for result in results[:2]])
-        log.append([result.as_dict() for result in results[2:5]])
-    assert read({'trials': 3}) == results[:5]
-    whole = path.read_text()
-    path.write_text(whole[:-20])
-    assert read({'trials': 3}) == results[:2]
-    with pytest.raises(OptionsError, match='another trials'):
-        read({'trials': 4})
-    lines = whole.splitlines()
-    for damaged in (['rubbish', lines[1]], ['[{"method": 1}]'], ['3']):
-        path.write_text('\n'.join([lines[0], *damaged, '']))
-        with pytest.raises(OptionsError, match='damaged'):
-            read({'trials': 3})
+def test_what_a_robot_asks_about_a_frame(questions):
+    """The robot sees the frames after its query first, and goes back in the same time."""
+    alone, = questions[5].in_order()
+    assert (alone.frames, alone.run) == ((questions[5].observation,), None)
+    rig = tuple(replace(questions[5].observation, camera_name=name) for name in 'ab')
+    instant, = replace(questions[5], neighbours=rig).in_order()
+    assert (instant.frames, instant.run) == ((*rig, questions[5].observation), None)
+    fused = with_neighbours(questions, [0] * len(questions))[5]
+    *earlier, last = fused.in_order()
+    assert last.frames == (fused.observation,)
+    seconds = [query.newest.stamp_ns // 10**9 for query in (*earlier, last)]
+    late = max(frame.stamp_ns for frame in fused.neighbours) // 10**9
+    assert seconds == sorted(set(seconds)) and seconds[-1] == 105 and len(seconds) > 2
+    assert seconds[-2] == 105 - (late - 105)
+    for query in (*earlier, last):
+        assert (query.run, query.limit) == (5, len(seconds))
+        assert query.length_s >= seconds[-1] - seconds[0]
 
 
 def test_crops_on_demand_are_a_part_of_all(room, questions):

@@ -37,6 +37,7 @@ from cliploc_ros.offline.mapping.check.relocalization import (
     try_recording,
 )
 from cliploc_ros.offline.mapping.check.report import check_keyframes, in_reach
+from cliploc_ros.offline.mapping.landmarks import Landmarks
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.views import make_views
@@ -251,7 +252,7 @@ def test_systematic_errors_are_measured(spoil, name, value, tolerance):
 def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
     views, witness = witness_of(TABLE, detections)
     first, *others = make_folds(views, witness, QUICK)
-    bare = first._replace(rows=first.rows[:0])
+    bare = first._replace(rows=first.rows[:0], landmarks=Landmarks.none())
     trials = try_recording(TABLE, detections, witness.shown, [bare, *others], QUICK,
                            lambda share: None)
     assert len(trials) == 12

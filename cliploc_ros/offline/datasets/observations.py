@@ -6,7 +6,6 @@ The networks run once: mapping, evaluation and the map editor read the same obse
 file also holds the similarities to a map's labels, so that all methods get identical input.
 """
 
-import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,9 +17,11 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.errors import CameraError, DatasetError
 from cliploc_ros.files import arrays as npz
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
 
 _STAGES = ('detector_ms', 'clip_ms')
@@ -77,6 +78,8 @@ _QUERIES = npz.Schema('query file', {
     'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE, npz.Check(
         'has a focal length that is not above 0',
         lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
+    'image_size': npz.Field('integers', (2,), (npz.Check(
+        'is not above 0', lambda sides: sides <= 0),), is_optional=True),
     # half precision rounds some cosines to just above 1
     'similarities': npz.Field('numbers', ('n', 'L'), (npz.FINITE, npz.Check(
         'is not a cosine, outside -1 to 1', lambda rows: (np.abs(rows) > 1.001).any(axis=1)))),
@@ -89,58 +92,23 @@ _QUERIES = npz.Schema('query file', {
 
 
 @dataclass(frozen=True)
-class QueryFrame:
-    """One frame of a query file: n boxes, L landmarks."""
-
-    stamp_ns: int  #: Time of the image [ns]
-    bboxes_xyxy: NDArray[np.float64]  #: (n, 4): Left, top, right, bottom [px], undistorted
-    class_ids: tuple[str, ...]  #: Detector classes
-    scores: NDArray[np.float64]  #: (n,): detector confidences
-    #: (n, L): cosine similarity of each crop and each landmark's label
-    similarities: NDArray[np.float64]
-    #: (n,): index into the landmarks, -1 where unknown. For evaluation only.
-    true_landmark: NDArray[np.int64]
-    map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
-    group: int  #: Number of the query that the frame belongs to
-    is_main: bool  #: Whether the frame is the query itself, not one of its neighbours
-    #: Processing time of the image [ms]; NaN if not recorded
-    detector_ms: float = math.nan
-    clip_ms: float = math.nan
-    #: (n,): depth of the object in each box [m], NaN where unknown; None without a depth camera
-    depths: NDArray[np.float64] | None = None
-
-    def __len__(self) -> int:
-        """Return the number of boxes."""
-        return len(self.class_ids)
-
-
-@dataclass(frozen=True)
 class Queries:
     """The content of a query file."""
 
     landmark_ids: tuple[str, ...]  #: The landmark of each column of the similarities
-    intrinsics_fx_fy_cx_cy: tuple[float, float, float, float]  #: Of the undistorted image [px]
-    frames: tuple[QueryFrame, ...]  #: In the file's order
+    frames: tuple[PosedQuery, ...]  #: In the file's order; all have the same camera
 
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self.frames)
 
-    def __iter__(self) -> Iterator[QueryFrame]:
+    def __iter__(self) -> Iterator[PosedQuery]:
         """Iterate over the frames."""
         return iter(self.frames)
 
-    def __getitem__(self, index: int) -> QueryFrame:
+    def __getitem__(self, index: int) -> PosedQuery:
         """Return a frame."""
         return self.frames[index]
-
-    def main_frames(self) -> tuple[QueryFrame, ...]:
-        """Return the main frame of each query."""
-        return tuple(frame for frame in self.frames if frame.is_main)
-
-    def group(self, group: int) -> tuple[QueryFrame, ...]:
-        """Return all frames of one query, in the file's order."""
-        return tuple(frame for frame in self.frames if frame.group == group)
 
 
 def _stamps_ns(arrays: npz.Arrays) -> NDArray[np.int64]:
@@ -166,22 +134,28 @@ def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) 
         more = f' (and {len(unknown) - 1} more)' if len(unknown) > 1 else ''
         raise DatasetError(f'{path}: array landmark_ids has {unknown[0]!r}, which the map does '
                            f'not know{more}')
-    fx, fy, cx, cy = map(float, arrays['intrinsics_fx_fy_cx_cy'])
+    # files of older releases lack the size of the image
+    size = 2 * arrays['intrinsics_fx_fy_cx_cy'][2:]
+    camera = camera_from_numbers(arrays.get('image_size', size.round().clip(1)),
+                                 arrays['intrinsics_fx_fy_cx_cy'])
     frames, stamps_ns = [], _stamps_ns(arrays)
+    detector_ms, clip_ms = (arrays.get(name, np.full(len(stamps_ns), np.nan))
+                            for name in _STAGES)
     for index, (begin, end) in enumerate(pairwise(map(int, arrays['frame_offsets']))):
         rows = slice(begin, end)
-        frames.append(QueryFrame(
-            stamp_ns=int(stamps_ns[index]),
-            bboxes_xyxy=arrays['boxes_xyxy'][rows].astype(np.float64),
-            class_ids=tuple(map(str, arrays['class_ids'][rows])),
-            scores=arrays['scores'][rows].astype(np.float64),
-            similarities=arrays['similarities'][rows].astype(np.float64),
-            true_landmark=arrays['true_landmark'][rows].astype(np.int64),
-            map_from_camera=arrays['map_from_camera'][index].astype(np.float64),
+        seen = Detections(arrays['boxes_xyxy'][rows].astype(np.float64),
+                          tuple(map(str, arrays['class_ids'][rows])),
+                          arrays['scores'][rows].astype(np.float64))
+        frames.append(PosedQuery(
+            index, Observation(
+                camera, seen, arrays['similarities'][rows].astype(np.float32),
+                int(stamps_ns[index]),
+                depths=arrays['depths'][rows].astype(np.float64) if 'depths' in arrays else None),
+            arrays['map_from_camera'][index].astype(np.float64),
             group=int(arrays['query_group'][index]), is_main=bool(arrays['is_main'][index]),
-            depths=arrays['depths'][rows].astype(np.float64) if 'depths' in arrays else None,
-            **{name: float(arrays[name][index]) for name in _STAGES if name in arrays}))
-    return Queries(tuple(map(str, arrays['landmark_ids'])), (fx, fy, cx, cy), tuple(frames))
+            true_landmark=arrays['true_landmark'][rows].astype(np.int64),
+            detector_ms=float(detector_ms[index]), clip_ms=float(clip_ms[index])))
+    return Queries(tuple(map(str, arrays['landmark_ids'])), tuple(frames))
 
 
 def save_queries(path: str | Path, queries: Queries) -> None:
@@ -189,37 +163,38 @@ def save_queries(path: str | Path, queries: Queries) -> None:
 
     DatasetError: the queries are invalid or the file cannot be written.
     """
-    path = Path(path)
-    frames = queries.frames
-
-    def rows(name: str, none: NDArray[Any]) -> NDArray[Any]:
-        return np.concatenate([none, *(getattr(frame, name) for frame in frames)])
-
+    path, frames = Path(path), queries.frames
+    seen = [frame.observation for frame in frames]
+    if not frames:
+        raise DatasetError(f'{path}: cannot be written: there are no frames')
+    camera, boxes = seen[0].camera, [one.detections for one in seen]
     try:
         arrays = {
             'landmark_ids': np.array(queries.landmark_ids, dtype=np.str_),
-            'intrinsics_fx_fy_cx_cy': np.array(queries.intrinsics_fx_fy_cx_cy, dtype=np.float64),
-            'frame_offsets': np.cumsum([0, *map(len, frames)], dtype=np.int64),
-            'boxes_xyxy': rows('bboxes_xyxy', np.empty((0, 4))),
-            'class_ids': np.array([name for frame in frames for name in frame.class_ids],
+            'intrinsics_fx_fy_cx_cy': np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            'image_size': np.array([camera.width, camera.height]),
+            'frame_offsets': np.cumsum([0, *map(len, boxes)], dtype=np.int64),
+            'boxes_xyxy': np.concatenate([one.bboxes_xyxy for one in boxes]),
+            'class_ids': np.array([name for one in boxes for name in one.class_ids],
                                   dtype=np.str_),
-            'scores': rows('scores', np.empty(0)),
-            'similarities': rows('similarities', np.empty((0, len(queries.landmark_ids)))
-                                 ).astype(np.float32),
-            'true_landmark': rows('true_landmark', np.empty(0, dtype=np.int64)),
-            'map_from_camera': np.array([frame.map_from_camera for frame in frames]
-                                        ).reshape(-1, 4, 4),
+            'scores': np.concatenate([one.scores for one in boxes]),
+            'similarities': np.concatenate([np.asarray(one.similarities, dtype=np.float32)
+                                            for one in seen]),
+            'true_landmark': np.concatenate([
+                np.full(len(one), -1) if frame.true_landmark is None else frame.true_landmark
+                for frame, one in zip(frames, boxes, strict=True)]),
+            'map_from_camera': np.array([frame.map_from_camera for frame in frames]),
             # Python's division of integers rounds once, NumPy's twice.
-            'timestamps': np.array([frame.stamp_ns / NS_PER_S for frame in frames]),
+            'timestamps': np.array([one.stamp_ns / NS_PER_S for one in seen]),
             'query_group': np.array([frame.group for frame in frames], dtype=np.int64),
             'is_main': np.array([frame.is_main for frame in frames], dtype=np.bool_),
-            'stamps_ns': np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
+            'stamps_ns': np.array([one.stamp_ns for one in seen], dtype=np.int64),
             **{name: np.array([getattr(frame, name) for frame in frames]) for name in _STAGES},
         }
-        if any(frame.depths is not None for frame in frames):
+        if any(one.depths is not None for one in seen):
             arrays['depths'] = np.concatenate([
-                np.full(len(frame), np.nan) if frame.depths is None else frame.depths
-                for frame in frames])
+                np.full(len(one.detections), np.nan) if one.depths is None else one.depths
+                for one in seen])
     except ValueError as error:  # arrays of different widths
         raise DatasetError(f'{path}: cannot be written: {error}') from error
     _QUERIES.write(path, arrays, compress=True)

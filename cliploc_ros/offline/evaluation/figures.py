@@ -26,7 +26,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.files.storage import write_file
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 from cliploc_ros.offline.evaluation.summary import Summary, find_best, wilson_interval
-from cliploc_ros.offline.evaluation.trials import PosedQuery, Result
+from cliploc_ros.offline.evaluation.trials import Result
+from cliploc_ros.offline.posed_query import PosedQuery
 
 #: Outline of text, which makes it legible on any background.
 EDGED = (withStroke(linewidth=2.0, foreground='white'),)

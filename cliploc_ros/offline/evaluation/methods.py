@@ -33,6 +33,11 @@ class Method:
         """Return whether it draws no random samples. Then all its trials are equal."""
         return self.options.algorithm in ('auto', 'bf')
 
+    @property
+    def accumulates(self) -> bool:
+        """Return whether a localizer gets all queries of a trial, unlike the paper's methods."""
+        return self.options.algorithm == 'auto'
+
 
 def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: int
                   ) -> tuple[Method, ...]:

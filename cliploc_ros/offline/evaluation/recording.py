@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from cliploc_ros.core.keyframes.features import SIFT, FeatureKind
-from cliploc_ros.core.keyframes.localization import ImageFeatures
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.models.map_rows import embed_map
-from cliploc_ros.offline.datasets.frames import Frames
-from cliploc_ros.offline.datasets.observations import Queries, QueryFrame, Recorded
-from cliploc_ros.offline.evaluation.trials import PosedQuery
+from cliploc_ros.offline.datasets.frames import Frames, undistorted
+from cliploc_ros.offline.datasets.observations import Queries, Recorded
+from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.recorder import RecordingOptions, observation_file, record_once
 
 logger = logging.getLogger(__name__)
@@ -58,35 +57,30 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
                     labels: LabelEmbeddings | None) -> Queries:
     """Return recorded frames as queries, each in its own group; true landmarks are unknown."""
     detections = recorded.detections
-    camera, names = detections.cameras[0], detections.class_names
-    frames = []
+    camera, frames = detections.cameras[0], []
     for frame, stamp_ns in enumerate(recorded.stamps_ns):
         rows = slice(*map(int, detections.frame_offsets[frame:frame + 2]))
         boxes = detections.bboxes_xyxy[rows]
         if detections.camera_of(frame) != camera:  # all queries have the same camera
             boxes = camera.bboxes_in_pixels(detections.camera_of(frame).normalize_bboxes(boxes))
-        similarities = np.zeros((len(boxes), len(landmark_map)))
+        similarities = np.zeros((len(boxes), len(landmark_map)), np.float32)
         if labels is not None:
             assert detections.embeddings is not None
             crops = detections.embeddings[rows].astype(np.float32)
-            similarities = np.asarray(CropSimilarities(crops, labels)).astype(np.float64)
-        frames.append(QueryFrame(
-            stamp_ns=int(stamp_ns), bboxes_xyxy=boxes,
-            class_ids=tuple(names[number] for number in detections.classes[rows]),
-            scores=detections.scores[rows], similarities=similarities,
-            true_landmark=np.full(len(boxes), -1, dtype=np.int64),
-            map_from_camera=detections.map_from_camera[frame], group=frame, is_main=True,
-            depths=None if detections.depths is None
-            else detections.depths[rows].astype(np.float64),
+            similarities = np.asarray(CropSimilarities(crops, labels))
+        frames.append(PosedQuery(
+            frame, Observation(
+                camera, replace(detections.detections_of(frame), bboxes_xyxy=boxes), similarities,
+                int(stamp_ns), depths=None if detections.depths is None
+                else detections.depths[rows].astype(np.float64)),
+            detections.map_from_camera[frame], group=frame,
             detector_ms=float(recorded.detector_ms[frame]),
             clip_ms=float(recorded.clip_ms[frame])))
-    return Queries(landmark_map.landmark_ids, (camera.fx, camera.fy, camera.cx, camera.cy),
-                   tuple(frames))
+    return Queries(landmark_map.landmark_ids, tuple(frames))
 
 
-def with_features(queries: Sequence[PosedQuery], frames: Frames, kind: FeatureKind = SIFT
-                  ) -> tuple[PosedQuery, ...]:
-    """Return queries with the features of their images; a query without an image is unchanged.
+def with_images(queries: Sequence[PosedQuery], frames: Frames) -> tuple[PosedQuery, ...]:
+    """Return queries with their undistorted images; a query without an image is unchanged.
 
     `frames` are the recording of the queries.
     """
@@ -96,16 +90,15 @@ def with_features(queries: Sequence[PosedQuery], frames: Frames, kind: FeatureKi
     found = list(queries)
     wanted = frames.read_raw(lambda place, stamp_ns, pose: pose is not None
                              and bool(waiting.get(stamp_ns)))
-    for raw in tqdm(wanted, 'features', len(queries), unit='image', disable=None):
+    for raw in tqdm(wanted, 'images', len(queries), unit='image', disable=None):
         if not waiting[raw.stamp_ns]:
             continue  # more images of this stamp than queries
         row = waiting[raw.stamp_ns].popleft()
         image_rgb, camera = raw.color()
+        image_rgb = undistorted(image_rgb, camera, queries[row].observation.camera)
         # kept compressed, since the images of a long recording would fill the memory
         _, content = cv2.imencode('.png', image_rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        features = ImageFeatures(partial(_decoded, content), camera, kind)
-        features.of_pass(is_thorough=False)
-        found[row] = replace(queries[row], image=features)
+        found[row] = replace(queries[row], image=partial(_decoded, content))
     return tuple(found)
 
 

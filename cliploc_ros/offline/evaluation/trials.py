@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run methods on queries: the pose of each search and its error; simulated sensors."""
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -11,56 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core import localizer
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.fit.verification import MAX_FRAMES
-from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth import (
-    CHORD_DEVIATION,
-    SURFACE_SHARE,
-    depth_deviations,
-    depth_of,
-    half_chord,
-)
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     make_transform,
     pose_error,
     transform_from_pose,
 )
-from cliploc_ros.core.keyframes.localization import (
-    ImageFeatures,
-    ImageRecognizer,
-    KeyframeLocalizer,
-)
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.joined_map import place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
-from cliploc_ros.core.search.frame_search import SearchedFrame
+from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS, Method
+from cliploc_ros.offline.posed_query import PosedQuery, ask
 from cliploc_ros.units import NS_PER_S
 
 #: Result.source of a pose that another program found.
 GIVEN = 'given'
 #: Greatest difference in time between a query and its given pose [ms]: evo's default.
 GIVEN_TOLERANCE_MS = 10
-
-
-@dataclass(frozen=True)
-class PosedQuery:
-    """An observation to localize, and its true pose."""
-
-    number: int  #: Number of the frame in its query file, from 0
-    observation: Observation
-    map_from_camera: NDArray[np.float64]  #: (4, 4): ground truth
-    #: Other frames that odometry links to it, or the frames of other cameras at its instant
-    neighbours: tuple[Observation, ...] = ()
-    image: ImageFeatures | None = None  #: Local features of its image, for keyframes
 
 
 @dataclass(frozen=True)
@@ -120,15 +97,10 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
         raise DatasetError(f"the queries lack the map's landmark '{missing[0]}'{more}: they were "
                            'recorded with another map')
     columns = [column[landmark_id] for landmark_id in landmark_map.landmark_ids]
-    fx, fy, cx, cy = queries.intrinsics_fx_fy_cx_cy
-    # the file lacks the size of the image, which localization does not need
-    camera = Camera(max(1, round(2 * cx)), max(1, round(2 * cy)), fx, fy, cx, cy)
-    return tuple(
-        PosedQuery(number, Observation(
-            camera, Detections(frame.bboxes_xyxy, frame.class_ids, frame.scores),
-            np.ascontiguousarray(frame.similarities[:, columns], dtype=np.float32),
-            frame.stamp_ns, depths=frame.depths), frame.map_from_camera)
-        for number, frame in enumerate(queries.frames) if every_frame or frame.is_main)
+    return tuple(replace(query, observation=replace(
+        query.observation, similarities=np.ascontiguousarray(
+            np.asarray(query.observation.similarities, dtype=np.float32)[:, columns])))
+        for query in queries if every_frame or query.is_main)
 
 
 def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float
@@ -160,28 +132,23 @@ def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float
 
 def run_trial(landmark_map: LandmarkMap, method: Method, trial: int, queries: Sequence[PosedQuery],
               keyframes: KeyframeLocalizer | None = None) -> list[Result]:
-    """Run one trial of a method, numbered from 0, on some queries.
+    """Run one trial of a method, numbered from 0, on some queries; return results by stamp.
+
+    One localizer gets all queries in the order of their stamps, as on a robot, so that evidence
+    about cameras and depth accumulates. For the paper's methods, each query gets a new localizer:
+    its searches are independent.
 
     `keyframes` localizes in the keyframes of the map, if the method uses them and the query has
-    features.
+    an image.
     """
-    seed = method.options.random_seed + trial
-    relocalizer = Relocalizer(landmark_map, replace(method.options, random_seed=seed))
-    on_demand = (method.options.crops == 'on_demand'
-                 and localizer.can_do_without_crops(method.options))
-    results = []
-    for query in queries:
-        recognizer = None
-        observations = [*query.neighbours, query.observation]
-        if keyframes is not None and query.image is not None and method.keyframes:
-            recognizer = ImageRecognizer(keyframes, query.image)
-        if on_demand:
-            found, crops_share = _localize_on_demand(relocalizer, observations, recognizer)
-        else:
-            found = relocalizer.relocalize(observations, recognizer)
-            crops_share = float(method.options.needs_similarities)
-        results.append(_judge(landmark_map, method.name, trial, query, found, crops_share,
-                              recognizer))
+    relocalizer = Relocalizer(landmark_map, replace(
+        method.options, random_seed=method.options.random_seed + trial))
+    layer = keyframes if method.keyframes else None
+    localizer, results = Localizer(relocalizer, layer), []
+    for query in sorted(queries, key=lambda query: query.observation.stamp_ns):
+        if not method.accumulates:
+            localizer = Localizer(relocalizer, layer)
+        results.append(_result(localizer, landmark_map, method, trial, query))
     return results
 
 
@@ -235,34 +202,17 @@ def _error(pose: NDArray[np.float64] | None, query: PosedQuery) -> dict[str, Any
             'error_deg': float(error_deg)}
 
 
-def _localize_on_demand(relocalizer: Relocalizer, observations: Sequence[Observation],
-                        recognizer: ImageRecognizer | None) -> tuple[Relocalization, float]:
-    """Localize as the node does: frame after frame, with crops compared on demand.
-
-    Return the result and the share of crops that were compared with labels.
-    """
-    frames: list[SearchedFrame] = []
-    count = len(relocalizer.landmark_map)
-    for observation in observations:
-        if observation.camera_name and observation is not observations[-1]:
-            frames.append(relocalizer.search(localizer.by_classes(observation, count)))
-            continue
-        frame, found = localizer.localize_on_demand(
-            relocalizer, frames, observation,
-            localizer.recorded_crops(observation, relocalizer.options),
-            recognizer=recognizer if observation is observations[-1] else None)
-        frames.append(frame)
-    crops = sum(len(frame.observation.detections) for frame in frames)
-    compared = sum(int((frame.observation.similarity_rows >= 0).sum()) for frame in frames)
-    return found, compared / max(crops, 1)
-
-
-def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery,
-           found: Relocalization, crops_share: float, recognizer: ImageRecognizer | None
-           ) -> Result:
+def _result(localizer: Localizer, landmark_map: LandmarkMap, method: Method, trial: int,
+            query: PosedQuery) -> Result:
+    """Ask a localizer about a query, and judge its answer."""
+    stages_s = list[float]()  # starts of keyframes, then search, alternately
+    found = ask(localizer, query, lambda stage: stages_s.append(time.perf_counter()))
+    keyframes_ms = 1e3 * (sum(stages_s[1::2]) - sum(stages_s[::2]))
     pose = found.map_from_camera
+    assert localizer.query is not None
+    rows = np.concatenate([frame.similarity_rows for frame in localizer.query.frames])
     return Result(
-        method=method, trial=trial, query=query.number,
+        method=method.name, trial=trial, query=query.number,
         timestamp=float(query.observation.stamp_ns) / NS_PER_S,
         boxes=len(query.observation.detections),
         solved=found.solved, accepted=found.accepted, **_error(pose, query),
@@ -271,18 +221,14 @@ def _judge(landmark_map: LandmarkMap, method: str, trial: int, query: PosedQuery
         else normalized_square(pose, found.covariance, query.map_from_camera),
         inliers=len(found.matches), hypotheses=int(found.tried),
         best_iteration=int(found.best_iteration), coverage=float(found.coverage),
-        reason=found.reason, search_ms=float(found.search_ms), crops_share=crops_share,
+        reason=found.reason, search_ms=float(found.search_ms) - keyframes_ms,
+        crops_share=float(method.options.needs_similarities
+                          and (rows >= 0).sum() / max(1, len(rows))),
         map='' if pose is None else place_of(landmark_map, pose).name,
         refusal_kind=found.refusal_kind or '',
         source='' if pose is None else found.source,
         keyframe_inliers=0 if found.recognized is None else found.recognized.inliers,
-        keyframes_ms=0.0 if recognizer is None else recognizer.spent_ms,
-        keyframe_search=found.keyframe_search)
-
-
-# Share of boxes without depth, measured in a kitchen; share of boxes with the depth of another
-# object, and the range of that depth [m]. The latter two are not measured.
-_NO_DEPTH, _SOMETHING_ELSE, _ANY_DEPTH_M = 0.1, 0.05, (0.5, 5.0)
+        keyframes_ms=keyframes_ms, keyframe_search=found.keyframe_search)
 
 
 def with_vertical(queries: Sequence[PosedQuery], noise_deg: float = 0.0, seed: int = 0
@@ -351,33 +297,6 @@ def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_
     if not any(query.neighbours for query in found.values()):
         raise OptionsError('--fuse: no query of this input has neighbouring frames in its group')
     return tuple(found[query.number] for query in queries)
-
-
-def simulate_depths(centers: NDArray[np.float64], shapes: NDArray[np.float64],
-                    map_from_camera: NDArray[np.float64], rng: np.random.Generator,
-                    scale: float = 1.0) -> NDArray[np.float64]:
-    """Return the depths (m,) [m] that an RGB-D camera would measure in m boxes; NaN: no depth.
-
-    Parameters
-    ----------
-    centers, shapes : ndarray (m, 3), (m, 6)
-        Ellipsoid of the object in each box, in the map; NaN: an object that is not in the map.
-    map_from_camera : ndarray (4, 4)
-    scale : float
-        Ratio of measured and true depth.
-    """
-    camera_from_map = invert_transform(map_from_camera)
-    rotation, translation = (np.ascontiguousarray(camera_from_map[:3, :3]),
-                             np.ascontiguousarray(camera_from_map[:3, 3]))
-    depths = rng.uniform(*_ANY_DEPTH_M, len(centers))
-    seen = np.isfinite(centers).all(axis=1) & (rng.random(len(centers)) >= _SOMETHING_ELSE)
-    for row in np.nonzero(seen)[0]:
-        share = rng.normal(SURFACE_SHARE, CHORD_DEVIATION)
-        depths[row] = (depth_of(rotation, translation, centers[row]) - share * half_chord(
-            centers[row], shapes[row], rotation, translation))
-    depths = scale * depths + rng.normal(size=len(depths)) * depth_deviations(depths)
-    depths[(rng.random(len(depths)) < _NO_DEPTH) | (depths <= 0.0)] = np.nan
-    return depths
 
 
 def _odometry(frames: Sequence[PosedQuery], noise_m: float, noise_deg: float,

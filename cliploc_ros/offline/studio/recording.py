@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, shape_matrices
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.association import associate
@@ -193,7 +194,8 @@ class Recording:
                    layer: KeyframeLayer | None = None) -> dict[int, Trial]:
         """Return the relocalizer's answers in some views; MapError: there are no landmarks.
 
-        Keyframes recorded at about the time of a view are not used for it.
+        Each view is an independent question to a new localizer, so that only edits change the
+        answers. Keyframes recorded at about the time of a view are not used for it.
         """
         keyframes = None if layer is None or self.images is None else RecordedKeyframes(
             layer, self.image)
@@ -202,12 +204,15 @@ class Recording:
         shown = np.full(len(detections.classes), -1, dtype=np.int64)
         for landmark, rows in enumerate(self.boxes_of(landmarks).values()):
             shown[rows] = landmark
-        # a fixed random seed, so that only edits change the answers
-        return {view: try_view(
-            relocalizer, simulated(detections, view, shown, labels, options.random_seed),
-            detections.map_from_camera[view], 0, options, float(detections.stamps_s[view]),
-            None if keyframes is None else keyframes.recognizer(detections, view))
-            for view in views}
+        answers = {}
+        for view in views:
+            query = simulated(detections, view, shown, labels, options.random_seed)
+            localizer = Localizer(relocalizer)
+            if keyframes is not None:
+                query = keyframes.with_image(query)
+                localizer = Localizer(relocalizer, keyframes.elsewhere(detections, view))
+            answers[view] = try_view(localizer, query, 0, options)
+        return answers
 
 
 def _array(landmarks: Landmarks, name: str) -> NDArray[np.float64]:

@@ -3,7 +3,9 @@
 """Relocalize recorded frames and simulated frames in a map.
 
 Cross-validation over time: recorded frames are judged with landmarks fitted to other blocks of the
-recording. Simulated frames have the errors of the recording's detector.
+recording. One localizer gets the frames of a fold in order, as on a robot, so that its evidence
+about cameras accumulates. Simulated frames have the errors of the recording's detector; each is an
+independent question to a new localizer, such as that of a robot that wakes up there.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,11 +19,8 @@ from scipy.spatial import cKDTree
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.localization import (
-    ImageFeatures,
-    ImageRecognizer,
-    KeyframeLocalizer,
-)
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
@@ -32,12 +31,14 @@ from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.views import Views
+from cliploc_ros.offline.posed_query import PosedQuery, ask
 from cliploc_ros.offline.simulation import (
     GUESSED_MIN_SIDE_PX,
     DetectorModel,
     LabelModel,
     Sightings,
 )
+from cliploc_ros.units import NS_PER_S
 
 _MAX_SAMPLED_FRAMES = 600
 _CLUTTER_IOU = 0.1
@@ -68,17 +69,16 @@ class RecordedKeyframes(NamedTuple):
     layer: KeyframeLayer
     image_of: ImageOf
 
-    def recognizer(self, detections: PosedDetections, frame: int) -> ImageRecognizer | None:
-        """Return the keyframe search of a frame, excluding keyframes near it in time.
-
-        None: there is no other keyframe, or no image.
-        """
+    def elsewhere(self, detections: PosedDetections, frame: int) -> KeyframeLocalizer | None:
+        """Return the keyframes that are not near a frame in time; None if there are none."""
         is_other = np.abs(detections.stamps_s[_frames_of(self.layer, detections)]
                           - detections.stamps_s[frame]) > _SAME_TIME_S
-        image = self.image_of(frame) if is_other.any() else None
-        return None if image is None else ImageRecognizer(
-            KeyframeLocalizer(self.layer.select(is_other)),
-            ImageFeatures(lambda: image, detections.camera_of(frame), self.layer.kind))
+        return KeyframeLocalizer(self.layer.select(is_other)) if is_other.any() else None
+
+    def with_image(self, query: PosedQuery) -> PosedQuery:
+        """Return the query of a recorded frame with its image, unless it is missing."""
+        image = self.image_of(query.number)
+        return query if image is None else replace(query, image=partial(np.asarray, image))
 
 
 def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
@@ -155,14 +155,6 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
         reach, scale, min_side, tuple(clutter))
 
 
-class PosedObservation(NamedTuple):
-    """An observation with similarities to the labels of the map, and the true pose."""
-
-    observation: Observation
-    map_from_camera: NDArray[np.float64]
-    stamp_s: float
-
-
 @dataclass(frozen=True)
 class Trial:
     """One relocalization attempt and its verdict."""
@@ -193,15 +185,18 @@ class Trial:
 
 
 def simulated(detections: PosedDetections, frame: int, shown: NDArray[np.int64],
-              labels: LabelModel, seed: int) -> Observation:
-    """Return the observation of a recorded frame, with simulated, reproducible similarities.
+              labels: LabelModel, seed: int) -> PosedQuery:
+    """Return a recorded frame as a query, with simulated, reproducible similarities.
 
     shown (n,) is the landmark of each box of the recording, -1 for none.
     """
     found, rows = detections.detections_of(frame), slice(*detections.frame_offsets[
         frame:frame + 2])
-    return Observation(detections.camera_of(frame), found, labels.similarities(
-        shown[rows], found.class_ids, found.bboxes_xyxy, np.random.default_rng([seed, frame])))
+    return PosedQuery(frame, Observation(
+        detections.camera_of(frame), found, labels.similarities(
+            shown[rows], found.class_ids, found.bboxes_xyxy, np.random.default_rng([seed, frame])),
+        round(detections.stamps_s[frame] * NS_PER_S), detections.name_of(frame)),
+        detections.map_from_camera[frame])
 
 
 def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
@@ -210,7 +205,8 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     """Relocalize recorded frames in maps fitted to other frames; return the trials by time.
 
     Boxes, poses and images are those of the recording, similarities are simulated. shown (n,) is
-    the landmark of each box, -1 for none. tell is called with the progress, 0 to 1.
+    the landmark of each box, -1 for none. tell is called with the progress, 0 to 1. A fold has one
+    localizer, and a second localizer with keyframes; each gathers its own evidence.
     """
     labels = LabelModel.of(landmark_map)
     chosen = set(sample_frames(detections, options.frames).tolist())
@@ -220,37 +216,28 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
         frames = [frame for frame in fold.frames.tolist() if frame in chosen]
         if not frames:
             continue
-        relocalizer = localizer = None
-        if len(fold.rows):
-            semi_axes, quats_xyzw = fold.landmarks.axes_and_quats()
-            relocalizer = make_relocalizer(replace(
-                landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
-                semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
+        semi_axes, quats_xyzw = fold.landmarks.axes_and_quats()
+        relocalizer = make_relocalizer(replace(
+            landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
+            semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
+        of_objects, of_both = Localizer(relocalizer), None
         if keyframes is not None and fold.training[taken_at].any():
-            localizer = KeyframeLocalizer(keyframes.layer.select(fold.training[taken_at]))
+            of_both = Localizer(relocalizer, KeyframeLocalizer(
+                keyframes.layer.select(fold.training[taken_at])))
         for frame in frames:
             tell((len(trials) + 1) / len(chosen))
             seen = shown[slice(*detections.frame_offsets[frame:frame + 2])]
             count, known = int((seen >= 0).sum()), int(np.isin(seen, fold.rows).sum())
-            is_judged = known >= min(LANDMARKS_FOR_A_POSE, count)
-            pose, stamp_s = detections.map_from_camera[frame], float(detections.stamps_s[frame])
-            if relocalizer is None:
-                trials.append(Trial('refused', pose[:3, 3], pose[:3, 2], len(seen), 0, None,
-                                    None, 'the other parts show no landmark', stamp_s,
-                                    is_judged=is_judged))
-                continue
-            observation = simulated(detections, frame, shown, labels, options.random_seed)
-            judge = partial(try_view, relocalizer, replace(
-                observation, similarities=np.asarray(observation.similarities)[:, fold.rows]),
-                pose, count, options, stamp_s)
-            trial = judge()
-            if (localizer is not None and keyframes is not None
-                    and (image := keyframes.image_of(frame)) is not None):
-                features = ImageFeatures(partial(np.asarray, image), observation.camera,
-                                         keyframes.layer.kind)
-                trial = replace(judge(ImageRecognizer(localizer, features)),
+            query = simulated(detections, frame, shown, labels, options.random_seed)
+            query = replace(query, observation=replace(query.observation, similarities=np.asarray(
+                query.observation.similarities)[:, fold.rows]))
+            trial = try_view(of_objects, query, count, options)
+            if of_both is not None and keyframes is not None:
+                query = keyframes.with_image(query)
+            if of_both is not None and query.image is not None:
+                trial = replace(try_view(of_both, query, count, options),
                                 by_objects=trial.verdict)
-            trials.append(replace(trial, is_judged=is_judged))
+            trials.append(replace(trial, is_judged=known >= min(LANDMARKS_FOR_A_POSE, count)))
     return sorted(trials, key=lambda trial: trial.stamp_s or 0.0)
 
 
@@ -281,17 +268,20 @@ def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np
         detections, shown = model.detect(pose, rng)
         similarities = labels.similarities(shown, detections.class_ids, detections.bboxes_xyxy,
                                            rng)
-        yield try_view(relocalizer, Observation(model.camera, detections, similarities), pose,
-                       int((shown >= 0).sum()), options)
+        yield replace(try_view(Localizer(relocalizer), PosedQuery(
+            number, Observation(model.camera, detections, similarities), pose),
+            int((shown >= 0).sum()), options), stamp_s=None)
 
 
-def try_observations(landmark_map: LandmarkMap, observations: Sequence[PosedObservation],
-                     options: CheckOptions) -> Iterator[Trial]:
-    """Relocalize observations with recorded similarities; yield the trials."""
-    relocalizer = make_relocalizer(landmark_map, options)
-    for observation, pose, stamp_s in observations:
-        yield try_view(relocalizer, observation, pose, len(observation.detections), options,
-                       stamp_s)
+def try_queries(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], options: CheckOptions
+                ) -> Iterator[Trial]:
+    """Relocalize queries with recorded similarities in the order of their stamps.
+
+    Yields the trials. One localizer gets all queries.
+    """
+    localizer = Localizer(make_relocalizer(landmark_map, options))
+    for query in sorted(queries, key=lambda query: query.observation.stamp_ns):
+        yield try_view(localizer, query, len(query.observation.detections), options)
 
 
 def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:
@@ -320,19 +310,17 @@ def make_relocalizer(landmark_map: LandmarkMap, options: CheckOptions) -> Reloca
     return Relocalizer(landmark_map, replace(options.relocalizer, k=k))
 
 
-def try_view(relocalizer: Relocalizer, observation: Observation,
-             map_from_camera: NDArray[np.float64], landmarks: int, options: CheckOptions,
-             stamp_s: float | None = None, recognizer: ImageRecognizer | None = None) -> Trial:
-    """Relocalize one view of known pose; `landmarks` is the number of landmarks in it."""
-    up = map_from_camera[2, :3] if options.use_vertical else None  # the map's z in the camera
-    result = relocalizer.relocalize([replace(observation, up_in_camera=up)], recognizer)
-    estimate, error_m = result.map_from_camera, None
-    if estimate is not None:
-        error_m = float(pose_error(estimate, map_from_camera)[0])
+def try_view(localizer: Localizer, query: PosedQuery, landmarks: int, options: CheckOptions
+             ) -> Trial:
+    """Ask a localizer about a view; `landmarks` is the number of landmarks in it."""
+    pose, observation = query.map_from_camera, query.observation
+    up = pose[2, :3] if options.use_vertical else None  # the map's z in the camera
+    result = ask(localizer, replace(query, observation=replace(observation, up_in_camera=up)))
+    estimate = result.map_from_camera
+    error_m = None if estimate is None else float(pose_error(estimate, pose)[0])
     verdict: Verdict = 'refused'
     if result.accepted and error_m is not None:
         verdict = 'misled' if error_m > options.wrong_m else 'accepted'
-    return Trial(verdict, map_from_camera[:3, 3], map_from_camera[:3, 2],
-                 len(observation.detections), landmarks,
-                 None if estimate is None else estimate[:3, 3], error_m, result.reason, stamp_s,
-                 result=result)
+    return Trial(verdict, pose[:3, 3], pose[:3, 2], len(observation.detections), landmarks,
+                 None if estimate is None else estimate[:3, 3], error_m, result.reason,
+                 observation.stamp_ns / NS_PER_S, result=result)
