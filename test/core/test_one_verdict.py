@@ -99,6 +99,12 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     assert weak.evidence.by_points <= points.evidence.by_points, 'objects add no more evidence'
 
 
+def test_points_that_agree_by_chance_change_nothing():
+    likely = {ask(Says(place(inliers=inliers, confirmed=0.0)), objects=3).evidence.likely
+              for inliers in (6, 7, 8)}
+    assert len(likely) == 1 and likely.pop() < 0.9
+
+
 @pytest.mark.parametrize('cause', ['too few objects', 'a search cut short', 'earlier looks'])
 def test_a_dozen_points_do_not_override_what_objects_lack(cause):
     objects, options, looks = 12, OPTIONS, Looks()

@@ -151,7 +151,8 @@ class Comparison:
         """Return the places that keyframes recognize, as contenders.
 
         If the search of objects found a pose at the same place, the points add to its odds. They
-        never lower them: a dozen points agree by chance.
+        never lower them: a dozen points agree by chance. Objects never lower the odds of points
+        either: the objects that the pose does not explain may never have been mapped.
         """
         most = CALIBRATION.attitude.vertical_sigmas
         found = contenders_of(self._joined, [unrefined(place.map_from_camera)
@@ -164,8 +165,8 @@ class Comparison:
             agreeing = [other.odds for other in met
                         if SAME_ANSWER.agree(contender.pose, other.pose)]
             proposed.append(contender._replace(
-                recognized=place, by_points=alone + min(0.0, objects),
-                odds=max([alone + objects, *(odds + max(0.0, points) for odds in agreeing)])))
+                recognized=place, by_points=alone,
+                odds=max([alone + max(0.0, objects), *(odds + max(0.0, points) for odds in agreeing)])))
         return proposed
 
     def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -202,7 +203,7 @@ class Comparison:
         """Return the evidence for the leading pose, given its covariance (6, 6)."""
         best, frames = self.by_objects or self.contenders[0], self._joined.frames
         coverage, by_points = coverage_of(frames), self._by_points()
-        distinct, twin = self._distinct()
+        distinct, twin = self._distinct() if len(self.contenders[0].landmarks) else (1.0, None)
         return Evidence(
             round(best.support.inliers), float(self.likely[0]), by_points=by_points,
             rival=self._rival(), distinct=distinct,
@@ -231,7 +232,7 @@ class Comparison:
         if self.place is None:
             return None
         boxes = self._last.detections.bboxes_xyxy[[match.detection for match in best.matches[-1]]]
-        return signs_of(self.place, best.support, boxes, self._last.camera)
+        return signs_of(self.place, boxes, self._last.camera)
 
     def _motion(self) -> Motion | None:
         """Compare the motion since an earlier look by keyframes; None without such a look."""
