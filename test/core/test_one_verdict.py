@@ -14,7 +14,7 @@ from cliploc_ros.core.fit.covariance import fuse
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 
@@ -97,6 +97,26 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
         'only a pose from boxes checks the camera'
     points = ask(Says(place(0.05, inliers=9)), objects=0)
     assert weak.evidence.by_points <= points.evidence.by_points, 'objects add no more evidence'
+
+
+@pytest.mark.parametrize('mapped', [0, 2])
+@pytest.mark.parametrize('fields', [
+    {'inliers': 30, 'confirmed': 0.9}, {'inliers': 175, 'confirmed': 0.6, 'reach': 0.5},
+    {'inliers': 12}], ids=['few points', 'a part of the image', 'too few points'])
+def test_objects_never_take_from_keyframes(fields, mapped):
+    """Most objects of a room are never mapped; in this test their boxes fit nowhere."""
+    corners = np.array([[x, y] for x in (10.0, 560.0) for y in (10.0, 220.0, 420.0)])
+    strangers = Detections(np.hstack([corners, corners + (25.0, 45.0)]), tuple('abcabc'),
+                           np.full(6, 0.9))
+    boxes = SEEN.select(np.arange(mapped))
+    joined = Detections(np.vstack([boxes.bboxes_xyxy, strangers.bboxes_xyxy]),
+                        boxes.class_ids + strangers.class_ids, np.full(mapped + 6, 0.9))
+    recognizer, relocalizer = Says(place(0.003, **fields)), Relocalizer(ROOM, OPTIONS)
+    alone = ask(recognizer, objects=0)
+    found = relocalizer.relocalize([Observation(CAMERA, joined)], recognizer)
+    assert found.confidence > alone.confidence - 1e-3 > 0.05, 'rivals from the boxes'
+    assert error_m(found, 0.003) < 1e-12
+    np.testing.assert_array_equal(found.covariance, alone.covariance)
 
 
 def test_points_that_agree_by_chance_change_nothing():
