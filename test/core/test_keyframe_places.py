@@ -117,6 +117,7 @@ def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, mi
     for place, in (fast.places, localizer.localize_features(seen, CAMERA, fast=fast).places):
         assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
         assert (place.inliers, place.keyframes) == (30, (18,))
+        assert place.apart == pytest.approx(0.1 / 2.0, abs=1e-3)
         assert abs(place.focal_ratio - 1.0) <= 3.0 * place.focal_deviation < 0.1
 
 

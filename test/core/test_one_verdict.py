@@ -81,10 +81,18 @@ def test_many_points_accept_what_objects_could_not():
 
 def test_points_of_a_thorough_search_count_less():
     """The thorough pass finds several times as many points, and so do places that look alike."""
-    fast, thorough = (ask(Says(place(3.0, inliers=50, confirmed=0.5, is_thorough=is_thorough)),
+    fast, thorough = (ask(Says(place(3.0, inliers=32, confirmed=0.5, is_thorough=is_thorough)),
                           objects=0) for is_thorough in (False, True))
     assert fast.accepted and not thorough.accepted
     assert ask(Says(place(3.0, is_thorough=True)), objects=0).accepted, 'more points suffice'
+
+
+@pytest.mark.parametrize(('apart', 'accepted'), [
+    (0.2, False), (1.0, True), (2.0, True), (4.0, False)])
+def test_the_fewer_cells_match_the_farther_away_a_keyframe_must_be(apart, accepted):
+    """Next to a keyframe, all of the image matches; from the opposite side, no feature does."""
+    found = ask(Says(place(3.0, inliers=40, confirmed=0.4, apart=apart)), objects=0)
+    assert found.accepted == accepted
 
 
 def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
