@@ -48,7 +48,7 @@ from studies.acceptance.troubles import exchange_landmarks
 
 OPTIONS = RelocalizerOptions()
 SURE = Evidence(inliers=9, likely=0.99)
-GENUINE = Signs(math.log(30), 0.8, 0.0, 0.0, 1.0)
+GENUINE = Signs(math.log(30), 0.8, 0.0, 0.0, 1.0, 0.5)
 SMALL = GENUINE._replace(reach=0.3, confirmed=0.4)
 RECOGNIZED = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 200, 0.9, 0.9)
 # Factors that reduce the confidence, and the kind of refusal that names them.

@@ -95,6 +95,7 @@ class Signs(NamedTuple):
     #: Extent of the agreeing points and boxes as a share of the image's width or height, whichever
     #: share is greater. A picture ends within the image.
     reach: float
+    apart: float  #: See RecognizedPlace, limited to 1: next to a keyframe, all surroundings match
 
 
 def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera) -> Signs:
@@ -117,7 +118,8 @@ def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera)
         math.log(min(max(1, place.inliers), _TERMS.most_features)), place.confirmed,
         _error(place.focal_ratio, place.focal_deviation),
         _error(place.aspect_ratio, place.aspect_deviation),
-        float((np.ptp(ends, axis=0) / size).max()) if len(ends) else 0.0)
+        float((np.ptp(ends, axis=0) / size).max()) if len(ends) else 0.0,
+        min(1.0, place.apart))
 
 
 def chance_genuine(signs: Signs, motion: Motion | None = None,
