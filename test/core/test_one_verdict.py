@@ -95,6 +95,14 @@ def test_the_fewer_cells_match_the_farther_away_a_keyframe_must_be(apart, accept
     assert found.accepted == accepted
 
 
+@pytest.mark.parametrize(('apart', 'kind'), [
+    (0.0, RefusalKind.CHANGED), (0.9, None), (1.5, None)])
+def test_a_part_of_an_image_next_to_a_keyframe_may_be_a_picture(apart, kind):
+    found = ask(Says(place(3.0, confirmed=0.5, reach=0.5, apart=apart)), objects=0)
+    assert found.refusal_kind == kind
+    assert found.evidence.signs.apart == min(apart, 1.0)
+
+
 def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     strong, weak = ask(Says(place(0.05))), ask(Says(place(0.05, inliers=9)))
     assert strong.accepted and weak.accepted
@@ -124,6 +132,7 @@ def test_objects_never_take_from_keyframes(fields, mapped):
     found = relocalizer.relocalize([Observation(CAMERA, joined)], recognizer)
     assert found.confidence > alone.confidence - 1e-3 > 0.05, 'rivals from the boxes'
     assert found.evidence.likely > alone.evidence.likely - 1e-3
+    assert found.evidence.by_points > alone.evidence.by_points - 5e-3
     if mapped < 3 or fields['inliers'] > 12:  # else points do not determine the pose
         assert error_m(found, 0.003) < 1e-12
         np.testing.assert_array_equal(found.covariance, alone.covariance)

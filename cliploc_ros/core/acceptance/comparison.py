@@ -169,7 +169,8 @@ class Comparison:
                         if SAME_ANSWER.agree(contender.pose, other.pose)]
             proposed.append(contender._replace(
                 recognized=place, by_points=alone,
-                odds=max([alone + max(0.0, objects), *(odds + max(0.0, points) for odds in agreeing)])))
+                odds=max([alone + max(0.0, objects),
+                          *(odds + max(0.0, points) for odds in agreeing)])))
         return proposed
 
     def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
