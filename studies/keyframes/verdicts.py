@@ -124,7 +124,8 @@ def place_rows(case: StoredCase) -> list[Row]:
                 strict=True):
             rows.append(_row(case, record, place.map_from_camera, [
                 np.log(counted_points(place)), place.confirmed, min(1.0, place.apart),
-                max(0.0, place.apart - 2.0), min(most, contender.support.inliers), min(most, contender.support.unexplained)]))
+                max(0.0, place.apart - 2.0), min(most, contender.support.inliers),
+                min(most, contender.support.unexplained)]))
     return rows
 
 

@@ -177,7 +177,7 @@ def test_a_keyframe_near_a_guess_is_found_though_many_look_more_like_the_image(c
     assert place.keyframes == (18,)
 
 
-def test_the_covariance_of_a_place_has_the_errors_of_its_points_and_of_its_keyframes(corridor, rng):
+def test_the_covariance_of_a_place_has_the_errors_of_points_and_of_keyframes(corridor, rng):
     pixels, descriptors = features_at(corridor, 18)
     seen = Features(pixels + rng.normal(0.0, 1.0, pixels.shape), descriptors,
                     np.ones(len(pixels), np.float32))
@@ -205,7 +205,8 @@ def test_a_place_that_looks_alike_is_found_behind_many_keyframes_of_the_first(co
     pixels, descriptors = features_at(corridor, 0)
     seen = Features(pixels, descriptors, np.ones(POINTS, np.float32))
     places = KeyframeLocalizer(layer).localize_features(seen, CAMERA).places
-    assert [place.map_from_camera[0, 3] for place in places] == pytest.approx([0.1, 50.1], abs=0.01)
+    assert [place.map_from_camera[0, 3] for place in places] == pytest.approx(
+        [0.1, 50.1], abs=0.01)
     assert [place.inliers for place in places] == [POINTS, POINTS - 10]
 
 

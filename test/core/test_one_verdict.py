@@ -122,7 +122,7 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
 def test_objects_never_take_from_keyframes(fields, mapped):
     """Most objects of a room are never mapped; in this test their boxes fit nowhere."""
     corners = np.array([[x, y] for x in (10.0, 560.0) for y in (10.0, 220.0, 420.0)])
-    strangers = Detections(np.hstack([corners, corners + (25.0, 45.0)]), tuple('abcabc'),
+    strangers = Detections(np.hstack([corners, corners + np.array([25.0, 45.0])]), tuple('abcabc'),
                            np.full(6, 0.9))
     boxes = SEEN.select(np.arange(mapped))
     joined = Detections(np.vstack([boxes.bboxes_xyxy, strangers.bboxes_xyxy]),
