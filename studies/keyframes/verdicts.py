@@ -40,7 +40,7 @@ Floats = NDArray[np.float64]
 #: The families in which wrong places match by chance.
 BY_CHANCE = ('plain', 'image', 'other room', 'classes', 'features')
 #: Names in calibration.yaml of the fitted terms.
-POINTS = ('none', 'inliers', 'confirmed', 'explained', 'unexplained')
+POINTS = ('none', 'inliers', 'confirmed', 'apart', 'far', 'explained', 'unexplained')
 GENUINE = ('none', *Signs._fields)
 _UNTROUBLED = ('plain', 'image', 'classes', 'features')
 _WEIGHT = 5.5
@@ -123,8 +123,9 @@ def place_rows(case: StoredCase) -> list[Row]:
                 unrefined(place.map_from_camera) for place in places], [True] * len(places)),
                 strict=True):
             rows.append(_row(case, record, place.map_from_camera, [
-                np.log(counted_points(place)), place.confirmed,
-                min(most, contender.support.inliers), min(most, contender.support.unexplained)]))
+                np.log(counted_points(place)), place.confirmed, min(1.0, place.apart),
+                max(0.0, place.apart - 2.0), min(most, contender.support.inliers),
+                min(most, contender.support.unexplained)]))
     return rows
 
 

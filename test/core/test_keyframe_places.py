@@ -117,6 +117,7 @@ def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, mi
     for place, in (fast.places, localizer.localize_features(seen, CAMERA, fast=fast).places):
         assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
         assert (place.inliers, place.keyframes) == (30, (18,))
+        assert place.apart == pytest.approx(0.1 / 2.0, abs=1e-3)
         assert abs(place.focal_ratio - 1.0) <= 3.0 * place.focal_deviation < 0.1
 
 
@@ -174,6 +175,39 @@ def test_a_keyframe_near_a_guess_is_found_though_many_look_more_like_the_image(c
     assert localizer.localize_features(seen, CAMERA).places == ()
     place, = localizer.localize_features(seen, CAMERA, (guess,)).places
     assert place.keyframes == (18,)
+
+
+def test_the_covariance_of_a_place_has_the_errors_of_points_and_of_keyframes(corridor, rng):
+    pixels, descriptors = features_at(corridor, 18)
+    seen = Features(pixels + rng.normal(0.0, 1.0, pixels.shape), descriptors,
+                    np.ones(len(pixels), np.float32))
+    place, = KeyframeLocalizer(corridor).localize_features(seen, CAMERA).places
+    of_points = refine(place.points, CAMERA.normalize_points(place.pixels),
+                       invert_transform(place.map_from_camera)).covariance
+    # several keyframes show the same points, and nearby points share errors
+    np.testing.assert_allclose(place.covariance - place.shared, 4.5 ** 2 * of_points, rtol=0.02)
+    position, turn = place.shared[0, 0], place.shared[3, 3]
+    assert position == pytest.approx(0.012 ** 2 + (0.1 * corridor.deviation_per_metre) ** 2,
+                                     rel=0.3)
+    assert turn == pytest.approx(np.radians(0.45) ** 2, rel=0.3)
+
+
+@pytest.mark.parametrize('similar', [1, 5, 12])
+def test_a_place_that_looks_alike_is_found_behind_many_keyframes_of_the_first(corridor, similar):
+    """Only a keyframe at another place shows that the image has two answers."""
+    rows = np.concatenate([np.arange(POINTS)] * similar + [np.arange(POINTS - 10)])
+    poses = np.tile(np.eye(4), (similar + 1, 1, 1))
+    poses[-1, 0, 3] = 50.0
+    layer = replace(corridor, map_from_camera=poses, offsets=np.append(
+        np.arange(0, POINTS * similar + 1, POINTS), len(rows)), **{
+        name: getattr(corridor, name)[rows] for name in ('pixels', 'points', 'descriptors',
+                                                         'words')})
+    pixels, descriptors = features_at(corridor, 0)
+    seen = Features(pixels, descriptors, np.ones(POINTS, np.float32))
+    places = KeyframeLocalizer(layer).localize_features(seen, CAMERA).places
+    assert [place.map_from_camera[0, 3] for place in places] == pytest.approx(
+        [0.1, 50.1], abs=0.01)
+    assert [place.inliers for place in places] == [POINTS, POINTS - 10]
 
 
 def test_keyframes_know_what_is_inside_of_the_image(corridor):

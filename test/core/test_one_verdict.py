@@ -14,7 +14,7 @@ from cliploc_ros.core.fit.covariance import fuse
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 
@@ -81,10 +81,26 @@ def test_many_points_accept_what_objects_could_not():
 
 def test_points_of_a_thorough_search_count_less():
     """The thorough pass finds several times as many points, and so do places that look alike."""
-    fast, thorough = (ask(Says(place(3.0, inliers=50, confirmed=0.5, is_thorough=is_thorough)),
+    fast, thorough = (ask(Says(place(3.0, inliers=38, confirmed=0.5, is_thorough=is_thorough)),
                           objects=0) for is_thorough in (False, True))
     assert fast.accepted and not thorough.accepted
     assert ask(Says(place(3.0, is_thorough=True)), objects=0).accepted, 'more points suffice'
+
+
+@pytest.mark.parametrize(('apart', 'accepted'), [
+    (0.2, False), (1.0, True), (2.0, True), (4.0, False)])
+def test_the_fewer_cells_match_the_farther_away_a_keyframe_must_be(apart, accepted):
+    """Next to a keyframe, all of the image matches; from the opposite side, no feature does."""
+    found = ask(Says(place(3.0, inliers=40, confirmed=0.4, apart=apart)), objects=0)
+    assert found.accepted == accepted
+
+
+@pytest.mark.parametrize(('apart', 'kind'), [
+    (0.0, RefusalKind.CHANGED), (0.9, None), (1.5, None)])
+def test_a_part_of_an_image_next_to_a_keyframe_may_be_a_picture(apart, kind):
+    found = ask(Says(place(3.0, confirmed=0.5, reach=0.5, apart=apart)), objects=0)
+    assert found.refusal_kind == kind
+    assert found.evidence.signs.apart == min(apart, 1.0)
 
 
 def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
@@ -97,6 +113,36 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
         'only a pose from boxes checks the camera'
     points = ask(Says(place(0.05, inliers=9)), objects=0)
     assert weak.evidence.by_points <= points.evidence.by_points, 'objects add no more evidence'
+
+
+@pytest.mark.parametrize('mapped', [0, 2, 5])
+@pytest.mark.parametrize('fields', [
+    {'inliers': 30, 'confirmed': 0.9}, {'inliers': 175, 'confirmed': 0.6, 'reach': 0.5},
+    {'inliers': 12}], ids=['few points', 'a part of the image', 'too few points'])
+def test_objects_never_take_from_keyframes(fields, mapped):
+    """Most objects of a room are never mapped; in this test their boxes fit nowhere."""
+    corners = np.array([[x, y] for x in (10.0, 560.0) for y in (10.0, 220.0, 420.0)])
+    strangers = Detections(np.hstack([corners, corners + np.array([25.0, 45.0])]), tuple('abcabc'),
+                           np.full(6, 0.9))
+    boxes = SEEN.select(np.arange(mapped))
+    joined = Detections(np.vstack([boxes.bboxes_xyxy, strangers.bboxes_xyxy]),
+                        boxes.class_ids + strangers.class_ids, np.full(mapped + 6, 0.9))
+    recognizer, relocalizer = Says(place(0.003, **fields)), Relocalizer(ROOM, OPTIONS)
+    alone = ask(recognizer, objects=0)
+    found = relocalizer.relocalize([Observation(CAMERA, joined)], recognizer)
+    assert found.confidence > alone.confidence - 1e-3 > 0.05, 'rivals from the boxes'
+    assert found.evidence.likely > alone.evidence.likely - 1e-3
+    assert found.evidence.by_points > alone.evidence.by_points - 5e-3
+    if mapped < 3 or fields['inliers'] > 12:  # else points do not determine the pose
+        assert error_m(found, 0.003) < 1e-12
+        np.testing.assert_array_equal(found.covariance, alone.covariance)
+        assert not found.cameras
+
+
+def test_points_that_agree_by_chance_change_nothing():
+    likely = {ask(Says(place(inliers=inliers, confirmed=0.0)), objects=3).evidence.likely
+              for inliers in (6, 7, 8)}
+    assert len(likely) == 1 and likely.pop() < 0.9
 
 
 @pytest.mark.parametrize('cause', ['too few objects', 'a search cut short', 'earlier looks'])
@@ -186,6 +232,16 @@ def test_the_twin_of_a_place_without_keyframes_stays_a_rival(lacking):
     found = ask(Says(place(), covers=covers), room=two_rooms(lacking))
     assert not found.accepted
     assert found.refusal_kind == RefusalKind.LOOK_ALIKE
+
+
+@pytest.mark.parametrize(('covered', 'objects', 'is_sure'), [
+    (0.0, 0, True), (0.0, 12, False), (0.3, 12, False), (0.6, 12, True)])
+def test_objects_have_no_say_where_keyframes_tell_a_twin_apart(covered, objects, is_sure):
+    """Neither without a matched object, nor where keyframes cover enough of the twin."""
+    found = ask(Says(place(), covers=lambda pose: 1.0 if pose[0, 3] < 10.0 else covered),
+                objects=objects, room=two_rooms())
+    assert (found.evidence.distinct > 0.999) == is_sure
+    assert found.accepted or not is_sure
 
 
 @pytest.mark.parametrize('covers', [1.0, 0.1])

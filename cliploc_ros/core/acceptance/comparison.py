@@ -16,6 +16,7 @@ The search for it starts at reflections of the camera in planes through the matc
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -138,8 +139,10 @@ class Comparison:
     @property
     def by_boxes(self) -> Contender | None:
         """Return by_objects if the pose depends on its boxes; None if points determine it."""
-        return self.by_objects if self.place is None or (
-            self.place.inliers < CALIBRATION.keyframes.good_covariance) else None
+        is_sure = self.place is not None and (
+            self.place.inliers >= CALIBRATION.keyframes.good_covariance
+            or self._by_points >= self._joined.options.min_confidence)
+        return None if is_sure else self.by_objects
 
     def _confidences(self, rows: NDArray[np.int64], odds: Sequence[float]
                      ) -> NDArray[np.float64]:
@@ -151,7 +154,8 @@ class Comparison:
         """Return the places that keyframes recognize, as contenders.
 
         If the search of objects found a pose at the same place, the points add to its odds. They
-        never lower them: a dozen points agree by chance.
+        never lower them: a dozen points agree by chance. Objects never lower the odds of points
+        either: the objects that the pose does not explain may never have been mapped.
         """
         most = CALIBRATION.attitude.vertical_sigmas
         found = contenders_of(self._joined, [unrefined(place.map_from_camera)
@@ -164,45 +168,45 @@ class Comparison:
             agreeing = [other.odds for other in met
                         if SAME_ANSWER.agree(contender.pose, other.pose)]
             proposed.append(contender._replace(
-                recognized=place, by_points=alone + min(0.0, objects),
-                odds=max([alone + objects, *(odds + max(0.0, points) for odds in agreeing)])))
+                recognized=place, by_points=alone,
+                odds=max([alone + max(0.0, objects),
+                          *(odds + max(0.0, points) for odds in agreeing)])))
         return proposed
 
     def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pose (4, 4) of the leading place and its covariance (6, 6).
 
-        A pose from many points is returned unchanged, because objects are less accurate. The error
-        of a pose from few points may exceed its covariance. Its covariance is therefore increased,
-        and the pose is fused with that of the objects.
+        A pose that points alone confirm, or from many points, is returned unchanged, because
+        objects are less accurate. The error of a pose from few points may exceed its covariance.
+        Its covariance is therefore increased, and the pose is fused with that of the objects.
         """
-        found = None
-        if (best := self.by_objects) is not None:
-            joined, options = self._joined, self._joined.options
-            covariance = covariance_of(joined.frames, joined.rig, best.finalist,
-                                       joined.landmark_map.shared_sigmas,
-                                       options.mount_deviation, CALIBRATED)
-            if best.finalist.information is not None:
-                found_by_objects = [contender for contender in self.contenders
-                                    if contender.recognized is None]
-                found_by_objects.sort(key=lambda contender: contender is not best)
-                covariance = covariance + spread(
-                    np.array([contender.pose for contender in found_by_objects]),
-                    np.array([contender.odds for contender in found_by_objects]))
-            found = best.pose, covariance
-        if self._by_keyframes is None or self.place is None:
-            assert found is not None
-            return found
-        terms = CALIBRATION.keyframes
-        doubt = max(1.0, terms.good_covariance / self.place.inliers) ** terms.doubt_power
-        pose, covariance = self._by_keyframes.pose, doubt * self.place.covariance
-        return (pose, covariance) if found is None or doubt == 1.0 else fuse(*found, pose,
-                                                                             covariance)
+        best, by_points = self.by_boxes, None
+        if self._by_keyframes is not None and self.place is not None:
+            terms = CALIBRATION.keyframes
+            doubt = max(1.0, terms.good_covariance / self.place.inliers) ** terms.doubt_power
+            by_points = self._by_keyframes.pose, doubt * self.place.covariance
+            if best is None:
+                return by_points
+        assert best is not None
+        joined = self._joined
+        covariance = covariance_of(joined.frames, joined.rig, best.finalist,
+                                   joined.landmark_map.shared_sigmas,
+                                   joined.options.mount_deviation, CALIBRATED)
+        if best.finalist.information is not None:
+            found_by_objects = [contender for contender in self.contenders
+                                if contender.recognized is None]
+            found_by_objects.sort(key=lambda contender: contender is not best)
+            covariance = covariance + spread(
+                np.array([contender.pose for contender in found_by_objects]),
+                np.array([contender.odds for contender in found_by_objects]))
+        return (best.pose, covariance) if by_points is None else fuse(best.pose, covariance,
+                                                                      *by_points)
 
     def evidence(self, covariance: NDArray[np.float64]) -> Evidence:
         """Return the evidence for the leading pose, given its covariance (6, 6)."""
         best, frames = self.by_objects or self.contenders[0], self._joined.frames
-        coverage, by_points = coverage_of(frames), self._by_points()
-        distinct, twin = self._distinct()
+        coverage, by_points = coverage_of(frames), self._by_points
+        distinct, twin = self._distinct() if len(self.contenders[0].landmarks) else (1.0, None)
         return Evidence(
             round(best.support.inliers), float(self.likely[0]), by_points=by_points,
             rival=self._rival(), distinct=distinct,
@@ -231,7 +235,7 @@ class Comparison:
         if self.place is None:
             return None
         boxes = self._last.detections.bboxes_xyxy[[match.detection for match in best.matches[-1]]]
-        return signs_of(self.place, best.support, boxes, self._last.camera)
+        return signs_of(self.place, boxes, self._last.camera)
 
     def _motion(self) -> Motion | None:
         """Compare the motion since an earlier look by keyframes; None without such a look."""
@@ -277,6 +281,7 @@ class Comparison:
         return Rival(min(float(self.likely[row]), 1.0 - float(self.likely[0])), place.position,
                      place.name, same_source is None)
 
+    @cached_property
     def _by_points(self) -> float:
         """Return the probability of the leading place without the evidence of objects for it."""
         if self.place is None:
@@ -330,7 +335,8 @@ class Comparison:
         """Return the log odds (m,) by which keyframes prefer the leading place to each twin.
 
         They are no evidence against a twin in another room that they do not cover: it may show the
-        same points.
+        same points. The odds are infinite if points alone are enough to accept the leading place
+        against the twin: objects have no say then.
         """
         leading = self._by_keyframes
         if self._recognizer is None or self.place is None or leading is None:
@@ -341,7 +347,9 @@ class Comparison:
             points_utility(contender.recognized) for contender in self.contenders
             if contender.recognized is not None and SAME_ANSWER.agree(contender.pose, pose)])
             for pose in twins])
-        return np.maximum(0.0, known * max(0.0, points_utility(self.place)) - theirs)
+        leads = np.maximum(0.0, known * max(0.0, points_utility(self.place)) - theirs)
+        is_sure = 1.0 / (1.0 + np.exp(-leads)) >= self._joined.options.min_confidence
+        return np.where(is_sure, np.inf, leads)
 
 
 def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -292,10 +292,16 @@ def counted_points(place: RecognizedPlace, calibration: Calibration = CALIBRATIO
 
 
 def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
-    """Return the log odds of a recognized place by its points, against a chance agreement."""
+    """Return the log odds of a recognized place by its points, against a chance agreement.
+
+    A keyframe near the pose shows the same as the image: if few cells match there, the points are
+    a pattern that repeats elsewhere. From farther away, a right pose has fewer points. Features
+    do not match across much larger angles or distances.
+    """
     terms = calibration.keyframes
     return min(terms.most, terms.none + terms.confirmed * place.confirmed
-               + terms.inliers * math.log(counted_points(place, calibration)))
+               + terms.inliers * math.log(counted_points(place, calibration))
+               + terms.apart * min(1.0, place.apart) + terms.far * max(0.0, place.apart - 2.0))
 
 
 def objects_utility(support: Support, calibration: Calibration = CALIBRATION) -> float:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.acceptance.confidence import Support
 from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.camera import Camera
@@ -96,13 +95,14 @@ class Signs(NamedTuple):
     #: Extent of the agreeing points and boxes as a share of the image's width or height, whichever
     #: share is greater. A picture ends within the image.
     reach: float
-    #: Share of the detected objects of the map's classes that the pose does not explain
-    unexplained: float
+    apart: float  #: See RecognizedPlace, limited to 1: next to a keyframe, all surroundings match
 
 
-def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64],
-             camera: Camera) -> Signs:
+def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera) -> Signs:
     """Return the signs that a recognized place is genuine and unchanged.
+
+    Objects that the pose does not explain are no sign of a picture: most objects of a room are
+    never mapped.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def signs_of(place: RecognizedPlace, support: Support, boxes: NDArray[np.float64
         _error(place.focal_ratio, place.focal_deviation),
         _error(place.aspect_ratio, place.aspect_deviation),
         float((np.ptp(ends, axis=0) / size).max()) if len(ends) else 0.0,
-        support.unexplained / (support.unexplained + support.inliers + _TERMS.further_object))
+        min(1.0, place.apart))
 
 
 def chance_genuine(signs: Signs, motion: Motion | None = None,

@@ -334,7 +334,7 @@ class KeyframeLocalizer:
             look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
             tuple((counts[used] / counts.sum()).tolist()),
             look.features.pixels[place.inliers.features], place.inliers.rows, place.inliers.points,
-            is_thorough)
+            is_thorough, float(_distances(self.layer.map_from_camera[used], pose).min()))
 
     def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
         """Choose the keyframes to match: similar keyframes, and keyframes near the guesses."""
@@ -463,12 +463,17 @@ def _focal(place: _Place, look: _Look, used: NDArray[np.int64]
 
 def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the keyframes whose views overlap the view of a pose, the closest first."""
-    distances = np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1)
-    cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], guess[:3, :3]) - 1.0)
-    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-    costs = distances / NEAR_M + angles / NEAR_DEG
+    costs = _distances(poses, guess)
     order = np.argsort(costs, kind='stable')
     return np.asarray(order[costs[order] < 1.0])
+
+
+def _distances(poses: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far (k,) the views of poses are from that of a pose: see NEAR_M."""
+    metres = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
+    cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], pose[:3, :3]) - 1.0)
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    return np.asarray(metres / NEAR_M + angles / NEAR_DEG)
 
 
 def _project(points: NDArray[np.float64], pose: NDArray[np.float64], camera: Camera

@@ -46,6 +46,9 @@ class RecognizedPlace(NamedTuple):
     rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
     points: NDArray[np.float64] = np.empty((0, 3))  #: (k, 3): its position in the map [m]
     is_thorough: bool = False  #: Whether the thorough pass found the place
+    #: How far the view of the nearest keyframe with agreeing points is from the pose: the sum of
+    #: distance / 2 m and angle / 40 degrees
+    apart: float = 0.5
 
 
 class Recognition(NamedTuple):
