@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.offline.datasets.frames import Frames
-    from cliploc_ros.offline.make_map import Labeller, MadeMap
+    from cliploc_ros.offline.mapping.make_map import Labeller, MadeMap
     from cliploc_ros.offline.mapping.options import MappingOptions
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
@@ -97,8 +97,8 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import move_frames
-    from cliploc_ros.offline.make_map import find_labeller, update_map, write_made_map
     from cliploc_ros.offline.mapping.building import LEAST_EXPLAINED, MappingReport
+    from cliploc_ros.offline.mapping.make_map import find_labeller, update_map, write_made_map
 
     begin = time.monotonic()
     update, name = options.update, sources.source_of(options).name
@@ -194,8 +194,8 @@ def _make(options: argparse.Namespace, detections: 'PosedDetections', labeller: 
     either.
     """
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.offline.make_map import MadeMap, make_map
     from cliploc_ros.offline.mapping.building import MappingReport
+    from cliploc_ros.offline.mapping.make_map import MadeMap, make_map
 
     failure = None
     with command.StageBar() as bar:
@@ -260,7 +260,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
     import numpy as np
 
     from cliploc_ros.cli.sources import metres_of
-    from cliploc_ros.offline.make_map import scale_of_objects
+    from cliploc_ros.offline.mapping.make_map import scale_of_objects
     from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 
     scale, rotation = 1.0, np.eye(3)
