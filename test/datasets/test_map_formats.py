@@ -60,21 +60,30 @@ def import_all(given: GivenMap, placement=HERE):
     return place(given, 'a test', *placement)
 
 
-def check_equal(imported, true_map):
-    assert imported.left_out == ()
-    found = imported.landmark_map
+VASE = (('book', 0.75), ('vase', 0.25))
+
+
+@pytest.mark.parametrize(('read', 'name', 'content', 'weights', 'support', 'note'), [
+    (read_goreloc, 'm.objects', goreloc_file, VASE, None, ''),
+    (read_oaslam, 'm.txt', oaslam_text, None, None, 'a monocular map of OA-SLAM has no metric'),
+    (read_oaslam, 'map_m.mapobjects', lambda given: oaslam_files(given)[0], None, 4,
+     'a monocular map'),
+    # quaternions are w, x, y, z; signs of radii mean nothing; shares are not likelihoods
+    (read_msgloc, 'm.json', msgloc_text, VASE, None, '4 landmarks')])
+def test_maps_of_other_systems(true_map, tmp_path, read, name, content, weights, support, note):
+    path = write(tmp_path / name, content(true_map))
+    if support:
+        with pytest.raises(DatasetError, match='objecttracks'):
+            read(path, COCO)
+        write(path.with_suffix('.objecttracks'), oaslam_files(true_map)[1])
+    found, left_out, notes = import_all(read(path, COCO))
+    assert left_out == () and ''.join(notes).startswith(note)
+    assert found.landmark_ids == ('cup_0', 'book_1', 'chair_2', 'cup_3')
     assert found.class_ids == true_map.class_ids
     np.testing.assert_allclose(found.centers, true_map.centers, atol=1e-5)
     np.testing.assert_allclose(shapes(found), shapes(true_map), atol=1e-5)
-    assert {detail.source for detail in found.details} == {'a test'}
-
-
-def test_goreloc(true_map, tmp_path):
-    path = write(tmp_path / 'm.objects', goreloc_file(true_map))
-    imported = import_all(read_goreloc(path, COCO))
-    check_equal(imported, true_map)
-    assert imported.landmark_map.landmark_ids == ('cup_0', 'book_1', 'chair_2', 'cup_3')
-    assert imported.landmark_map.details[0].class_weights == (('cup', 0.75), ('vase', 0.25))
+    detail = found.details[1]
+    assert (detail.source, detail.class_weights, detail.support) == ('a test', weights, support)
 
 
 def test_what_the_file_does_not_know_of_its_errors_is_given(true_map, tmp_path):
@@ -87,32 +96,6 @@ def test_what_the_file_does_not_know_of_its_errors_is_given(true_map, tmp_path):
     assert (known.position_sigma, known.shared_sigma) == (0.1, None)
     assert {(other.position_sigma, other.shared_sigma, other.shared_sigma_deg)
             for other in others} == {(0.05, 0.05, 1.0)}
-
-
-def test_oaslam_text(true_map, tmp_path):
-    imported = import_all(read_oaslam(write(tmp_path / 'm.txt', oaslam_text(true_map)), COCO))
-    check_equal(imported, true_map)
-    assert 'has no metric scale' in imported.notes[0]
-
-
-def test_oaslam_saved_map(true_map, tmp_path):
-    objects, tracks = oaslam_files(true_map)
-    path = write(tmp_path / 'map_m.mapobjects', objects)
-    with pytest.raises(DatasetError, match='objecttracks'):
-        read_oaslam(path, COCO)
-    write(tmp_path / 'map_m.objecttracks', tracks)
-    imported = import_all(read_oaslam(path, COCO))
-    check_equal(imported, true_map)
-    assert [detail.support for detail in imported.landmark_map.details] == [4] * 4
-
-
-def test_msgloc(true_map, tmp_path):
-    """Quaternions are w, x, y, z; signs of radii mean nothing; shares are not likelihoods."""
-    imported = import_all(read_msgloc(write(tmp_path / 'm.json', msgloc_text(true_map)), COCO))
-    check_equal(imported, true_map)
-    assert imported.landmark_map.details[1].class_weights == (('book', 0.75), ('vase', 0.25))
-    (note,) = imported.notes
-    assert note.startswith('4 landmarks')
 
 
 @pytest.mark.parametrize('encoding', [
