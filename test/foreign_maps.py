@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets.map_formats.given_map import COCO
+from studies.foreign_maps import COCO
 
 HEADER = 'id,label,class_id,x,y,z,a,b,c,qx,qy,qz,qw'
 

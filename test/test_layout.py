@@ -41,7 +41,7 @@ LAYERS = (
     ('offline.mapping',),
     ('offline.datasets',),
     ('offline.recording',),
-    ('offline.make_map',),
+    ('offline.mapping.make_map',),
     ('offline.evaluation',),
     ('offline.replay',),
     ('offline.studio',),

@@ -10,7 +10,7 @@ from scene import CAMERA, make_room
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.offline.datasets.map_recording import MapRecording
-from cliploc_ros.offline.make_map import MadeMap, write_made_map
+from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
 
 ROOM = make_room()
 

@@ -25,11 +25,9 @@ if TYPE_CHECKING:
 
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.offline.datasets.frames import Frames
-    from cliploc_ros.offline.make_map import Labeller, MadeMap
-    from cliploc_ros.offline.mapping.building import MappingReport
-    from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
+    from cliploc_ros.offline.mapping.make_map import Labeller, MadeMap
+    from cliploc_ros.offline.mapping.options import MappingOptions
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-    from cliploc_ros.offline.mapping.update.updating import UpdateReport
 
 # Options of the check after a build: with fewer views, it takes seconds instead of a minute.
 _QUICK = ('--positions', '25', '--headings', '6', '--frames', '30')
@@ -37,13 +35,8 @@ EPILOG = """\
 examples:
   build_map --bag drive --out office.yaml
   build_map --bag drive --cameras front left back --map-frame map --out office.yaml
-  build_map --rgbd kitchen --model yolov8n.pt --no-clip --out kitchen.yaml
-  build_map --observations office.npz --out office.yaml
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
-  build_map --observations office.npz --out office.yaml --vocabulary our_things.yaml
-  build_map --folder phone_scan --out office.yaml
   build_map --colmap office --known-distance a.jpg b.jpg 1.5 --level --out office.yaml
-  build_map --observations office.npz --out office.yaml --every 5 --report office.json
   build_map --rgbd kitchen --level --out kitchen.yaml --no-keyframe-layer
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
 """
@@ -104,27 +97,16 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import move_frames
-    from cliploc_ros.offline.make_map import find_labeller, update_map, write_made_map
-    from cliploc_ros.offline.mapping.options import (
-        MOVING_CLASSES,
-        MappingOptions,
-        OdometryErrors,
-    )
+    from cliploc_ros.offline.mapping.building import LEAST_EXPLAINED, MappingReport
+    from cliploc_ros.offline.mapping.make_map import find_labeller, update_map, write_made_map
 
     begin = time.monotonic()
-    path, update, name = options.out, options.update, sources.source_of(options).name
+    update, name = options.update, sources.source_of(options).name
     _check(options)
     if update is not None and not len(LandmarkMap.from_file(update)):
         raise OptionsError(f'--update {update}: is a map of keyframes alone, which cannot be '
                            'updated; build a new one')
-    mapping = MappingOptions(
-        pose_errors=_pose_errors(options), estimate_pose_errors=options.joint is None,
-        odometry_errors=OdometryErrors(*options.odometry_noise or ()),
-        refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
-        min_baseline_deg=options.min_baseline, frame_id=options.frame_id,
-        source=f'build_map {name}', random_seed=options.seed,
-        moving_classes=MOVING_CLASSES if options.moving is None else tuple(
-            filter(None, map(str.strip, options.moving.split(',')))))
+    mapping = _mapping_options(options, f'build_map {name}')
     source = sources.read_source(options)
     _tell_misspelt(mapping.moving_classes, source.recorded.detections.class_names)
     detections, scale, rotation = _placed(source.recorded.detections, options, mapping)
@@ -134,32 +116,64 @@ def build(options: argparse.Namespace) -> int:
         detections = detections.select_frames(range(0, len(detections), options.every))
     clip = partial(sources.clip_options, options) if options.clip else None
     labeller = find_labeller(detections, clip, options.vocabulary)
-    layer, note, is_poor = None, '', False
-    if update is None:
-        frames = source.frames and move_frames(source.frames, scale, rotation)
-        made, layer, note = _make(options, detections, labeller, mapping, frames)
-        path, is_poor = _place_of(options.out, made.report)
-        lines = made.report.lines()
-        head = [f'built by build_map from {name}', *lines[:2]]
-        if made.mount is not None:
-            lines.append(_mount_option(options, made.mount.given_from_corrected))
-    else:
-        if layer_path(update).exists():
-            note = ('the new map has no keyframes, which need all images: it localizes by objects '
-                    'alone; build a new map to have both')
-        with _reporting_failure(options.report):
+    layer, note = None, ''
+    with _report_to(options.report) as report:
+        if update is None:
+            frames = source.frames and move_frames(source.frames, scale, rotation)
+            made, layer, note = _make(options, detections, labeller, mapping, frames)
+        else:
+            if layer_path(update).exists():
+                note = ('the new map has no keyframes, which need all images: it localizes by '
+                        'objects alone; build a new map to have both')
             made = update_map(update, detections, labeller, mapping)
-        _write_report(options.report, made.report.as_dict())
-        lines = made.report.lines()
-        head = [f'{update.name}, updated by build_map from {name}', lines[0]]
+        report |= made.report.as_dict()
+    lines = made.report.lines()
+    head = [f'built by build_map from {name}', *lines[:2]] if update is None else [
+        f'{update.name}, updated by build_map from {name}', lines[0]]
+    if made.mount is not None:
+        lines.append(_mount_option(options, made.mount.given_from_corrected))
+    is_poor = isinstance(made.report, MappingReport) and made.report.landmarks > 0 and (
+        made.report.explained_of_classes < LEAST_EXPLAINED)
+    path = options.out.with_stem(f'{options.out.stem}.refused') if is_poor else options.out
     lines += write_made_map(path, replace(made, layer=layer), head, sources.recording_of(
         options, source.file, scale, rotation), update)
     print('\n'.join(lines))
     for text in filter(None, (labeller.note, note)):
         print(f'note: {text}')
     print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
-    _check_map(path, options.check)
-    return _refuse(options.out, path) if is_poor else 0
+    try:
+        if options.check:
+            check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]))
+    except CliplocError as error:  # the map is kept
+        print(f'note: not checked: {error}')
+    print(f'to correct it: studio {path}')
+    if is_poor:
+        print(f'refused: the map explains too few of the boxes of its classes: {options.out} is '
+              f'not written; look at {path.name}; check the camera first, then stamps, then '
+              'poses, then the objects')
+    return int(is_poor)
+
+
+def _mapping_options(options: argparse.Namespace, source: str) -> 'MappingOptions':
+    """Return the options of mapping; source is the origin that the map names."""
+    from cliploc_ros.offline.mapping.options import (
+        MOVING_CLASSES,
+        MappingOptions,
+        OdometryErrors,
+        PoseErrors,
+    )
+
+    sigma_m, sigma_deg = options.pose_noise or (0.02, 0.5)
+    errors = PoseErrors(sigma_m, sigma_deg, options.pose_correlation)
+    return MappingOptions(
+        pose_errors=errors if options.joint or options.pose_noise else None,
+        estimate_pose_errors=options.joint is None,
+        odometry_errors=OdometryErrors(*options.odometry_noise or ()),
+        refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
+        min_baseline_deg=options.min_baseline, frame_id=options.frame_id, source=source,
+        random_seed=options.seed,
+        moving_classes=MOVING_CLASSES if options.moving is None else tuple(
+            filter(None, map(str.strip, options.moving.split(',')))))
 
 
 def _tell_misspelt(moving: Sequence[str], seen: Sequence[str]) -> None:
@@ -171,14 +185,6 @@ def _tell_misspelt(moving: Sequence[str], seen: Sequence[str]) -> None:
         print(f"note: --moving: no box is of class '{name}'{hint}", flush=True)
 
 
-def _refuse(out: Path, written: Path) -> int:
-    """Say that a map is too poor; return the exit code."""
-    print(f'refused: the map explains too few of the boxes of its classes: {out} is not written; '
-          f'look at {written.name}; check the camera first, then stamps, then poses, then the '
-          'objects')
-    return 1
-
-
 def _make(options: argparse.Namespace, detections: 'PosedDetections', labeller: 'Labeller',
           mapping: 'MappingOptions', frames: 'Frames | None'
           ) -> 'tuple[MadeMap, KeyframeLayer | None, str]':
@@ -188,82 +194,63 @@ def _make(options: argparse.Namespace, detections: 'PosedDetections', labeller: 
     either.
     """
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.offline.make_map import MadeMap, make_map
     from cliploc_ros.offline.mapping.building import MappingReport
+    from cliploc_ros.offline.mapping.make_map import MadeMap, make_map
 
     failure = None
-    with command.StageBar() as bar, _reporting_failure(options.report):
+    with command.StageBar() as bar:
         try:
             made = make_map(detections, labeller, mapping, progress=bar.show)
         except MappingError as error:
+            if frames is None or options.keyframe_layer is False:
+                raise
             failure = error
             made = MadeMap(LandmarkMap.empty(options.frame_id),
                            MappingReport.of_nothing(detections, error))
-            if frames is None or options.keyframe_layer is False:
-                raise
         layer, note = map_layer.make_layer(options, frames, made.landmark_map)
         if failure is not None and layer is None:
             raise failure
-    _write_report(options.report, made.report.as_dict())
     return made, layer, note
 
 
-def _place_of(path: Path, report: 'MappingReport | UpdateReport') -> tuple[Path, bool]:
-    """Return the path to write a map to, and whether it is too poor to replace another one."""
-    from cliploc_ros.offline.mapping.building import LEAST_EXPLAINED, MappingReport
-
-    is_poor = isinstance(report, MappingReport) and report.landmarks > 0 and (
-        report.explained_of_classes < LEAST_EXPLAINED)
-    return path.with_name(f'{path.stem}.refused{path.suffix}') if is_poor else path, is_poor
-
-
 @contextmanager
-def _reporting_failure(path: Path | None) -> Iterator[None]:
-    """Write a report of a MappingError, with its reason and the landmarks that were left out."""
-    from cliploc_ros.offline.mapping.building import NothingFoundError
+def _report_to(path: Path | None) -> Iterator[dict[str, Any]]:
+    """Write the report that the caller fills, or the reason of a MappingError, if a path is given.
 
-    try:
-        yield
-    except MappingError as error:
-        left_out = error.left_out if isinstance(error, NothingFoundError) else ()
-        _write_report(path, {'failure': str(error),
-                             'left_out': [asdict(landmark) for landmark in left_out]})
-        raise
-
-
-def _write_report(path: Path | None, report: dict[str, Any]) -> None:
-    """Write a report if a path is given, and print the path."""
+    The report of a failure also has the landmarks that were left out.
+    """
     from cliploc_ros.files.storage import write_text
 
-    if path is not None:
-        write_text(path, json.dumps(report, indent=1))
-        print(f'report: {path}', flush=True)
-
-
-def _check_map(path: Path, wanted: bool) -> None:
-    """Check the map that was written; it is kept if it cannot be checked."""
+    report: dict[str, Any] = {}
     try:
-        if wanted:
-            check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]))
-    except CliplocError as error:
-        print(f'note: not checked: {error}')
-    print(f'to correct it: studio {path}')
+        yield report
+    except MappingError as error:
+        left_out = getattr(error, 'left_out', ())
+        report |= {'failure': str(error), 'left_out': [asdict(landmark) for landmark in left_out]}
+        raise
+    finally:
+        if path is not None and report:
+            write_text(path, json.dumps(report, indent=1))
+            print(f'report: {path}', flush=True)
 
 
 def _check(options: argparse.Namespace) -> None:
     """Refuse an unwritable output and conflicting options, before any work is done."""
     command.check_output(options.out)
     map_layer.check_layer_options(options)
-    if options.level and options.update is not None:
-        raise OptionsError('--level is for new maps, not for --update')
-    if options.object_size is not None and (options.scale or options.known_distance
-                                            or options.update is not None):
-        raise OptionsError('--object-size is not for --scale, --known-distance or --update')
-    if options.refine_mount and options.update is not None:
-        raise OptionsError('--refine-mount is for new maps, not for --update')
-    if options.refine_mount and len(options.cameras) > 1:
-        raise OptionsError('--refine-mount is for one camera: correct each with a map of '
-                           '--cameras NAME alone')
+    is_update = options.update is not None
+    for is_wrong, text in (
+            (options.level and is_update, '--level is for new maps, not for --update'),
+            (options.object_size and (options.scale or options.known_distance or is_update),
+             '--object-size is not for --scale, --known-distance or --update'),
+            (options.refine_mount and is_update,
+             '--refine-mount is for new maps, not for --update'),
+            (options.refine_mount and len(options.cameras) > 1, '--refine-mount is for one '
+             'camera: correct each with a map of --cameras NAME alone'),
+            (options.joint is False and options.pose_noise,
+             '--pose-noise is for --joint, not for --no-joint')):
+        if is_wrong:
+            raise OptionsError(text)
 
 
 def _placed(detections: 'PosedDetections', options: argparse.Namespace,
@@ -273,7 +260,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
     import numpy as np
 
     from cliploc_ros.cli.sources import metres_of
-    from cliploc_ros.offline.make_map import scale_of_objects
+    from cliploc_ros.offline.mapping.make_map import scale_of_objects
     from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
 
     scale, rotation = 1.0, np.eye(3)
@@ -293,20 +280,6 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
         print(f'a unit is {scale:.5g} m, by {objects} objects of class {class_name}', flush=True)
         detections = detections.moved(scale, np.eye(3))
     return detections, scale, rotation
-
-
-def _pose_errors(options: argparse.Namespace) -> 'PoseErrors | None':
-    """Return the errors of the poses; None if unknown, or if the poses are not to be refined."""
-    from cliploc_ros.offline.mapping.options import PoseErrors
-
-    if options.joint is False:
-        if options.pose_noise is not None:
-            raise OptionsError('--pose-noise is for --joint, not for --no-joint')
-        return None
-    if options.joint is None and options.pose_noise is None:
-        return None
-    sigma_m, sigma_deg = options.pose_noise or (0.02, 0.5)
-    return PoseErrors(sigma_m, sigma_deg, options.pose_correlation)
 
 
 def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]') -> str:

@@ -1,36 +1,31 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The executable ``import_map``: convert a map of another system, or a table, to a map file."""
+"""The executable ``import_map``: convert a table of ellipsoids to a map file."""
 
 import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.command import check_output, finite, option, positive, printable, run_main
 from cliploc_ros.errors import DatasetError, OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.offline.datasets.map_formats.given_map import GivenMap
+    from cliploc_ros.offline.datasets.given_map import GivenMap
 
-_FORMATS = ('msgloc', 'goreloc', 'oaslam', 'csv')
 _LEFT_OUT_SHOWN = 10
 # [m] [deg]. Chosen so that 0.95 of the poses lie in their 95 % ellipsoid on the map of TUM fr3, if
 # the landmarks are displaced by 5 cm on each axis, independently or together, or enlarged by 1.25.
 _ERRORS = (0.05, 1.0)
 EPILOG = """\
-formats:
-  msgloc    a JSON file with nodes
-  goreloc   NAME.objects
-  oaslam    map_objects_NAME.txt, or map_NAME.mapobjects next to map_NAME.objecttracks
-  csv       columns class_id x y z a b c, and optional ones; see doc/mapping.md
+columns: class_id x y z a b c, and optional ones; see doc/mapping.md
 
 examples:
-  import_map --from msgloc walk.json --out walk.yaml
-  import_map --from goreloc map.objects --refit office.npz --out office.yaml
-  import_map --from oaslam map_objects.txt --scale 2.31 --transform 0 0 1.2 -0.5 0.5 -0.5 0.5 \\
+  import_map office.csv --out office.yaml
+  import_map slam.csv --scale 2.31 --transform 0 0 1.2 -0.5 0.5 -0.5 0.5 \\
              --refit office.npz --out office.yaml
 """
 
@@ -40,18 +35,17 @@ def main(args: Sequence[str] | None = None) -> int:
     return run_main(make_parser(), import_map, args)
 
 
-def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
+def make_parser(formats: Sequence[str] = ('csv',)) -> argparse.ArgumentParser:
+    """Return the parser of the command line, with the formats of the input."""
     parser = argparse.ArgumentParser(
         prog='import_map', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Import a map of another system. An existing map is replaced only when the '
-        'new one is complete. Needs no sourced ROS.')
+        description='Import a map from a table. An existing map is replaced only when the new one '
+        'is complete. Needs no sourced ROS.')
     option(parser, 'input IN', 'the file to import')
-    option(parser, '--from', 'its format', dest='format', choices=_FORMATS, required=True)
+    option(parser, '--from', 'its format (%(default)s)', dest='format', choices=formats,
+           default=formats[0])
     option(parser, '--out YAML', 'the map to write', required=True)
     option(parser, '--report JSON', 'also write what was left out, and why')
-    option(parser, '--class-names FILE', 'a file with one class name per line, for formats with '
-           'class indices (COCO)')
     place = parser.add_argument_group('coordinate frame and errors of the map')
     option(place, '--frame-id', 'coordinate frame of the map (%(default)s)', default='map')
     option(place, '--scale METRES', 'length of a unit of the file in metres (%(default)s)',
@@ -68,13 +62,14 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def import_map(options: argparse.Namespace) -> int:
-    """Import the map that the command line names; return the exit code."""
+def import_map(options: argparse.Namespace,
+               read: 'Callable[[Path], GivenMap] | None' = None) -> int:
+    """Import the map that the command line names; return the exit code. Default: read a table."""
     # Imported late, so that --help is fast.
     from cliploc_ros.core.keyframes.layer import layer_path, removed_layer
     from cliploc_ros.core.map.map_file import write_map
     from cliploc_ros.files.storage import write_text
-    from cliploc_ros.offline.datasets.map_formats.given_map import place, refit
+    from cliploc_ros.offline.datasets.given_map import place, read_table, refit
     from cliploc_ros.offline.datasets.map_recording import recording_path
     from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
@@ -86,7 +81,7 @@ def import_map(options: argparse.Namespace) -> int:
         map_from_given = mount_from_numbers(options.transform)
     except DatasetError as error:
         raise OptionsError(f'--transform: {error}') from error
-    given = _read(options)
+    given = (read or read_table)(options.input)
     try:
         imported = place(given, f'import_map {options.format} {options.input.name}',
                          options.frame_id, options.scale, map_from_given,
@@ -127,24 +122,9 @@ def _check_paths(options: argparse.Namespace) -> None:
         if path is None:
             continue
         check_output(path)
-        for other in (options.input, options.refit, options.class_names):
+        for other in (options.input, options.refit):
             if other is not None and path.exists() and other.exists() and path.samefile(other):
                 raise OptionsError(f'--{name} {path} is an input; name another file')
-
-
-def _read(options: argparse.Namespace) -> 'GivenMap':
-    """Read the input file in its format."""
-    from cliploc_ros.offline.datasets.map_formats import given_map
-    from cliploc_ros.offline.datasets.map_formats.quadric_maps import read_goreloc, read_oaslam
-
-    if options.format == 'csv':
-        if options.class_names is not None:
-            raise OptionsError('--class-names is not for csv, whose column class_id has names')
-        return given_map.read_table(options.input)
-    names = (given_map.COCO if options.class_names is None
-             else given_map.read_class_names(options.class_names))
-    readers = {'msgloc': given_map.read_msgloc, 'goreloc': read_goreloc, 'oaslam': read_oaslam}
-    return readers[options.format](options.input, names)
 
 
 if __name__ == '__main__':

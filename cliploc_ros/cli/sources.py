@@ -100,7 +100,7 @@ def read_source(options: argparse.Namespace) -> Source:
     """
     if options.bag is None and (options.odometry_topic or options.odometry_frame):
         raise OptionsError('--odometry-topic and --odometry-frame are for --bag')
-    camera_names(options)
+    _mounts(options)
     check_folder_options(options)
     find_topics(options, options.bag)
     if options.observations is not None:
@@ -211,22 +211,17 @@ def read_cameras(options: argparse.Namespace, gap_s: float | None = None, *,
     return {'': rgbd_frames(path, folder) if key == 'rgbd' else read_folder(path, folder)}
 
 
-def camera_names(options: argparse.Namespace) -> list[str]:
-    """Return the names of the cameras of a bag; [''] for one without a name.
+def _mounts(options: argparse.Namespace) -> dict[str, NDArray[np.float64] | None]:
+    """Return the mount (4, 4) of each camera by its name; None if it is not given.
 
-    OptionsError: a name is given twice, or the source is not a bag.
+    The name is '' for a single camera. OptionsError: a name is given twice, the source is not a
+    bag, or the numbers of --mount are not those of the cameras.
     """
-    names: list[str] = options.cameras
+    names, numbers = options.cameras, options.mount
     if len(set(names)) < len(names):
         raise OptionsError(f'--cameras {" ".join(names)}: names a camera twice')
     if names != [''] and options.bag is None:
         raise OptionsError('--cameras is for --bag')
-    return names
-
-
-def _mounts(options: argparse.Namespace) -> dict[str, NDArray[np.float64] | None]:
-    """Return the mount (4, 4) of each camera by its name; None if it is not given."""
-    names, numbers = camera_names(options), options.mount
     if numbers is None:
         return dict.fromkeys(names)
     if len(numbers) != 7 * len(names):
@@ -252,6 +247,39 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
         raise DatasetError(f"camera '{name}': {error}") from error
 
 
+def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
+                gap_ns: int) -> bag_poses.ReadPoses:
+    """Return a reader of the poses of a camera of a bag; gap_ns is for poses of a topic."""
+    given = [name for name in ('--pose-topic', '--map-frame', '--trajectory')
+             if getattr(options, name[2:].replace('-', '_')) is not None]
+    max_gap_ns = round(options.max_gap * NS_PER_S)
+    tolerance_ns = round(options.stamp_tolerance * NS_PER_S)
+    several = len(options.cameras) > 1
+    for is_wrong, text in (
+            (len(given) > 1, f'{", ".join(given)}: give only one source of poses'),
+            (not given and mount is not None,
+             '--mount is for --pose-topic and --trajectory: name one of them'),
+            (options.trajectory and mount is None and several,
+             '--trajectory of several cameras: give the --mount of each'),
+            (options.map_frame and mount is not None,
+             '--mount is not for --map-frame: tf has the mount'),
+            (options.map_frame and options.camera_frame and several,
+             '--camera-frame is for one camera: with several, the images name the frames')):
+        if is_wrong:
+            raise OptionsError(text)
+    if options.pose_topic is not None:
+        return _poses_of_topic(options, options.pose_topic, camera, mount, gap_ns)
+    if options.map_frame is not None:
+        return bag_poses.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns,
+                                     options.tf)
+    if options.trajectory is not None:
+        poses = replace(read_tum_trajectory(options.trajectory), max_gap_ns=max_gap_ns,
+                        body_from_camera=mount, tolerance_ns=tolerance_ns)
+        return lambda reader, camera_frame: poses
+    return bag_poses.find_poses(max_gap_ns, bag_frames.topic_of(camera, bag_poses.GROUND_TRUTH),
+                                options.camera_frame, gap_ns, tolerance_ns, options.tf)
+
+
 def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
                     mount: NDArray[np.float64] | None, gap_ns: int) -> bag_poses.ReadPoses:
     """Return a reader of a topic, which is in the camera's namespace if there is no mount."""
@@ -260,51 +288,19 @@ def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
         round(options.stamp_tolerance * NS_PER_S), options.tf)
 
 
-def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
-                gap_ns: int) -> bag_poses.ReadPoses:
-    """Return a reader of the poses of a camera of a bag; gap_ns is for poses of a topic."""
-    given = [name for name in ('pose_topic', 'map_frame', 'trajectory')
-             if getattr(options, name) is not None]
-    max_gap_ns = round(options.max_gap * NS_PER_S)
-    if len(given) > 1:
-        raise OptionsError(f'{", ".join("--" + name.replace("_", "-") for name in given)}: '
-                           'give only one source of poses')
-    if not given:
-        if mount is not None:
-            raise OptionsError('--mount is for --pose-topic and --trajectory: name one of them')
-        truth = bag_frames.topic_of(camera, bag_poses.GROUND_TRUTH)
-        return bag_poses.find_poses(max_gap_ns, truth, options.camera_frame, gap_ns,
-                                     round(options.stamp_tolerance * NS_PER_S), options.tf)
-    if options.pose_topic is not None:
-        return _poses_of_topic(options, options.pose_topic, camera, mount, gap_ns)
-    if options.trajectory is not None:
-        if mount is None and len(options.cameras) > 1:
-            raise OptionsError('--trajectory of several cameras: give the --mount of each')
-        poses = replace(read_tum_trajectory(options.trajectory), max_gap_ns=max_gap_ns,
-                        body_from_camera=mount,
-                        tolerance_ns=round(options.stamp_tolerance * NS_PER_S))
-        return lambda reader, camera_frame: poses
-    if mount is not None:
-        raise OptionsError('--mount is not for --map-frame: tf has the mount')
-    if options.camera_frame is not None and len(options.cameras) > 1:
-        raise OptionsError('--camera-frame is for one camera: with several, the images name the '
-                           'frames')
-    return bag_poses.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns, options.tf)
-
-
 def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
     """Return the odometry of each camera of a bag, by name; None if no option names any."""
-    max_gap_ns = round(options.max_gap * NS_PER_S)
-    if options.odometry_frame is None and options.odometry_topic is None:
+    topic, max_gap_ns = options.odometry_topic, round(options.max_gap * NS_PER_S)
+    if options.odometry_frame is None and topic is None:
         return None
-    if options.odometry_topic is not None and options.map_frame is not None:
+    if topic is not None and options.map_frame is not None:
         raise OptionsError('--odometry-topic needs a --mount, which is not for --map-frame: give '
                            '--odometry-frame')
     return {name: bag_poses.bag_odometry(
         options.bag, bag_frames.topic_of(name, options.image),
-        _poses_of_topic(options, options.odometry_topic, name, mount, max_gap_ns)
-        if options.odometry_frame is None else bag_poses.poses_of_tf(
-            options.odometry_frame, options.camera_frame, max_gap_ns, options.tf))
+        _poses_of_topic(options, topic, name, mount, max_gap_ns) if topic is not None
+        else bag_poses.poses_of_tf(options.odometry_frame, options.camera_frame, max_gap_ns,
+                                   options.tf))
         for name, mount in _mounts(options).items()}
 
 

@@ -39,7 +39,7 @@ def table(office, tmp_path_factory):
 
 def test_refits_to_a_recording(import_map, office, table, observations, tmp_path):
     out, report = tmp_path / 'map.yaml', tmp_path / 'map.json'
-    done = import_map('--from', 'csv', table, '--refit', observations, '--out', out,
+    done = import_map(table, '--refit', observations, '--out', out,
                       '--report', report, '--frame-id', 'world')
     assert done.returncode == 0, done.stderr
     found = LandmarkMap.from_file(out)
@@ -61,7 +61,7 @@ def test_refits_to_a_recording(import_map, office, table, observations, tmp_path
 
 def test_keeps_what_cannot_be_fitted_where_asked_for(import_map, table, observations, tmp_path):
     out = tmp_path / 'map.yaml'
-    done = import_map('--from', 'csv', table, '--refit', observations, '--out', out,
+    done = import_map(table, '--refit', observations, '--out', out,
                       '--keep-unsupported')
     assert done.returncode == 0, done.stderr
     found = LandmarkMap.from_file(out)

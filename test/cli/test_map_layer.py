@@ -14,7 +14,7 @@ from cliploc_ros.core.keyframes.layer import load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.datasets.map_recording import MapRecording
-from cliploc_ros.offline.make_map import MadeMap, write_made_map
+from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 WALK = ['--tum', str(ASSETS / 'mapping')]

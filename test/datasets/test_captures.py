@@ -27,8 +27,8 @@ from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
-from cliploc_ros.offline.make_map import scale_of_objects
 from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.make_map import scale_of_objects
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.recording.networks import RunNetworks
 from cliploc_ros.offline.recording.recorder import (

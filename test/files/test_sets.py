@@ -35,7 +35,7 @@ from cliploc_ros.offline.datasets.map_recording import (
     load_recording,
     recording_path,
 )
-from cliploc_ros.offline.make_map import MadeMap, write_made_map
+from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
 from cliploc_ros.offline.studio.document import Document
 
 PROJECT = Path(__file__).resolve().parents[2]

@@ -28,7 +28,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays, read_case
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.models.label_embeddings import LabelCache
-from cliploc_ros.offline.datasets.map_formats.given_map import read_msgloc, read_table
+from cliploc_ros.offline.datasets.given_map import read_table
 from cliploc_ros.offline.datasets.map_recording import load_recording
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.datasets.parsing import Fields
@@ -37,7 +37,6 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 LABELS = ['a mug', 'a book']
 TABLE = 'id,class_id,x,y,z,a,b,c\n' + ''.join(
     f'cup_{row},cup,{row}.5,1,2,.1,.1,.2\n' for row in range(8))
-NODES = {'nodes': [{'id': row, 'class': 'cup', 'position': [row, 1.0, 2.0]} for row in range(8)]}
 
 
 def labels(path):
@@ -64,7 +63,6 @@ def sound(tmp_path_factory):
     LabelCache(folder / 'cache').store('key', LABELS, rows)
     next((folder / 'cache').iterdir()).rename(folder / 'labels.npz')
     (folder / 'table.csv').write_text(TABLE)
-    (folder / 'nodes.json').write_text(json.dumps(NODES))
     (folder / 'camera.json').write_text(json.dumps({'width': 640, 'k': [1.0] * 9}))
     return folder
 
@@ -74,7 +72,7 @@ FORMATS = {
     'a.keyframes.npz': lambda path: load_layer_of_map(path, ROOM), 'case.npz': read_case,
     'labels.npz': labels, 'a.yaml': LandmarkMap.from_file,
     'a.recording.json': lambda path: load_recording(path.with_name('a.yaml')),
-    'table.csv': read_table, 'nodes.json': partial(read_msgloc, class_names=['cup']),
+    'table.csv': read_table,
     'camera.json': lambda path: Fields.of_file(path).numbers('k', (9,))}
 
 

@@ -24,10 +24,10 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import MappingError, ModelError
-from cliploc_ros.offline.make_map import find_labeller, make_map, update_map
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
+from cliploc_ros.offline.mapping.make_map import find_labeller, make_map, update_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.pose_noise import _sample
 from cliploc_ros.offline.mapping.views import make_views, number_viewpoints, thin_out

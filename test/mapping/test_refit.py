@@ -144,6 +144,10 @@ BACK = BOTTLE, (0.0, 0.0, 1.0), (0.2, 0.2, 0.2)
 TABLE = BOOK, (0.0, 0.0, 0.6), (0.5, 0.4, 0.3)
 LEFT = BOOK, (-0.1, 0.0, 0.8), (0.1, 0.1, 0.3)
 RIGHT = BOOK, (0.1, 0.0, 0.8), (0.2, 0.1, 0.1)
+# .27 m apart on the line of sight of frames 0 to 5 and 30 to 41: their boxes overlap there
+NEAR = BOOK, (0.135, 0.0, 0.8), (0.2, 0.2, 0.3)
+FAR = BOOK, (-0.135, 0.0, 0.8), (0.2, 0.2, 0.3)
+IN_LINE = (FRAMES < 6) | ((FRAMES > 29) & (FRAMES < 42))
 CUP_ON_TABLE = CUP, (0.1, 0.0, 0.85), (0.06, 0.06, 0.08)
 
 
@@ -191,6 +195,8 @@ SCENES = {
     'side by side': ([(*LEFT, ALWAYS), (*RIGHT, ALWAYS)], [{BOOK: 1.0}, {BOOK: 1.0}]),
     'side by side, two names': ([(*LEFT, ALWAYS), (*under(CUP, RIGHT), ALWAYS)],
                                 [{BOOK: 1.0}, {CUP: 1.0}]),
+    'apart from 6 viewpoints, else one behind the other': (
+        [(*NEAR, ALWAYS), (*FAR, IN_LINE | (FRAMES // 6 == 3))], [{BOOK: 1.0}, {BOOK: 1.0}]),
 }
 
 
@@ -209,6 +215,14 @@ def test_what_the_images_show_at_once_is_two(things, expected):
         assert dict(built.details[row].class_weights or {built.class_ids[row]: 1.0}
                     ) == pytest.approx(weights, abs=0.15)
     assert not any(pair.is_duplicate for pair in overlaps_of(built, detections))
+
+
+def test_one_object_whose_boxes_split_at_times_is_one():
+    """A detector gives a chair two boxes; in 4 of 60 frames they are its upper and lower half."""
+    is_split = FRAMES // 4 == 5
+    halves = [(BOOK, (0.0, 0.0, height), (0.25, 0.25, 0.2)) for height in (0.6, 1.0)]
+    seen = watch((*CHAIR, ~is_split), (*CHAIR, ~is_split), *((*half, is_split) for half in halves))
+    assert build_map(seen).landmark_map.centers == pytest.approx(np.array([CHAIR[1]]), abs=0.02)
 
 
 def overlaps_of(landmark_map, detections=None):

@@ -394,6 +394,12 @@ def test_a_landmark_that_is_never_seen_is_removed_or_named():
     assert 'it is kept' in one.evidence
     assert any(line.startswith('doubtful: thing_0') for line in rarely.report.lines())
     assert rarely.landmark_map.details[0].seen_ratio < 0.1
+    # a new object of its class is the landmark within 1.5 m only
+    for place, fate in (((0.16, 0.12, 0.8), 'moved'), ((0.32, 0.24, 0.8), 'doubtful')):
+        walk, truth = see_rows(join_maps(things, moved(things.select([0]), {0: place})), POSES,
+                               missed=0.4)
+        report = update_map(things, walk.select_boxes((truth != 0) | (walk.frames < 2))).report
+        assert ids(getattr(report, fate)) == {'thing_0'}
 
 
 def test_an_object_that_comes_back_gets_its_id_back():

@@ -35,6 +35,11 @@ _LEAST_LIFT, _LEAST_SHARE = 1 / 3, 0.15
 # the images of both. All values are guesses that separate the doubles from the neighbours of four
 # rooms and TUM fr3.
 _LEAST_STEADY = 0.3
+# Two boxes of one image are apart if they share less than the first share of the smaller one. Two
+# objects are apart from at least this number of viewpoints, and in at least the next share of the
+# images that show the less frequent of the two, even if they hide each other in all other images.
+# Chosen: on TUM fr3, two landmarks of one object are apart from at most one viewpoint.
+_APART_SHARE, _LEAST_APART, _LEAST_APART_SHARE = 0.5, 5.0, 0.05
 # Landmarks of one object are fitted together, unless the mean IoU of their boxes drops by more.
 _MERGE_LOSS = 0.1
 
@@ -83,10 +88,12 @@ def relation(views: Views, landmarks: Landmarks, rows_of: Sequence[NDArray[np.in
     is_within = ~is_one & (shared > _WITHIN_SHARE * small) & (small > _THING_SHARE * large)
     # the errors of frames of one viewpoint are correlated
     together = views.weights[common]
-    one, within, beside = (together @ mask for mask in (is_one, is_within, ~is_one & ~is_within))
+    one, within, beside, apart = (together @ mask for mask in (
+        is_one, is_within, ~is_one & ~is_within, shared < _APART_SHARE * small))
     small_within = together @ (is_within & (small < _PART_SHARE * large))
     rates, total = _rates_in_view(views, landmarks, rows_of, pair)
-    if ((beside > one and beside * total > _LEAST_LIFT * rates.prod())
+    if (apart >= max(_LEAST_APART, _LEAST_APART_SHARE * rates.min())
+            or (beside > one and beside * total > _LEAST_LIFT * rates.prod())
             or (beside > one + within and beside > _LEAST_SHARE * rates.min())
             or beside + small_within > _LEAST_STEADY * total):
         return Relation.TWO

@@ -29,50 +29,51 @@ _FEW_FRAMES, _MANY_UNEXPLAINED = 12, 0.12
 # A wrong pose within this distance of the pose that a look-alike implies is due to the look-alike
 # [m]. Chosen.
 _SAME_POSE_M = 1.0
+# The remedy for each cause of a systematic error of the boxes.
+_REMEDIES = {
+    'intrinsics': 'calibrate the camera and map again',
+    'mount': 'measure how the camera is mounted on the robot',
+    'stamps': 'check the clock and the delay of the images'}
 # Distance from which a camera sees a place: twice the radius of a place [m].
 _SIGHT_M = 2.0 * RADIUS_M
-_NUMBERS = ('no', 'one', 'two', 'three', 'four', 'five', 'six', 'seven', 'eight', 'nine', 'ten')
 
 
 def give_advice(report: CheckReport) -> list[Advice]:
     """Return pieces of advice, each of one or two sentences."""
     advice = [*_on_scale(report), *_on_look_alikes(report), *_on_landmarks(report),
-              *_on_corrections(report),
-              *_on_misled(report), *_on_spans(report), *_on_grid(report)]
+              *_on_corrections(report), *_on_misled(report), *_on_spans(report),
+              *_on_grid(report)]
     return advice or [Advice('nothing to do: the map reaches all thresholds that were checked')]
 
 
 def _on_scale(report: CheckReport) -> Iterator[Advice]:
     if report.scale is not None:
-        too = 'large' if report.scale > 1.0 else 'small'
         yield Advice(f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
-                     f'{too} by the sizes of its objects: check the unit of the poses, then the '
-                     'intrinsics')
+                     f'{"large" if report.scale > 1.0 else "small"} by the sizes of its objects: '
+                     'check the unit of the poses, then the intrinsics')
 
 
 def _some(advice: Sequence[Advice], what: str) -> list[Advice]:
     """Return the first pieces of advice, and how many more there are."""
-    more = [Advice(f'and {len(advice) - _MOST_OF_A_KIND} more {what}')]
-    return [*advice[:_MOST_OF_A_KIND], *(more if len(advice) > _MOST_OF_A_KIND else [])]
+    more = len(advice) - _MOST_OF_A_KIND
+    return [*advice[:_MOST_OF_A_KIND], *[Advice(f'and {more} more {what}')] * (more > 0)]
 
 
 def _on_look_alikes(report: CheckReport) -> list[Advice]:
     texts = []
-    for one in report.look_alikes:
-        matched = len(one.matched)
-        told_apart = ('their labels are equal, so nothing tells them apart: map an object that '
-                      'only one of them has, or describe what differs') \
-            if one.same_labels == matched else (
-            f'{_count(matched - one.same_labels)} labels differ: make sure that they are right')
-        mistaken = sum(_takes_for(trial, one) for trial in _misled(report))
-        distance_m = np.hypot(one.first[0] - one.second[0], one.first[1] - one.second[1])
-        alike = (f'the place around {_place(one.first)} looks the same when turned by '
-                 f'{abs(one.turn_deg):.0f} degrees') if distance_m < _SAME_POSE_M else (
-            f'the places around {_place(one.first)} and {_place(one.second)} look alike')
-        texts.append(Advice(
-            f'{alike} ({matched} of {one.landmarks} landmarks)'
-            + (f', and {mistaken} of the checked views are accepted in the wrong one'
-               if mistaken else '') + f': {told_apart}', one.matched[0] if one.matched else ()))
+    for pair in report.look_alikes:
+        matched = len(pair.matched)
+        what_to_do = ('their labels are equal, so nothing tells them apart: map an object that '
+                      'only one of them has') if pair.same_labels == matched else (
+            f'{matched - pair.same_labels} labels differ: make sure that they are right')
+        mistaken = sum(_takes_for(trial, pair) for trial in _misled(report))
+        distance_m = np.hypot(pair.first[0] - pair.second[0], pair.first[1] - pair.second[1])
+        alike = (f'the place around {_place(pair.first)} looks the same when turned by '
+                 f'{abs(pair.turn_deg):.0f} degrees') if distance_m < _SAME_POSE_M else (
+            f'the places around {_place(pair.first)} and {_place(pair.second)} look alike')
+        views = f', {mistaken} views are accepted in the wrong one' if mistaken else ''
+        texts.append(Advice(f'{alike} ({matched} of {pair.landmarks} landmarks){views}: '
+                            f'{what_to_do}', pair.matched[0] if pair.matched else ()))
     return _some(texts, 'pairs of places that look alike')
 
 
@@ -98,27 +99,19 @@ def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
 
 
 def _on_corrections(report: CheckReport) -> Iterator[Advice]:
-    found = [one for one in (report.recording.corrections if report.recording else ())
-             if one.is_significant]
+    found = [result for result in (report.recording.corrections if report.recording else ())
+             if result.is_significant]
     if not found:
         return
-    what = {'intrinsics': 'calibrate the camera and map again',
-            'mount': 'measure how the camera is mounted on the robot',
-            'stamps': 'check the clock and the delay of the images'}
-    best = max(found, key=lambda one: one.explained)
     # only one cause of one camera: its error makes other causes look wrong, too
-    cause, of_best = best.cause, [one for one in found if (one.cause, one.explained) == (
-        best.cause, best.explained)]
-    numbers = [f'{one.name} by {one.value:+.2f} {one.unit} (± {one.deviation:.2f})'
-               for one in sorted(of_best, key=lambda one: -one.effect_px)]
-    left = sorted({one.cause for one in found if not one.follows} - {cause})
-    follow = sorted({one.cause for one in found if one.follows} - {cause, *left})
-    then = f'; after that, {" and ".join(what[one] for one in left)}' if left else ''
-    if follow:
-        then += f'; only if that was right, look at the {" and the ".join(follow)}'
-    place = ' in its camera_info or camera file' if cause == 'intrinsics' else ''
-    yield Advice(f'{what[cause]}: the boxes fit better if you change {", ".join(numbers)}{place}'
-                 f'{then}')
+    best = max(found, key=lambda result: result.explained)
+    changes = ', '.join(
+        f'{result.name} by {result.value:+.2f} {result.unit} (± {result.deviation:.2f})'
+        for result in sorted(found, key=lambda result: -result.effect_px)
+        if (result.cause, result.explained) == (best.cause, best.explained))
+    others = sorted({result.cause for result in found} - {best.cause})
+    then = f'; check again before you change the {" or the ".join(others)}' if others else ''
+    yield Advice(f'{_REMEDIES[best.cause]}: the boxes fit better if you change {changes}{then}')
 
 
 def _on_misled(report: CheckReport) -> Iterator[Advice]:
@@ -133,60 +126,44 @@ def _on_misled(report: CheckReport) -> Iterator[Advice]:
 
 
 def _on_spans(report: CheckReport) -> Iterator[Advice]:
-    if report.recording is None:
-        return
-    sides: list[list[list[Trial]]] = []  # runs of the same side are reported once
-    for run in refused_spans(report.recording.trials):
-        if len(run) < _MIN_SPAN:
+    """Yield advice on runs of refused frames, once for each side of a place."""
+    trials = report.recording.trials if report.recording else ()
+    middles: list[Trial] = []
+    for run in refused_spans(trials):
+        middle, seen = run[len(run) // 2], int(np.median([trial.landmarks for trial in run]))
+        if len(run) < _MIN_SPAN or middle.stamp_s is None or any(
+                np.linalg.norm(middle.position - other.position) < RADIUS_M
+                and middle.forward @ other.forward > _ONE_SIDE for other in middles):
             continue
-        same = next((side for side in sides if _is_one_side(side[0], run)), None)
-        if same is None:
-            sides.append([run])
-        else:
-            same.append(run)
-    for side in sides[:_MOST_OF_A_KIND]:
-        run = side[0]
-        seen, halfway = int(np.median([trial.landmarks for trial in run])), run[len(run) // 2]
-        if run[0].stamp_s is None or run[-1].stamp_s is None:
-            continue
-        if seen > _FEW_LANDMARKS and _sees_double(halfway.position, report):
-            continue
-        first = report.recording.trials[0].stamp_s or 0.0
-        middle = 0.5 * (run[0].stamp_s + run[-1].stamp_s) - first
-        center = np.mean([trial.position for trial in run], axis=0)
-        what = 'record this side' if seen <= _FEW_LANDMARKS else (
-            'describe these objects better in their labels, or record this side again')
-        frames = f'{len(run)} frames' if len(side) == 1 else (
-            f'{sum(map(len, side))} frames of {len(side)} passes, most')
-        yield Advice(f'{what}: {frames} at {middle:.0f} s, around {_place(center)} '
-                     f'looking {_heading(halfway)}, show {_landmarks(seen)} and none is accepted',
-                     view=halfway)
-
-
-def _is_one_side(first: Sequence[Trial], second: Sequence[Trial]) -> bool:
-    """Return whether two runs of frames look in the same direction at nearly the same place."""
-    one, other = first[len(first) // 2], second[len(second) // 2]
-    return bool(np.linalg.norm(one.position - other.position) < RADIUS_M
-                and one.forward @ other.forward > _ONE_SIDE)
+        middles.append(middle)
+        if len(middles) > _MOST_OF_A_KIND:
+            return
+        if seen <= _FEW_LANDMARKS or not _sees_double(middle.position, report):
+            what = 'record this side' if seen <= _FEW_LANDMARKS else (
+                'describe these objects better in their labels, or record this side again')
+            yield Advice(
+                f'{what}: {len(run)} frames at {middle.stamp_s - (trials[0].stamp_s or 0.0):.0f} '
+                f's, around {_place(middle.position)} looking {_heading(middle)}, show {seen} '
+                'landmarks and none is accepted', view=middle)
 
 
 def _on_grid(report: CheckReport) -> Iterator[Advice]:
     """Yield advice on areas without an accepted heading, and on those without a keyframe."""
-    grid = report.grid
+    grid, keyframes = report.grid, report.keyframes
     for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
         if np.mean([_sees_double(position, report) for position in grid.positions[rows]]) <= 0.5:
-            best = int(grid.visible[rows].max())
-            fullest = int(rows[0] * grid.headings + grid.visible[rows[0]].argmax())
-            reached = report.keyframes is not None and (report.keyframes.headings[rows] > 0).all()
-            yield Advice(f'no heading is accepted by objects at {_area(grid, rows)}'
-                         f'{", only keyframes reach them" if reached else ""}: a view from there '
-                         f'shows {_landmarks(best)} at most; map more objects that can be seen '
-                         'from there', view=grid.trials[fullest])
-    if report.keyframes is not None:
+            reached = keyframes is not None and (keyframes.headings[rows] > 0).all()
+            yield Advice(
+                f'no heading is accepted by objects at {_area(grid, rows)}'
+                f'{", only keyframes reach them" if reached else ""}: a view from there shows '
+                f'{int(grid.visible[rows].max())} landmarks at most; map more objects that can '
+                'be seen from there',
+                view=grid.trials[int(rows[0] * grid.headings + grid.visible[rows[0]].argmax())])
+    if keyframes is not None:
         yield from _some([
             Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when you '
                    'record again, or rely on the landmarks')
-            for rows in _areas(grid, report.keyframes.without)], 'areas that no keyframe reaches')
+            for rows in _areas(grid, keyframes.without)], 'areas that no keyframe reaches')
 
 
 def _misled(report: CheckReport) -> list[Trial]:
@@ -240,11 +217,3 @@ def _place(point: NDArray[np.float64] | tuple[float, ...]) -> str:
 def _heading(trial: Trial) -> str:
     """Describe the heading of a camera as an angle from the map's x axis."""
     return f'to {np.degrees(np.arctan2(trial.forward[1], trial.forward[0])):.0f} degrees'
-
-
-def _count(number: int) -> str:
-    return _NUMBERS[number] if 0 <= number < len(_NUMBERS) else str(number)
-
-
-def _landmarks(number: int) -> str:
-    return f'{_count(number)} landmark{"" if number == 1 else "s"}'

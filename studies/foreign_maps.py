@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read maps of dual quadrics: those of GOReloc, and both formats of OA-SLAM.
+"""Import a map of GOReloc, OA-SLAM or MSG-Loc: ``python -m studies.foreign_maps --help``.
 
 | file | content |
 |---|---|
@@ -10,11 +10,14 @@
 | map_objects_NAME.txt (both) | a line for each object: track id, category, dual quadric |
 | map_NAME.mapobjects (OA-SLAM) | repeated mapobject = 1 {ellipsoid = 1, track id = 2} |
 | map_NAME.objecttracks | next to it: repeated track = 1 {id = 1, category = 2, boxes = 8} |
+| NAME.json (MSG-Loc) | a list of nodes, see read_msgloc |
 
 The format of OA-SLAM is taken from its source code; no saved map was available. A monocular map
 has no metric scale, and its coordinate frame is that of the first camera: z forward, y down.
 """
 
+import argparse
+import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,11 +25,22 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.cli import import_map
+from cliploc_ros.command import option, run_main
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.map_formats import given_map
-from cliploc_ros.offline.datasets.parsing import naming, parse_all
+from cliploc_ros.offline.datasets.given_map import (
+    MAX_LENGTH,
+    GivenLandmark,
+    GivenMap,
+    Skipped,
+    make_id,
+    read_bytes,
+)
+from cliploc_ros.offline.datasets.parsing import FieldError, Fields, naming, parse_all
+from cliploc_ros.offline.vocabulary.vocabulary import coco_classes
 
+COCO = coco_classes()
 _MAX_ASYMMETRY = 1e-3
 _LEAST_SCALE = 1e-9
 _NOTE = ('a monocular map of OA-SLAM has no metric scale, and its axes are those of the first '
@@ -35,6 +49,13 @@ _NUMBERS_IN_A_LINE = 18
 _NO_DETAILS = LandmarkDetails()
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _MAX_VARINT_BYTES = 10
+# A map file holds four decimals of a weight; classes with a smaller share are dropped.
+_LEAST_SHARE = 0.001
+_NUMBER_OF_SYMBOL = (1 << 56) - 1
+# Where a node has only likelihoods, classes below this share of the greatest are left out. Not
+# measured.
+_LEAST_LIKELIHOOD = 0.5
+_MOST_SHARE = 1e300  # sums of larger numbers are infinite
 
 
 class QuadricError(Exception):
@@ -45,33 +66,33 @@ class WireError(Exception):
     """A protocol buffer is invalid; the caller adds the name of the file."""
 
 
-def read_goreloc(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
+def read_goreloc(path: Path, class_names: Sequence[str]) -> GivenMap:
     """Read the objects of a GOReloc map, NAME.objects.
 
     Class weights are proportional to the counts of an object's categories. Objects without a
     category, or that are not ellipsoids, are left out. `class_names` has the name of each category
     index. DatasetError: the message names the file and its fault.
     """
-    given = given_map.GivenMap([], [], [])
+    given = GivenMap([], [], [])
     with naming(path, WireError, what='is not a complete NAME.objects of GOReloc: '):
         for item in _messages(path):
             number, quadric = _integer(item, 2), _quadric(item)
             categories, counts = _integers(item, 3), _integers(item, 4)
             if len(categories) != len(counts) or not sum(counts):
-                given.left_out.append(given_map.Skipped(
+                given.left_out.append(Skipped(
                     f'object {number}',
                     f'it has {len(categories)} categories with the counts {counts[:5]}'))
                 continue
             votes: Counter[str] = Counter()
             for category, count in zip(categories, counts, strict=True):
-                votes[given_map.class_name(class_names, category)] += count
-            weights = given_map.shares(votes)
+                votes[class_name(class_names, category)] += count
+            weights = shares(votes)
             _add(given, weights[0][0], number, quadric, LandmarkDetails(
                 class_weights=weights if len(weights) > 1 else None), f'object {number}')
     return given
 
 
-def read_oaslam(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
+def read_oaslam(path: Path, class_names: Sequence[str]) -> GivenMap:
     """Read the objects of an OA-SLAM map.
 
     DatasetError: the message names the file and its fault.
@@ -85,10 +106,10 @@ def read_oaslam(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
     """
     if path.suffix == '.mapobjects':
         return _read_saved_map(path, class_names)
-    given = given_map.GivenMap([], [], [_NOTE])
+    given = GivenMap([], [], [_NOTE])
     with naming(path, UnicodeDecodeError, what='is neither a map_objects_NAME.txt of OA-SLAM nor '
                 'a saved map, which ends in .mapobjects: '):
-        lines = given_map.read_bytes(path).decode('ascii').splitlines()
+        lines = read_bytes(path).decode('ascii').splitlines()
     for line_number, line in enumerate(lines, 1):
         words = line.split()
         if not words:
@@ -98,16 +119,16 @@ def read_oaslam(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
         if len(words) != _NUMBERS_IN_A_LINE:
             raise DatasetError(f'{where}, not {line[:40]!r}')
         track, category = parse_all(words[:2], int, where)
-        _add(given, given_map.class_name(class_names, category), track,
+        _add(given, class_name(class_names, category), track,
              parse_all(words[2:], float, where))
     return given
 
 
-def _read_saved_map(path: Path, class_names: Sequence[str]) -> given_map.GivenMap:
+def _read_saved_map(path: Path, class_names: Sequence[str]) -> GivenMap:
     tracks_path = path.with_suffix('.objecttracks')
     if not tracks_path.is_file():
         raise DatasetError(f'{tracks_path} is missing: it holds the classes of {path.name}')
-    given = given_map.GivenMap([], [], [_NOTE])
+    given = GivenMap([], [], [_NOTE])
     broken = 'is not a complete map of OA-SLAM: '
     with naming(tracks_path, WireError, what=broken):
         # category and number of keyframes of each track
@@ -117,27 +138,27 @@ def _read_saved_map(path: Path, class_names: Sequence[str]) -> given_map.GivenMa
         for item in _messages(path):
             track, quadric = _integer(item, 2), _quadric(item)
             if track not in tracks:
-                given.left_out.append(given_map.Skipped(
+                given.left_out.append(Skipped(
                     f'track {track}', f'{tracks_path.name} has no such track, so the class is '
                     'unknown'))
                 continue
             category, support = tracks[track]
-            _add(given, given_map.class_name(class_names, category), track, quadric,
+            _add(given, class_name(class_names, category), track, quadric,
                  LandmarkDetails(support=support))
     return given
 
 
-def _add(given: given_map.GivenMap, name: str, number: int, quadric: list[float],
+def _add(given: GivenMap, name: str, number: int, quadric: list[float],
          details: LandmarkDetails = _NO_DETAILS, shown: str = '') -> None:
     """Add an object to a map, or to the objects left out if it is not an ellipsoid."""
-    landmark_id = given_map.make_id(name, number)
+    landmark_id = make_id(name, number)
     try:
         ellipsoid = decompose(quadric)
     except QuadricError as error:
-        given.left_out.append(given_map.Skipped(shown or landmark_id, str(error)))
+        given.left_out.append(Skipped(shown or landmark_id, str(error)))
     else:
         given.landmarks.append(
-            given_map.GivenLandmark(landmark_id, name, name, *ellipsoid, details))
+            GivenLandmark(landmark_id, name, name, *ellipsoid, details))
 
 
 def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[float]]:
@@ -167,6 +188,131 @@ def decompose(numbers: list[float]) -> tuple[list[float], list[float], list[floa
             Rotation.from_matrix(axes).as_quat().tolist())
 
 
+def read_class_names(path: Path) -> tuple[str, ...]:
+    """Read a text file with one class name per line.
+
+    DatasetError: the message names the file and the line to correct.
+    """
+    with naming(path, UnicodeDecodeError, what='not a text file in UTF-8: '):
+        lines = read_bytes(path).decode('utf-8-sig').splitlines()
+    names = tuple(line.strip() for line in lines)
+    for number, name in enumerate(names, 1):
+        if not name or len(name) > MAX_LENGTH:
+            raise DatasetError(f'{path}: line {number} must be a class name; give one per line')
+    return names
+
+
+def class_name(names: Sequence[str], index: int) -> str:
+    """Return the name of a class; DatasetError: the list of names has no such index."""
+    if not 0 <= index < len(names):
+        raise DatasetError(f'class index {index} is not among {len(names)} names; give the names '
+                           'of the classes that the map was made with: `class_names`')
+    return names[index]
+
+
+def shares(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
+    """Return classes with their shares, the greatest first; shares up to 0.001 are dropped."""
+    least = _LEAST_SHARE * sum(weights.values())
+    ranked = sorted(((name, weight) for name, weight in weights.items() if weight > least),
+                    key=lambda pair: -pair[1])
+    total = sum(weight for _, weight in ranked)
+    return tuple((name, weight / total) for name, weight in ranked)
+
+
+def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
+    """Read a map of MSG-Loc: JSON with a list of nodes.
+
+    | field of a node | content |
+    |---|---|
+    | id | a symbol of GTSAM: the letter q in the highest byte, and a number |
+    | translation, radii | centre and semi-axes; the signs of radii are ignored |
+    | orientation | quaternion w, x, y, z |
+    | baseline_label | class to [share of the detections by score, ...] |
+    | msgloc_label | class to [likelihood]: how often the class was proposed by the detector |
+
+    Class weights are the shares of the detections. For a node without shares, likelihoods are
+    used: they sum to more than 1, and show which classes the detector confuses. DatasetError: the
+    message names the file and its fault.
+
+    Parameters
+    ----------
+    path : Path
+        A JSON file.
+    class_names : sequence of str
+        Names of the class indices; a file may also name classes.
+    """
+    given = GivenMap([], [], [])
+    negative = 0
+    content = Fields.of_file(path, read_bytes)
+    if not isinstance(content.values.get('nodes'), list):
+        raise DatasetError(f"{path}: is not a map of MSG-Loc: it has no list 'nodes'")
+    for place, values in enumerate(content.entries('nodes')):
+        try:
+            node = Fields(values, f'node {place}')
+            given.landmarks.append(_landmark_of_node(node, place, class_names))
+            negative += any(radius < 0.0 for radius in node.values['radii'])
+        except FieldError as error:
+            reason = str(error).removeprefix(f'node {place}: ')
+            given.left_out.append(Skipped(f'node {place}', reason))
+    if negative:
+        given.notes.append(f'{negative} landmarks have negative radii; their signs are ignored')
+    return given
+
+
+def _landmark_of_node(node: Fields, place: int, class_names: Sequence[str]) -> GivenLandmark:
+    center, radii = (node.numbers(name, (3,)).tolist() for name in ('translation', 'radii'))
+    w, x, y, z = node.numbers('orientation', (4,)).tolist()
+    weights = _class_weights(node, class_names)
+    number = node.values.get('id', place)
+    if not isinstance(number, int):
+        raise FieldError(f"{node.where}: 'id' is {str(number)[:40]!r}, not an integer")
+    name = weights[0][0]
+    return GivenLandmark(
+        make_id(name, number & _NUMBER_OF_SYMBOL), name, name, center,
+        [abs(radius) for radius in radii], (x, y, z, w),
+        LandmarkDetails(class_weights=weights if len(weights) > 1 else None))
+
+
+def _class_weights(node: Fields, class_names: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Return the classes of a node with their shares, the greatest first."""
+    weights = shares(_labels(node, 'baseline_label', class_names))
+    if not weights:
+        likely = _labels(node, 'msgloc_label', class_names)
+        least = _LEAST_LIKELIHOOD * max(likely.values(), default=0.0)
+        weights = shares({name: value for name, value in likely.items() if value >= least})
+    if not weights:
+        raise FieldError(f"{node.where}: has no class: neither 'baseline_label' nor "
+                         "'msgloc_label'")
+    return weights
+
+
+def _labels(node: Fields, field: str, class_names: Sequence[str]) -> Mapping[str, float]:
+    """Return the first number of each class in a field."""
+    found: dict[str, float] = {}
+    for key, values in node.mapping(field).items():
+        where = f"{node.where}: '{field}' of class {key[:40]!r}"
+        first = Fields({'share': values[0] if isinstance(values, list) and values else None},
+                       where).number('share')
+        if not 0.0 <= first < _MOST_SHARE:
+            raise FieldError(f'{where} is {first:g}, expected 0 or more')
+        name = _name_of(key, class_names, where)
+        found[name] = found.get(name, 0.0) + first
+    return found
+
+
+def _name_of(key: str, class_names: Sequence[str], where: str) -> str:
+    """Return the class of a key, which is an index written as a float, or a name."""
+    try:
+        index = float(key)
+    except ValueError:
+        if not key.strip() or len(key) > 1000:
+            raise FieldError(f'{where}: the class has no name') from None
+        return key
+    if not index.is_integer():
+        raise FieldError(f'{where}: the class is not an index')
+    return class_name(class_names, int(index))
+
+
 # ---- protocol buffers ---------------------------------------------------------------------------
 #
 # A message is a sequence of fields. A field begins with a varint, 8 * number + wire type; the wire
@@ -178,7 +324,7 @@ _Fields = Mapping[int, list[int | memoryview]]
 
 def _messages(path: Path, is_strict: bool = True) -> Iterator[_Fields]:
     """Yield the messages in field 1 of a file; WireError: a strict file has other fields."""
-    fields = _fields(memoryview(given_map.read_bytes(path)))
+    fields = _fields(memoryview(read_bytes(path)))
     for number in fields:
         if is_strict and number != 1:
             raise WireError(f'field {number} is unknown')
@@ -268,3 +414,24 @@ def _read_varint(data: memoryview, place: int) -> tuple[int, int]:
         if byte < 0x80:
             return value, place
     raise WireError(f'byte {place}: a number has more than {_MAX_VARINT_BYTES} bytes')
+
+
+READERS = {'goreloc': read_goreloc, 'oaslam': read_oaslam, 'msgloc': read_msgloc}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Import a map as ``import_map`` does; return the exit code."""
+    parser = import_map.make_parser(tuple(READERS))
+    parser.prog, parser.epilog = 'studies.foreign_maps', None
+    option(parser, '--class-names FILE', 'a file with one class name per line, for class indices '
+           '(COCO)')
+
+    def run(options: argparse.Namespace) -> int:
+        names = COCO if options.class_names is None else read_class_names(options.class_names)
+        return import_map.import_map(options, lambda path: READERS[options.format](path, names))
+
+    return run_main(parser, run, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

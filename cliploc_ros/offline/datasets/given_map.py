@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps read from other formats, their conversion to our maps, and readers of MSG-Loc and CSV."""
+"""Read a map from a table, CSV, and convert maps of other systems to ours."""
 
 import codecs
 import csv
@@ -20,19 +20,15 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.files.storage import read_file
 from cliploc_ros.offline.datasets.observations import load_observations
-from cliploc_ros.offline.datasets.parsing import FieldError, Fields, naming, unit_quaternion
+from cliploc_ros.offline.datasets.parsing import naming, unit_quaternion
 from cliploc_ros.offline.mapping.refit import refit_map
-from cliploc_ros.offline.vocabulary.vocabulary import coco_classes
 
 # A smaller semi-axis is a collapsed fit; a larger one does not belong to an object. Not measured.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
 _MAX_COORDINATE_M = 1e6
 _MAX_NORM_ERROR = 0.01
 MAX_FILE_BYTES = 512 * 1024 * 1024
-COCO = coco_classes()
-_MAX_LENGTH = 1000
-# A map file holds four decimals of a weight; classes with a smaller share are dropped.
-_LEAST_SHARE = 0.001
+MAX_LENGTH = 1000
 
 
 class GivenLandmark(NamedTuple):
@@ -192,138 +188,6 @@ def read_bytes(path: Path) -> bytes:
     return content
 
 
-def read_class_names(path: Path) -> tuple[str, ...]:
-    """Read a text file with one class name per line.
-
-    DatasetError: the message names the file and the line to correct.
-    """
-    with naming(path, UnicodeDecodeError, what='not a text file in UTF-8: '):
-        lines = read_bytes(path).decode('utf-8-sig').splitlines()
-    names = tuple(line.strip() for line in lines)
-    for number, name in enumerate(names, 1):
-        if not name or len(name) > _MAX_LENGTH:
-            raise DatasetError(f'{path}: line {number} must be a class name; give one per line')
-    return names
-
-
-def class_name(names: Sequence[str], index: int) -> str:
-    """Return the name of a class; DatasetError: the list of names has no such index."""
-    if not 0 <= index < len(names):
-        raise DatasetError(f'class index {index} is not among {len(names)} names; give the names '
-                           'of the classes that the map was made with: `class_names`')
-    return names[index]
-
-
-def shares(weights: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
-    """Return classes with their shares, the greatest first; shares up to 0.001 are dropped."""
-    least = _LEAST_SHARE * sum(weights.values())
-    ranked = sorted(((name, weight) for name, weight in weights.items() if weight > least),
-                    key=lambda pair: -pair[1])
-    total = sum(weight for _, weight in ranked)
-    return tuple((name, weight / total) for name, weight in ranked)
-
-
-_NUMBER_OF_SYMBOL = (1 << 56) - 1
-# Where a node has only likelihoods, classes below this share of the greatest are left out. Not
-# measured.
-_LEAST_LIKELIHOOD = 0.5
-_MOST_SHARE = 1e300  # sums of larger numbers are infinite
-
-
-def read_msgloc(path: Path, class_names: Sequence[str]) -> GivenMap:
-    """Read a map of MSG-Loc: JSON with a list of nodes.
-
-    | field of a node | content |
-    |---|---|
-    | id | a symbol of GTSAM: the letter q in the highest byte, and a number |
-    | translation, radii | centre and semi-axes; the signs of radii are ignored |
-    | orientation | quaternion w, x, y, z |
-    | baseline_label | class to [share of the detections by score, ...] |
-    | msgloc_label | class to [likelihood]: how often the class was proposed by the detector |
-
-    Class weights are the shares of the detections. For a node without shares, likelihoods are
-    used: they sum to more than 1, and show which classes the detector confuses. DatasetError: the
-    message names the file and its fault.
-
-    Parameters
-    ----------
-    path : Path
-        A JSON file.
-    class_names : sequence of str
-        Names of the class indices; a file may also name classes.
-    """
-    given = GivenMap([], [], [])
-    negative = 0
-    content = Fields.of_file(path, read_bytes)
-    if not isinstance(content.values.get('nodes'), list):
-        raise DatasetError(f"{path}: is not a map of MSG-Loc: it has no list 'nodes'")
-    for place, values in enumerate(content.entries('nodes')):
-        try:
-            node = Fields(values, f'node {place}')
-            given.landmarks.append(_landmark_of_node(node, place, class_names))
-            negative += any(radius < 0.0 for radius in node.values['radii'])
-        except FieldError as error:
-            reason = str(error).removeprefix(f'node {place}: ')
-            given.left_out.append(Skipped(f'node {place}', reason))
-    if negative:
-        given.notes.append(f'{negative} landmarks have negative radii; their signs are ignored')
-    return given
-
-
-def _landmark_of_node(node: Fields, place: int, class_names: Sequence[str]) -> GivenLandmark:
-    center, radii = (node.numbers(name, (3,)).tolist() for name in ('translation', 'radii'))
-    w, x, y, z = node.numbers('orientation', (4,)).tolist()
-    weights = _class_weights(node, class_names)
-    number = node.values.get('id', place)
-    if not isinstance(number, int):
-        raise FieldError(f"{node.where}: 'id' is {str(number)[:40]!r}, not an integer")
-    name = weights[0][0]
-    return GivenLandmark(
-        make_id(name, number & _NUMBER_OF_SYMBOL), name, name, center,
-        [abs(radius) for radius in radii], (x, y, z, w),
-        LandmarkDetails(class_weights=weights if len(weights) > 1 else None))
-
-
-def _class_weights(node: Fields, class_names: Sequence[str]) -> tuple[tuple[str, float], ...]:
-    """Return the classes of a node with their shares, the greatest first."""
-    weights = shares(_labels(node, 'baseline_label', class_names))
-    if not weights:
-        likely = _labels(node, 'msgloc_label', class_names)
-        least = _LEAST_LIKELIHOOD * max(likely.values(), default=0.0)
-        weights = shares({name: value for name, value in likely.items() if value >= least})
-    if not weights:
-        raise FieldError(f"{node.where}: has no class: neither 'baseline_label' nor "
-                         "'msgloc_label'")
-    return weights
-
-
-def _labels(node: Fields, field: str, class_names: Sequence[str]) -> Mapping[str, float]:
-    """Return the first number of each class in a field."""
-    found: dict[str, float] = {}
-    for key, values in node.mapping(field).items():
-        where = f"{node.where}: '{field}' of class {key[:40]!r}"
-        first = Fields({'share': values[0] if isinstance(values, list) and values else None},
-                       where).number('share')
-        if not 0.0 <= first < _MOST_SHARE:
-            raise FieldError(f'{where} is {first:g}, expected 0 or more')
-        name = _name_of(key, class_names, where)
-        found[name] = found.get(name, 0.0) + first
-    return found
-
-
-def _name_of(key: str, class_names: Sequence[str], where: str) -> str:
-    """Return the class of a key, which is an index written as a float, or a name."""
-    try:
-        index = float(key)
-    except ValueError:
-        if not key.strip() or len(key) > 1000:
-            raise FieldError(f'{where}: the class has no name') from None
-        return key
-    if not index.is_integer():
-        raise FieldError(f'{where}: the class is not an index')
-    return class_name(class_names, int(index))
-
-
 _CENTER, _SEMI_AXES, _QUATERNION = ('x', 'y', 'z'), ('a', 'b', 'c'), ('qx', 'qy', 'qz', 'qw')
 _REQUIRED = ('class_id', *_CENTER, *_SEMI_AXES)
 _DETAILS = ('position_sigma', 'support', 'seen_ratio', 'baseline_deg', 'last_seen')
@@ -404,7 +268,7 @@ def _landmark_of_row(row: Mapping[str, str], number: int, where: str
                      ) -> GivenLandmark:
     class_id = _text(row, 'class_id', where)
     landmark_id = row.get('id') or make_id(class_id, number)
-    if '.' in landmark_id or len(landmark_id) > _MAX_LENGTH:
+    if '.' in landmark_id or len(landmark_id) > MAX_LENGTH:
         raise DatasetError(f'{where}: column id: an id must be short text without dots')
     label = _text(row, 'label', where) if row.get('label') else class_id
     has_turn = _QUATERNION[0] in row
@@ -431,8 +295,8 @@ def _details(row: Mapping[str, str], where: str) -> LandmarkDetails:
 
 
 def _text(row: Mapping[str, str], name: str, where: str) -> str:
-    if not row[name] or len(row[name]) > _MAX_LENGTH:
-        raise DatasetError(f'{where}: column {name}: must be text of 1 to {_MAX_LENGTH} '
+    if not row[name] or len(row[name]) > MAX_LENGTH:
+        raise DatasetError(f'{where}: column {name}: must be text of 1 to {MAX_LENGTH} '
                            'characters')
     return row[name]
 
