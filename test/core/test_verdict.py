@@ -48,7 +48,7 @@ from studies.acceptance.troubles import exchange_landmarks
 
 OPTIONS = RelocalizerOptions()
 SURE = Evidence(inliers=9, likely=0.99)
-GENUINE = Signs(math.log(30), 0.8, 0.0, 0.0, 1.0, 0.5)
+GENUINE = Signs(math.log(30), 0.8, 0.0, 0.0, 1.0, 0.5, 0.0)
 SMALL = GENUINE._replace(reach=0.3, confirmed=0.4)
 RECOGNIZED = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 200, 0.9, 0.9)
 # Factors that reduce the confidence, and the kind of refusal that names them.
@@ -92,6 +92,7 @@ def test_keyframes_that_are_sure_replace_what_objects_lack():
 def test_a_picture_needs_motion_to_be_told_from_the_place_and_motion_tells():
     in_doubt = GENUINE._replace(reach=0.6)
     assert chance_genuine(SMALL) < chance_genuine(in_doubt) < chance_genuine(GENUINE)
+    assert chance_genuine(SMALL._replace(contradicted=2.0)) < chance_genuine(SMALL)
     moved_like_the_place, moved_like_a_picture = Motion(2.0, 50.0), Motion(60.0, 2.0)
     only_turned = Motion(2.0, 2.0)
     assert chance_genuine(in_doubt, moved_like_the_place) > chance_genuine(in_doubt)

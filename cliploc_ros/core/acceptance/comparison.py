@@ -53,6 +53,7 @@ from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLAC
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.joined_map import Place, place_of
+from cliploc_ros.core.map.visibility import expect
 from cliploc_ros.core.search.frame_search import constraint_of, coverage_of, match_frame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
@@ -234,8 +235,13 @@ class Comparison:
         """
         if self.place is None:
             return None
-        boxes = self._last.detections.bboxes_xyxy[[match.detection for match in best.matches[-1]]]
-        return signs_of(self.place, boxes, self._last.camera)
+        seen, camera = best.matches[-1], self._last.camera
+        expected = expect(self._joined.landmark_map, camera, best.pose,
+                          np.array([match.landmark for match in seen], dtype=np.int64))
+        return signs_of(
+            self.place, self._last.detections.bboxes_xyxy[[match.detection for match in seen]],
+            camera, min(float((expected.in_sight & ~expected.was_seen).sum()),
+                        best.support.unexplained))
 
     def _motion(self) -> Motion | None:
         """Compare the motion since an earlier look by keyframes; None without such a look."""

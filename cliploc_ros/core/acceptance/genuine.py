@@ -96,18 +96,22 @@ class Signs(NamedTuple):
     #: share is greater. A picture ends within the image.
     reach: float
     apart: float  #: See RecognizedPlace, limited to 1: next to a keyframe, all surroundings match
+    #: Number of landmarks in sight that no detection shows, at most the number of detections that
+    #: no landmark explains. Either alone is no sign: detectors miss objects, and most objects of a
+    #: room are never mapped.
+    contradicted: float
 
 
-def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera) -> Signs:
+def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera,
+             contradicted: float) -> Signs:
     """Return the signs that a recognized place is genuine and unchanged.
-
-    Objects that the pose does not explain are no sign of a picture: most objects of a room are
-    never mapped.
 
     Parameters
     ----------
     boxes : ndarray (b, 4)
         Boxes of the detections that the pose explains: left, top, right, bottom [px].
+    contradicted : float
+        See Signs.
     """
     size = np.array([camera.width, camera.height], dtype=np.float64)
     corners = np.clip(boxes.reshape(-1, 2), 0.0, size)
@@ -119,7 +123,7 @@ def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera)
         _error(place.focal_ratio, place.focal_deviation),
         _error(place.aspect_ratio, place.aspect_deviation),
         float((np.ptp(ends, axis=0) / size).max()) if len(ends) else 0.0,
-        min(1.0, place.apart))
+        min(1.0, place.apart), contradicted)
 
 
 def chance_genuine(signs: Signs, motion: Motion | None = None,
