@@ -23,7 +23,7 @@ LINE = re.compile('^(.{12}) (pass|fail|not checked|refused) +(.*)$', re.MULTILIN
 WHOLE = {'parameters': 'valid', 'map': '12 landmarks', 'camera': '640 x 480 px',
          'clock': 'images come', 'calibration': '65 degrees wide', 'tf': '0.50 m above',
          'odometry': 'the robot is at rest', 'detector': '12 boxes', 'localizer': 'amcl_pose',
-         'time': 'search', 'pose': 'accepted with'}
+         'time': 'search', 'pose': 'accepted: x '}
 # Upright, and half a metre above the robot.
 MOUNT = [0.0, 0.0, 0.5, -0.70710678, 0.0, 0.0, 0.70710678]
 

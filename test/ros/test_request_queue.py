@@ -46,12 +46,15 @@ class Answering(ManagedNode):
         self.loads = lambda: 'nothing'
         self.localize = lambda frame: Answer(Verdict.REFUSED, 'nothing known',
                                              received_at=frame.received_at)
+        self.publish = lambda answer: answer
         self.robot = RobotStateSource(self)
         self.frames = CameraRig(self, RelocalizerParameters())
-        pipeline = SimpleNamespace(localize=lambda frame, times, deadline: self.localize(frame))
+        pipeline = SimpleNamespace(localize=lambda frame, times, deadline: self.localize(frame),
+                                   publish=lambda answer, deadline: self.publish(answer))
         jumps = TimeJumps(self, self.frames.forget)
         self.requests = Requests(self, self.frames, self.robot, jumps, pipeline,
-                                 CaseRecorder(False), HandOff(self, self.robot.odometry))
+                                 CaseRecorder(False), HandOff(
+            self, self.robot.odometry, self.robot.transforms))
 
     def load(self):
         return self.loads()
