@@ -143,8 +143,9 @@ class HandOff:
         """Publish a pose on `initialpose` until the localizer takes it, and let it converge.
 
         The localizer has taken the pose when it publishes a pose that agrees, after odometry has
-        carried the given pose to its stamp. `initialpose` is then not repeated. The localizer must still run after it has converged: it answers each
-        update or publishes another pose, and its topics exist at the end.
+        carried the given pose to its stamp. `initialpose` is then not repeated. The localizer must
+        still run after it has converged: it answers each update or publishes another pose, and its
+        topics exist at the end.
 
         Parameters
         ----------

@@ -155,14 +155,17 @@ def test_a_request_gets_no_image_older_than_itself(node, camera, clients, wait):
 
 
 def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, clients, wait):
+    """The search ends later; then nothing of it is published."""
     set_values(node, timeout_s=0.6)
-    release = threading.Event()
-    node.localize = lambda frame: release.wait(10.0)
+    release, published = threading.Event(), []
+    node.localize, node.publish = lambda frame: release.wait(10.0), published.append
     start = time.monotonic()
     request = clients.submit(node.requests.answer)
     shoot_until(camera, wait, request)
     took_s = time.monotonic() - start
     release.set()
+    node.worker.run(lambda: None)  # after the search
+    assert not published
     assert request.result().verdict is Verdict.REFUSED
     assert 'time is up: waiting for' in request.result().message
     assert took_s < 1.0
