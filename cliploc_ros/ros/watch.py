@@ -6,6 +6,8 @@ A separate thread waits for frames and transforms. Only the check itself runs in
 and no check begins while a request is being answered. Thus the watch never delays a request.
 """
 
+import math
+import re
 import threading
 import time
 import traceback
@@ -48,6 +50,8 @@ _LEAST_S, _DUTY = 1.0, 0.1
 # After a move [m] or a turn [deg] of this size the camera sees other objects.
 _WAY_M, _TURN_DEG = 1.0, 90.0
 _POLL_S = 0.1
+# Least time between two log lines of one state, which state different problems.
+_SAY_PERIOD_S = 30.0
 # A camera at 1 Hz and a detector that takes one second complete a frame within this time.
 _FRAME_PATIENCE_S = 5.0
 # Without a check for this long, the verdict is no longer valid.
@@ -100,6 +104,8 @@ class Watcher:
         # Checks that began before this number changed are discarded.
         self._age = 0
         self._cost_s = 0.0
+        # The state and the problem that were logged last, and when (monotonic clock) [s].
+        self._said, self._said_at = (WatchState.UNCERTAIN, ''), -math.inf
         # Reaction to a lost robot, and whether it is at rest.
         self._reaction, self._is_at_rest = '', False
         self._rest_stamp: Time | None = None
@@ -256,7 +262,11 @@ class Watcher:
             self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if known.state is not WatchState.LOST:
             self._is_at_rest = False
-        if (known.state, known.problem) != (before.state, before.problem):
+        # stamps and ages make each problem a new text
+        now, said = time.monotonic(), (known.state, re.sub(r'\d[\d.]*', '', known.problem))
+        if said != self._said and (known.state is not before.state
+                                   or now >= self._said_at + _SAY_PERIOD_S):
+            self._said, self._said_at = said, now
             text = f'watch: {known.problem or known.reason}'
             if known.state is WatchState.LOST:
                 self._node.get_logger().warning(text)
