@@ -13,7 +13,6 @@ from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_msgs.msg import Header
@@ -80,10 +79,13 @@ class Answer:
     header: Header | None = None  #: Stamp of the image, frame of the map; None without an image
     #: The deciding figures, as doc/interface.md describes them
     figures: Mapping[str, object] = field(default_factory=dict)
-    #: Direction of the robot's x axis, or of the camera's view without base_frame, from the map's
-    #: x axis towards its y axis
-    heading_deg: float = 0.0
+    pose_figures: Mapping[str, object] = field(default_factory=dict)  #: Empty unless accepted
     number: int = 0  #: Answers to requests count from 1; 0: not the answer to a request
+
+    def withheld(self, why: str) -> 'Answer':
+        """Return this accepted answer without its pose, which is not delivered."""
+        return replace(self, verdict=Verdict.WITHHELD, pose=None, pose_figures={},
+                       detail=f'{why} ({self.message})')
 
     @property
     def is_linked(self) -> bool:
@@ -108,11 +110,28 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
     """
     found = localized.found
     header = Header(stamp=frame.image.header.stamp, frame_id=localized.landmark_map.frame_id)
-    figures = _figures(localized, parameters)
-    said = ', '.join(phrase.format_map(figures) for name, usual, phrase in _PHRASES
-                     if figures[name] not in usual)
+    evidence, points, depth = found.evidence, found.recognized, found.depth
+    stamp, seen = header.stamp, localized.seen.observation
+    figures: dict[str, object] = {
+        'stamp [s]': f'{stamp.sec}.{stamp.nanosec:09d}', 'frame': header.frame_id,
+        'source': found.source if found.solved else '', 'confidence': found.confidence,
+        'confidence needed': parameters.min_confidence if evidence is None else
+        needed_confidence(evidence, parameters.options()),
+        'score': found.score, 'landmarks': 0 if evidence is None else evidence.inliers,
+        'frames': len(found.frame_matches), 'hypotheses': found.tried,
+        'searched percent': 100.0 * found.coverage, 'crops': '' if seen.similarities is None else
+        f'{localized.compared} of {len(seen.detections)}',
+        'keyframe points': 0 if points is None else points.inliers,
+        'keyframe search': found.keyframe_search,
+        'depth': '' if depth is None else f'depth of {depth.objects} objects' if depth.is_passed
+        else 'depth contradicts the boxes',
+        'cameras': len(localized.query.frames), 'left out': ', '.join(localized.left_out),
+        'prior': 0.0 if evidence is None else evidence.prior,
+        **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in stages_ms.items()}}
     # the reason of a refusal may state the confidence already, with other rounding
-    said = said.partition(', ')[2] if 'confidence' in found.reason else said
+    said = ', '.join(phrase.format_map(figures) for name, usual, phrase in _PHRASES
+                     if figures[name] not in usual
+                     and not (name == 'confidence' and name in found.reason))
     summary = f'[{said}; {in_words(stages_ms)}]'
     answer = Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, frame.received_at,
                     localized.query, localized.is_cut, stages_ms, map_hash, found.refusal_kind,
@@ -126,31 +145,18 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
     # the heading of a robot is its x axis, that of a camera its viewing direction (z axis)
     ahead = map_from_base[:2, 0 if parameters.base_frame else 2]
     heading_deg = math.degrees(math.atan2(ahead[1], ahead[0]))
-    (x, y, z), (position_m, turn_deg) = map_from_base[:3, 3], _deviations(pose)
-    return replace(answer, verdict=Verdict.ACCEPTED, pose=pose, heading_deg=heading_deg, detail=(
-        f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id}, heading {heading_deg:.0f} deg, '
-        f'deviation {position_m:.2f} m and {turn_deg:.1f} deg {summary}'))
-
-
-def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[str, object]:
-    """Return the figures that decided the answer to a frame, see doc/interface.md."""
-    found, seen = localized.found, localized.seen.observation
-    evidence, points, depth = found.evidence, found.recognized, found.depth
-    return {
-        'source': found.source if found.solved else '', 'confidence': found.confidence,
-        'confidence needed': parameters.min_confidence if evidence is None else
-        needed_confidence(evidence, parameters.options()),
-        'score': found.score, 'landmarks': 0 if evidence is None else evidence.inliers,
-        'frames': len(found.frame_matches), 'hypotheses': found.tried,
-        'searched percent': 100.0 * found.coverage,
-        'crops': '' if seen.similarities is None else
-        f'{localized.compared} of {len(seen.detections)}',
-        'keyframe points': 0 if points is None else points.inliers,
-        'keyframe search': found.keyframe_search,
-        'depth': '' if depth is None else f'depth of {depth.objects} objects' if depth.is_passed
-        else 'depth contradicts the boxes',
-        'cameras': len(localized.query.frames), 'left out': ', '.join(localized.left_out),
-        'prior': 0.0 if evidence is None else evidence.prior}
+    covariance, p, q = pose.pose.covariance, pose.pose.pose.position, pose.pose.pose.orientation
+    position_m = math.sqrt(sum(covariance[:15:7]))
+    turn_deg = math.degrees(math.sqrt(covariance[35]))
+    return replace(answer, verdict=Verdict.ACCEPTED, pose=pose, pose_figures={
+        'x [m]': p.x, 'y [m]': p.y, 'z [m]': p.z,
+        'orientation xyzw': f'{q.x} {q.y} {q.z} {q.w}', 'heading [deg]': f'{heading_deg:.2f}',
+        'position deviation [m]': f'{position_m:.4f}',
+        'heading deviation [deg]': f'{turn_deg:.3f}',
+        'covariance': ' '.join(map(repr, map(float, covariance)))}, detail=(
+            f'x {p.x:.2f} y {p.y:.2f} z {p.z:.2f} m in {header.frame_id}, heading '
+            f'{heading_deg:.0f} deg, deviation {position_m:.2f} m and {turn_deg:.1f} deg '
+            f'{summary}'))
 
 
 def answer_msg(answer: Answer, node: str) -> DiagnosticArray:
@@ -159,34 +165,13 @@ def answer_msg(answer: Answer, node: str) -> DiagnosticArray:
     `node` is the name of the relocalizer with its namespace.
     """
     level = {Verdict.ACCEPTED: DiagnosticStatus.OK, Verdict.FAILED: DiagnosticStatus.ERROR}
-    header, name = answer.header or Header(), node.lstrip('/')
-    seen = {} if answer.header is None else {
-        'stamp [s]': f'{header.stamp.sec}.{header.stamp.nanosec:09d}', 'frame': header.frame_id}
-    pose: dict[str, object] = {}
-    if answer.pose is not None:
-        of_pose = answer.pose.pose
-        p, q = of_pose.pose.position, of_pose.pose.orientation
-        position_m, turn_deg = _deviations(answer.pose)
-        pose = {'x [m]': p.x, 'y [m]': p.y, 'z [m]': p.z,
-                'orientation xyzw': f'{q.x} {q.y} {q.z} {q.w}',
-                'heading [deg]': f'{answer.heading_deg:.2f}',
-                'position deviation [m]': f'{position_m:.4f}',
-                'heading deviation [deg]': f'{turn_deg:.3f}',
-                'covariance': ' '.join(map(repr, map(float, of_pose.covariance)))}
+    name = node.lstrip('/')
     values = {'answer': answer.number, 'verdict': answer.verdict, 'kind': answer.kind or '',
-              **seen, **answer.figures, **pose,
-              **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in answer.stages_ms.items()},
-              'map hash': answer.map_hash}
-    return DiagnosticArray(header=header, status=[DiagnosticStatus(
+              **answer.figures, **answer.pose_figures, 'map hash': answer.map_hash}
+    return DiagnosticArray(header=answer.header or Header(), status=[DiagnosticStatus(
         level=level.get(answer.verdict, DiagnosticStatus.WARN), name=f'{name}: answer',
         message=answer.message, hardware_id=name,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
-
-
-def _deviations(pose: PoseWithCovarianceStamped) -> tuple[float, float]:
-    """Return the standard deviations of the position [m] and the heading [deg] of a pose."""
-    covariance = np.reshape(pose.pose.covariance, (6, 6))
-    return math.sqrt(np.trace(covariance[:3, :3])), math.degrees(math.sqrt(covariance[5, 5]))
 
 
 class RequestCounters:

@@ -150,8 +150,7 @@ class Pipeline:
             try:
                 self._map_to_odom.update(header, map_from_base, parameters, answer.received_at)
             except NoTransformError as error:
-                answer = replace(answer, verdict=Verdict.WITHHELD, pose=None,
-                                 detail=f'publish_tf: {error} (accepted: {answer.detail})')
+                answer = answer.withheld(f'publish_tf: {error}')
             self._pose.publish(pose_with_covariance_msg(header, map_from_base, move_covariance(
                 localized.for_filter, map_from_base[:3, 3] - found.map_from_camera[:3, 3])))
             self._robot.prior.keep(pose, parameters, answer.map_hash)
@@ -277,9 +276,7 @@ class Requests:
             self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
                                     answer.received_at, self._jumps)
         except HandOffError as error:
-            return (replace(answer, verdict=Verdict.WITHHELD, pose=None,
-                            detail=f'{error} ({answer.message})'),
-                    not isinstance(error, NoLocalizerError))
+            return answer.withheld(str(error)), not isinstance(error, NoLocalizerError)
         return answer, False
 
 
