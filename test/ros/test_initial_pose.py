@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from handing_over import PARAMETERS, TEN_HZ, Robot, make_pose, stamp, stand, tell
 
 from cliploc_ros.ros.handoff import (
@@ -163,16 +163,29 @@ def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):
     showing.localizer.may_answer.set()
 
 
+class RearTransforms:
+    """Replaces tf2's buffer: it knows a frame at the robot's origin, turned by 180 degrees."""
+
+    def lookup_transform(self, target, source, stamp, timeout):
+        if (target, source) != ('base_link', 'rear'):
+            raise LookupError('unknown frame')
+        found = TransformStamped()
+        found.transform.rotation.z, found.transform.rotation.w = 1.0, 0.0
+        return found
+
+
 @pytest.mark.parametrize(('x_m', 'driven_m', 'body', 'named'), [
     (0.0, 0.0, 'base_link', ''), (2.0, 0.0, 'base_link', r'differs from it by 2\.00 m'),
     (2.0, 2.0, 'base_link', ''), (0.0, 2.0, 'base_link', r'differs from it by 2\.00 m'),
-    (2.0, 2.0, 'wheels', r'differs from it by 2\.00 m')])
+    (2.0, 2.0, 'wheels', r'differs from it by 2\.00 m'), (-2.0, 2.0, 'rear', '')])
 def test_where_the_localizer_is_once_it_has_settled_decides(showing, wheels, x_m, driven_m, body,
                                                             named):
     """It answers no update but shows a pose, also that of a robot that has driven off.
 
-    The robot drives after the pose was taken. Nobody places `wheels` at the robot.
+    The robot drives after the pose was taken. Nobody places `wheels` at the robot; `rear` looks
+    back.
     """
+    showing.handoff._transforms._buffer = RearTransforms()
     stand(showing, wheels, dict.fromkeys((-0.1, 0.0, 0.1, 0.2, 0.3, 0.4), 0.0), body=body)
     showing.localizer.may_answer.clear()
     with ThreadPoolExecutor(1) as pool:
