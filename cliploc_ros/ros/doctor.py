@@ -375,10 +375,10 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
         is_slow = answer.is_cut or sum(answer.stages_ms.values()) > 1e3 * parameters.timeout_s
         report.judge('time', time_is_up(answer.stages_ms) if is_slow else '',
                      f'{in_words(answer.stages_ms)}; timeout_s {parameters.timeout_s:g}')
-        is_accepted = answer.verdict is Verdict.ACCEPTED
-        report.add('pose', State.PASS if is_accepted and not node.wrong_cameras else
-                   State.REFUSED, f'the relocalizer refuses it: {node.wrong_cameras}'
-                   if is_accepted and node.wrong_cameras else answer.message)
+        if answer.verdict is Verdict.ACCEPTED and node.wrong_cameras:
+            report.add('pose', State.REFUSED, f'the relocalizer refuses it: {node.wrong_cameras}')
+        else:
+            report.add('pose', State.REFUSED if answer.kind else State.PASS, answer.message)
 
 
 def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) -> None:

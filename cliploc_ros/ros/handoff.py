@@ -39,11 +39,7 @@ from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_from_msg, pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
-from cliploc_ros.ros.inputs.odometry import (
-    MOMENT_PATIENCE_S,
-    NoOdometryError,
-    OdometrySource,
-)
+from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -243,7 +239,7 @@ class HandOff:
             motion, frame = self._odometry.motion(given.header.stamp, stamp, patience_s)
             base_from_body = np.eye(4) if frame == self._base_frame else self._transforms.lookup(
                 self._base_frame, frame, given.header.stamp, 0.0)
-        except (NoOdometryError, NoTransformError):
+        except CliplocError:
             return given
         assert pose is not None  # it was accepted
         carried = deepcopy(given)

@@ -43,16 +43,16 @@ _GRACE_S = 0.2
 # Refusals of images without objects of the map.
 _WITHOUT_OBJECTS = (RefusalKind.TOO_FEW_OBJECTS, RefusalKind.WRONG_DETECTIONS)
 
-_SMALLER = 'choose a faster profile or a smaller'
 # The name of each stage in messages, and how to make it faster.
-_STAGES = {'image': 'waiting for an image with detections', 'detection': 'the detector',
-           'waiting': 'waiting for earlier work or for /tf', 'decoding': 'reading the image',
-           'CLIP': 'CLIP', 'search': 'the search', 'keyframes': 'matching keyframes'}
-_REMEDIES = {'image': 'raise the rate of the camera or of the detector',
-             'detection': f'{_SMALLER} detector',
-             'waiting': 'retry', 'decoding': 'use smaller images', 'CLIP': f'{_SMALLER} CLIP',
-             'search': 'lower iterations or time_budget_ms',
-             'keyframes': "set keyframes_file to ''"}
+_STAGES = {
+    'image': ('waiting for an image with detections',
+              'raise the rate of the camera or of the detector'),
+    'detection': ('the detector', 'choose a faster profile or a smaller detector'),
+    'waiting': ('waiting for earlier work or for /tf', 'retry'),
+    'decoding': ('reading the image', 'use smaller images'),
+    'CLIP': ('CLIP', 'choose a faster profile or a smaller CLIP'),
+    'search': ('the search', 'lower iterations or time_budget_ms'),
+    'keyframes': ('matching keyframes', "set keyframes_file to ''")}
 
 
 class Look(NamedTuple):
@@ -283,6 +283,6 @@ class Requests:
 def time_is_up(stages_ms: Mapping[str, float]) -> str:
     """Return a message with the slowest stage of a request and its remedy."""
     stage = max(stages_ms, key=lambda name: stages_ms[name])
-    total_s = sum(stages_ms.values()) / 1e3
-    return (f'time is up: {_STAGES[stage]} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; '
-            f'{_REMEDIES[stage]}, or raise timeout_s')
+    (name, remedy), total_s = _STAGES[stage], sum(stages_ms.values()) / 1e3
+    return (f'time is up: {name} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; {remedy}, '
+            'or raise timeout_s')

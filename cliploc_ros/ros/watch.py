@@ -185,8 +185,11 @@ class Watcher:
                 except PoselessError as error:
                     self._miss(stopped, str(error))
                     self._wake_up(stopped)
-                else:
-                    self._react(stopped, stamp)
+                else:  # relocalize a lost robot at rest if on_lost asks for it
+                    if self._known.state is WatchState.LOST and stamp is not None:
+                        self._relocalize_at_rest(stopped, stamp, 'lost')
+                    else:
+                        self._rest_stamp = None
             except StoppedError:
                 return
             except (NoFrameError, NoTransformError, LaterError, TimeJumpError, TimeUpError
@@ -294,13 +297,6 @@ class Watcher:
 
     # ---- what follows ---------------------------------------------------------------------------
 
-    def _react(self, stopped: threading.Event, stamp: Time | None) -> None:
-        """Relocalize a lost robot at rest if on_lost asks for it, at increasing intervals."""
-        if self._known.state is not WatchState.LOST or stamp is None:
-            self._rest_stamp = None
-            return
-        self._relocalize_at_rest(stopped, stamp, 'lost')
-
     def _wake_up(self, stopped: threading.Event) -> None:
         """Relocalize after a restart of the localizer: it has no pose, but had one before."""
         is_wanted = self._node.settings.values.on_lost != 'report' and self._had_pose
@@ -308,6 +304,7 @@ class Watcher:
             self._relocalize_at_rest(stopped, self._image_stamp, 'the localizer has no pose')
 
     def _relocalize_at_rest(self, stopped: threading.Event, stamp: Time, why: str) -> None:
+        """Relocalize a robot at rest at increasing intervals, unless on_lost is report."""
         parameters = self._node.settings.values
         self._reaction = self._why_not_at_rest(parameters, stamp)
         self._is_at_rest = not self._reaction
