@@ -120,8 +120,8 @@ def informative_first(landmark_map: LandmarkMap, observation: Observation) -> ND
 def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame],
                        observation: Observation, crops: Crops | None = None,
                        looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
-                       budget: TimeBudget | None = None, cameras: CameraCheck | None = None
-                       ) -> tuple[SearchedFrame, Relocalization]:
+                       budget: TimeBudget | None = None, cameras: CameraCheck | None = None,
+                       request: float = math.inf) -> tuple[SearchedFrame, Relocalization]:
     """Localize a frame with more and more of its crops until its pose is accepted.
 
     Parameters
@@ -139,6 +139,8 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
         Time budget of the first search, by default a new one. Each further search has a new one.
     cameras : CameraCheck, optional
         Evidence about the cameras; by default there is none.
+    request : float
+        When a request needs the result (monotonic clock) [s].
 
     Returns
     -------
@@ -160,7 +162,7 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
         left = informative_first(relocalizer.landmark_map, observation)
         left = left[~np.isin(left, compared)]
     while True:
-        budget = budget or relocalizer.begin(len(earlier) + 1)
+        budget = budget or relocalizer.begin(len(earlier) + 1, request=request)
         frame = relocalizer.search(observation, budget.search_end())
         found = relocalizer.locate([*earlier, frame], budget, looks, recognizer, cameras)
         search_ms, budget = search_ms + found.search_ms, None
@@ -227,8 +229,8 @@ class Localizer:
         crops : CropSource, optional
             Compares the crops for which the query has no similarities, until the pose is accepted.
         deadline : float
-            After this time, no crops are compared and no keyframes are matched (monotonic clock)
-            [s].
+            After this time, no crops are compared, no keyframes are matched, and no search goes on
+            (monotonic clock) [s].
         begin_stage : callable
             Called with the name of each stage that begins: 'CLIP', 'keyframes', and 'search' after
             them.
@@ -249,7 +251,8 @@ class Localizer:
         for frame in query.frames:
             self.cameras.see(frame)
         found = self._localize(query, others, *self._crops(query, crops, deadline, begin_stage),
-                               self.recognizer(query, deadline, begin_stage))
+                               self.recognizer(query, deadline, begin_stage),
+                               deadline - _ANSWER_S)
         self.cameras.add(found.cameras)
         if found.accepted and found.depth is not None:
             self.depth_scale.add(found.depth)
@@ -347,9 +350,11 @@ class Localizer:
         return Crops(compare, of_image.known)
 
     def _localize(self, query: Query, others: Sequence[Observation], newest: Observation,
-                  crops: Crops | None, recognizer: ImageRecognizer | None) -> Relocalization:
+                  crops: Crops | None, recognizer: ImageRecognizer | None, request: float
+                  ) -> Relocalization:
         """Localize the newest frame together with the other frames, and store the full query."""
-        budget = self._relocalizer.begin(len(others) + 1, len(others) + 1) if others else None
+        budget = self._relocalizer.begin(len(others) + 1, len(others) + 1, request) \
+            if others else None
         beside = [self._relocalizer.search(other, budget.search_end(number, len(others) + 1))
                   for number, other in enumerate(others, start=1)] if budget else []
         rooms: list[int] = []
@@ -375,7 +380,7 @@ class Localizer:
         searched, found = localize_on_demand(
             self._relocalizer,
             [*(frame for instant in earlier for frame in instant.searched), *beside],
-            newest, crops, looks, recognizer, budget, self.cameras)
+            newest, crops, looks, recognizer, budget, self.cameras, request)
         self.query = replace(query, frames=(*others, searched.observation), rooms=tuple(rooms),
                              is_thorough=found.recognition is not None
                              and found.recognition.is_thorough)

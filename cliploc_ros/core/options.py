@@ -5,6 +5,7 @@
 import math
 import time
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from cliploc_ros.errors import OptionsError
 
@@ -21,18 +22,24 @@ _RANGES = {'k': (1, math.inf), 'iterations': (1, 1_000_000), 'iou_threshold': (0
            'min_inliers': (3, math.inf), 'min_confidence': (0.0, 1.0)}
 
 
-# The share of waiting time that counts. A search that only waits, on a busy machine, thus ends
-# after ten times its budget.
-_WAITING_SHARE = 0.1
+class Deadline(NamedTuple):
+    """The end of a search.
 
-
-def used_time_s() -> float:
-    """Return the clock of time budgets [s]: the processor time of this thread.
-
-    A tenth of its waiting time is added. Other programs on the processor therefore hardly shorten
-    a search, but a search that gets no processor time still ends.
+    Time without a processor does not count, so other programs do not shorten a search. A search
+    that gets too little processor time ends with its request.
     """
-    return ((1.0 - _WAITING_SHARE) * time.thread_time() + _WAITING_SHARE * time.perf_counter())
+
+    used_s: float = math.inf  #: By the processor time of the thread that searches [s]
+    request: float = math.inf  #: When its request needs the result (monotonic clock) [s]
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether the search must end."""
+        return time.thread_time() > self.used_s or time.monotonic() > self.request
+
+
+#: The end of a search without limits.
+NEVER = Deadline()
 
 
 @dataclass(frozen=True)
@@ -60,7 +67,7 @@ class RelocalizerOptions:
     iou_threshold: float = 0.2
     random_seed: int = 0  #: Equal seed and input give equal output. If negative, searches differ.
     #: Limit of the processor time for association, search and refinement [s], kept to within 10 %,
-    #: see used_time_s. A search that exceeds it is refused, except for auto. Such results depend
+    #: see Deadline. A search that exceeds it is refused, except for auto. Such results depend
     #: on the machine, so iterations should end a search first: 10,000 took at most 32 ms on the
     #: 258 recorded frames (40 landmarks, one idle core). Crowded maps take longer.
     time_budget_s: float = math.inf

@@ -31,7 +31,7 @@ from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.map.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.options import RelocalizerOptions, used_time_s
+from cliploc_ros.core.options import NEVER, Deadline, RelocalizerOptions
 from cliploc_ros.core.search.frame_search import SearchedFrame, check_k, coverage_of, search_frame
 from cliploc_ros.core.warm_up import call_every_kernel
 
@@ -158,22 +158,25 @@ def in_its_map(found: Relocalization, landmark_map: LandmarkMap
 
 @dataclass(frozen=True)
 class TimeBudget:
-    """A time budget that starts at `start`. Times are on the clock of used_time_s [s]."""
+    """A budget of processor time of the thread that searches."""
 
-    start: float
+    start: float  #: Processor time of the thread when it begins [s]
     total_s: float  #: Infinite for no limit
     frames: int  #: Number of frames that are localized together
+    request: float = math.inf  #: See Deadline
     #: Start on the clock of time.perf_counter
     begun_s: float = field(default_factory=time.perf_counter)
 
-    def search_end(self, number: int = 1, count: int = 1) -> float:
-        """Return the time when the search of frame `number`, from 1, of `count` frames ends."""
-        return self.start + self._time_s(_SEARCH_SHARE, _EARLIER_SEARCH_S) * number / count
+    def search_end(self, number: int = 1, count: int = 1) -> Deadline:
+        """Return the end of the search of frame `number`, from 1, of `count` frames."""
+        return Deadline(self.start + self._time_s(_SEARCH_SHARE, _EARLIER_SEARCH_S)
+                        * number / count, self.request)
 
     @property
-    def refinement_end(self) -> float:
-        """Return the time when the refinement ends."""
-        return self.start + self._time_s(_REFINEMENT_SHARE, _EARLIER_REFINEMENT_S)
+    def refinement_end(self) -> Deadline:
+        """Return the end of the refinement."""
+        return Deadline(self.start + self._time_s(_REFINEMENT_SHARE, _EARLIER_REFINEMENT_S),
+                        self.request)
 
     @property
     def elapsed_ms(self) -> float:
@@ -228,15 +231,17 @@ class Relocalizer:
         return self.look_again(self.locate(frames, budget, recognizer=recognizer), frames,
                                recognizer=recognizer)
 
-    def begin(self, frames: int, cameras: int = 1) -> TimeBudget:
+    def begin(self, frames: int, cameras: int = 1, request: float = math.inf) -> TimeBudget:
         """Return the time budget of a relocalization with a number of frames; it starts now.
 
         For several cameras of one instant, the time budget is multiplied by their number.
+        `request` is when a request needs the result (monotonic clock) [s].
         """
-        return TimeBudget(used_time_s(), cameras * self.options.time_budget_s, frames)
+        return TimeBudget(time.thread_time(), cameras * self.options.time_budget_s, frames,
+                          request)
 
-    def search(self, observation: Observation, deadline: float = math.inf) -> SearchedFrame:
-        """Search one frame, until a deadline of used_time_s [s]."""
+    def search(self, observation: Observation, deadline: Deadline = NEVER) -> SearchedFrame:
+        """Search one frame, until a deadline."""
         return search_frame(self.landmark_map, observation, self.options, deadline)
 
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
@@ -314,7 +319,8 @@ class Relocalizer:
         """
         if found.accepted or recognizer is None or not recognizer.begin_thorough():
             return found
-        again = self.locate(frames, None, looks, recognizer, cameras)
+        budget = self.begin(len(frames), request=recognizer.deadline)
+        again = self.locate(frames, budget, looks, recognizer, cameras)
         assert again.recognition is not None
         kept = again if again.recognition.is_complete else found
         return replace(kept, search_ms=found.search_ms + again.search_ms)

@@ -71,7 +71,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                 f'{name}:={self.resolve_topic_name(name)}' for name in (
                     *(topic for source in sources for topic in source.topics.values()),
                     *_OTHER_TOPICS, parameters.localizer_pose) if name)
-        self._handoff = HandOff(self, self._robot.odometry)
+        self._handoff = HandOff(self, self._robot.odometry, self._robot.transforms)
         self._handoff.on_shown(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))
         self._requests = Requests(self, self._frames, self._robot, self._jumps, self._pipeline,
@@ -256,7 +256,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
     def _localize_and_log(self, frame: Frame) -> None:
         """Localize with a frame of continuous mode, in the worker's thread."""
         try:
-            answer = self._pipeline.localize(frame)
+            answer = self._pipeline.publish(self._pipeline.localize(frame))
         except CliplocError as error:
             answer = Answer(Verdict.FAILED, str(error))
         self._record(answer)

@@ -7,28 +7,43 @@ import threading
 from collections import Counter, deque
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from numpy.typing import NDArray
 from std_msgs.msg import Header
 
-from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.core.acceptance.verdict import RefusalKind, needed_confidence
+from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.files.storage import make_folder
+from cliploc_ros.ros.conversions import pose_with_covariance_msg
+from cliploc_ros.ros.frame_localizer import Localized
+from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.robot_state import RobotState
+from cliploc_ros.ros.node.diagnostics import in_words
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # Number of past frames that acceptance uses, see cliploc_ros.core.acceptance.looks.
 _MAX_FRAMES = 20
 _MAX_BYTES = 256 * 2**20
 _MIB = 2**20
+# How the text of an answer shows a figure, unless it has one of these usual values.
+_PHRASES: tuple[tuple[str, tuple[object, ...], str], ...] = (
+    ('confidence', (), 'confidence {confidence:.3f}'), ('score', (), 'score {score:.2f}'),
+    ('landmarks', (), '{landmarks} landmarks'), ('frames', (0, 1), '{frames} frames'),
+    ('hypotheses', (), '{hypotheses} hypotheses'),
+    ('searched percent', (), '{searched percent:.3g} % of the search'),
+    ('crops', ('',), 'CLIP of {crops} crops'), ('source', ('', 'objects'), 'pose by {source}'),
+    ('keyframe points', (0,), '{keyframe points} points of keyframes agree'),
+    ('keyframe search', ('none', 'fast'), '{keyframe search} search of keyframes'),
+    ('depth', ('',), '{depth}'), ('cameras', (1,), '{cameras} cameras'),
+    ('left out', ('',), 'no image of {left out}'), ('prior', (0.0,), 'prior {prior:.1f}'))
 _LIBRARIES = ('cliploc_ros', 'numpy', 'scipy', 'numba')
 
 
@@ -64,10 +79,13 @@ class Answer:
     header: Header | None = None  #: Stamp of the image, frame of the map; None without an image
     #: The deciding figures, as doc/interface.md describes them
     figures: Mapping[str, object] = field(default_factory=dict)
-    #: Direction of the robot's x axis, or of the camera's view without base_frame, from the map's
-    #: x axis towards its y axis
-    heading_deg: float = 0.0
+    pose_figures: Mapping[str, object] = field(default_factory=dict)  #: Empty unless accepted
     number: int = 0  #: Answers to requests count from 1; 0: not the answer to a request
+
+    def withheld(self, why: str) -> 'Answer':
+        """Return this accepted answer without its pose, which is not delivered."""
+        return replace(self, verdict=Verdict.WITHHELD, pose=None, pose_figures={},
+                       detail=f'{why} ({self.message})')
 
     @property
     def is_linked(self) -> bool:
@@ -83,40 +101,77 @@ class Answer:
         return f'{text}; map {self.map_hash}' if self.map_hash else text
 
 
+def answer_to(frame: Frame, localized: Localized, state: RobotState,
+              parameters: RelocalizerParameters, map_hash: str, stages_ms: Mapping[str, float]
+              ) -> Answer:
+    """Return the answer that a frame gives, before its pose is published.
+
+    `state` is the robot's state at the stamp of the frame, `map_hash` that of the searched map.
+    """
+    found = localized.found
+    header = Header(stamp=frame.image.header.stamp, frame_id=localized.landmark_map.frame_id)
+    evidence, points, depth = found.evidence, found.recognized, found.depth
+    stamp, seen = header.stamp, localized.seen.observation
+    figures: dict[str, object] = {
+        'stamp [s]': f'{stamp.sec}.{stamp.nanosec:09d}', 'frame': header.frame_id,
+        'source': found.source if found.solved else '', 'confidence': found.confidence,
+        'confidence needed': parameters.min_confidence if evidence is None else
+        needed_confidence(evidence, parameters.options()),
+        'score': found.score, 'landmarks': 0 if evidence is None else evidence.inliers,
+        'frames': len(found.frame_matches), 'hypotheses': found.tried,
+        'searched percent': 100.0 * found.coverage, 'crops': '' if seen.similarities is None else
+        f'{localized.compared} of {len(seen.detections)}',
+        'keyframe points': 0 if points is None else points.inliers,
+        'keyframe search': found.keyframe_search,
+        'depth': '' if depth is None else f'depth of {depth.objects} objects' if depth.is_passed
+        else 'depth contradicts the boxes',
+        'cameras': len(localized.query.frames), 'left out': ', '.join(localized.left_out),
+        'prior': 0.0 if evidence is None else evidence.prior,
+        **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in stages_ms.items()}}
+    # the reason of a refusal may state the confidence already, with other rounding
+    said = ', '.join(phrase.format_map(figures) for name, usual, phrase in _PHRASES
+                     if figures[name] not in usual
+                     and not (name == 'confidence' and name in found.reason))
+    summary = f'[{said}; {in_words(stages_ms)}]'
+    answer = Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, frame.received_at,
+                    localized.query, localized.is_cut, stages_ms, map_hash, found.refusal_kind,
+                    header, figures)
+    if not found.accepted:
+        return answer
+    assert found.covariance is not None and found.map_from_camera is not None
+    map_from_base = found.map_from_camera @ state.camera_from_base
+    pose = pose_with_covariance_msg(header, map_from_base, move_covariance(
+        found.covariance, map_from_base[:3, 3] - found.map_from_camera[:3, 3]))
+    # the heading of a robot is its x axis, that of a camera its viewing direction (z axis)
+    ahead = map_from_base[:2, 0 if parameters.base_frame else 2]
+    heading_deg = math.degrees(math.atan2(ahead[1], ahead[0]))
+    covariance, p, q = pose.pose.covariance, pose.pose.pose.position, pose.pose.pose.orientation
+    position_m = math.sqrt(sum(covariance[:15:7]))
+    turn_deg = math.degrees(math.sqrt(covariance[35]))
+    return replace(answer, verdict=Verdict.ACCEPTED, pose=pose, pose_figures={
+        'x [m]': p.x, 'y [m]': p.y, 'z [m]': p.z,
+        'orientation xyzw': f'{q.x} {q.y} {q.z} {q.w}', 'heading [deg]': f'{heading_deg:.2f}',
+        'position deviation [m]': f'{position_m:.4f}',
+        'heading deviation [deg]': f'{turn_deg:.3f}',
+        'covariance': ' '.join(map(repr, map(float, covariance)))}, detail=(
+            f'x {p.x:.2f} y {p.y:.2f} z {p.z:.2f} m in {header.frame_id}, heading '
+            f'{heading_deg:.0f} deg, deviation {position_m:.2f} m and {turn_deg:.1f} deg '
+            f'{summary}'))
+
+
 def answer_msg(answer: Answer, node: str) -> DiagnosticArray:
     """Return an answer as a diagnostic message with the keys that doc/interface.md describes.
 
     `node` is the name of the relocalizer with its namespace.
     """
     level = {Verdict.ACCEPTED: DiagnosticStatus.OK, Verdict.FAILED: DiagnosticStatus.ERROR}
-    header, name = answer.header or Header(), node.lstrip('/')
-    seen = {} if answer.header is None else {
-        'stamp [s]': f'{header.stamp.sec}.{header.stamp.nanosec:09d}', 'frame': header.frame_id}
-    pose: dict[str, object] = {}
-    if answer.pose is not None:
-        of_pose = answer.pose.pose
-        p, q = of_pose.pose.position, of_pose.pose.orientation
-        position_m, turn_deg = deviations(np.reshape(of_pose.covariance, (6, 6)))
-        pose = {'x [m]': p.x, 'y [m]': p.y, 'z [m]': p.z,
-                'orientation xyzw': f'{q.x} {q.y} {q.z} {q.w}',
-                'heading [deg]': f'{answer.heading_deg:.2f}',
-                'position deviation [m]': f'{position_m:.4f}',
-                'heading deviation [deg]': f'{turn_deg:.3f}',
-                'covariance': ' '.join(map(repr, map(float, of_pose.covariance)))}
+    name = node.lstrip('/')
     values = {'answer': answer.number, 'verdict': answer.verdict, 'kind': answer.kind or '',
-              **seen, **answer.figures,
-              **pose,
-              **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in answer.stages_ms.items()},
-              'map hash': answer.map_hash}
-    return DiagnosticArray(header=header, status=[DiagnosticStatus(
+              **answer.figures, **answer.pose_figures, 'map hash': answer.map_hash}
+    return DiagnosticArray(header=answer.header or Header(), status=[DiagnosticStatus(
         level=level.get(answer.verdict, DiagnosticStatus.WARN), name=f'{name}: answer',
         message=answer.message, hardware_id=name,
         values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
-
-
-def deviations(covariance: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the standard deviations of position [m] and heading [deg] of a covariance (6, 6)."""
-    return math.sqrt(np.trace(covariance[:3, :3])), math.degrees(math.sqrt(covariance[5, 5]))
 
 
 class RequestCounters:

@@ -33,7 +33,7 @@ from cliploc_ros.messages import (
     image_from_msg,
     parse_class_map,
 )
-from cliploc_ros.ros.answer import Verdict
+from cliploc_ros.ros.answer import Verdict, answer_to
 from cliploc_ros.ros.conversions import of_camera
 from cliploc_ros.ros.frame_localizer import (
     FrameLocalizer,
@@ -129,7 +129,7 @@ class Doctor(ManagedNode[RelocalizerParameters]):
         parameters, self.wrong_cameras = self.settings.values, wrong_cameras
         self.robot = RobotStateSource(self)
         self.frames = CameraRig(self, parameters, math.inf)
-        self.handoff = HandOff(self, self.robot.odometry)
+        self.handoff = HandOff(self, self.robot.odometry, self.robot.transforms)
 
     def load(self) -> str:
         """Load nothing: the inputs are checked even if the map is bad."""
@@ -366,21 +366,19 @@ def _check_request(node: Doctor, parameters: RelocalizerParameters,
         if parameters.depth_transport != 'none':
             for camera_frame, state in ((frame, known.state), *known.beside):
                 _check_depth(camera_frame, state, parameters, report)
-        times = StageTimes('waiting', time.monotonic())
-        localized = node.worker.run(partial(
-            localizer.localize, frame, parameters, known, times))
-        stages_ms = {'detection': 1e3 * (frame.detected_at - frame.received_at), **times.ms}
-        is_slow = sum(stages_ms.values()) > 1e3 * parameters.timeout_s
-        report.judge('time', time_is_up(stages_ms) if is_slow else '',
-                     f'{in_words(stages_ms)}; timeout_s {parameters.timeout_s:g}')
-        found = localized.found
-        if found.accepted and node.wrong_cameras:
+        now, detection_s = time.monotonic(), frame.detected_at - frame.received_at
+        times = StageTimes('detection', now - detection_s)
+        times.begin('waiting', now)
+        localized = node.worker.run(partial(localizer.localize, frame, parameters, known, times,
+                                            now - detection_s + parameters.timeout_s))
+        answer = answer_to(frame, localized, known.state, parameters, localizer.map_hash, times.ms)
+        is_slow = answer.is_cut or sum(answer.stages_ms.values()) > 1e3 * parameters.timeout_s
+        report.judge('time', time_is_up(answer.stages_ms) if is_slow else '',
+                     f'{in_words(answer.stages_ms)}; timeout_s {parameters.timeout_s:g}')
+        if answer.verdict is Verdict.ACCEPTED and node.wrong_cameras:
             report.add('pose', State.REFUSED, f'the relocalizer refuses it: {node.wrong_cameras}')
-        elif found.accepted:
-            report.add('pose', State.PASS,
-                       f'accepted with confidence {found.confidence:.3f}; not published')
         else:
-            report.add('pose', State.REFUSED, found.reason)
+            report.add('pose', State.REFUSED if answer.kind else State.PASS, answer.message)
 
 
 def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) -> None:

@@ -28,10 +28,16 @@ from rclpy.timer import Timer
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
-from cliploc_ros.core.geometry.transforms import SAME_SPOT, TAKEN, Tolerance, pose_error
+from cliploc_ros.core.geometry.transforms import (
+    SAME_SPOT,
+    TAKEN,
+    Tolerance,
+    invert_transform,
+    pose_error,
+)
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import pose_to_msg, stamp_ns
+from cliploc_ros.ros.conversions import pose_from_msg, pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
@@ -44,6 +50,8 @@ _MIN_VARIANCES = (1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5)
 _MAX_ODOM_AGE_S = 2.0
 # Longest wait for the first message of odometry that has a publisher, including discovery.
 _ODOM_PATIENCE_S = 2.0
+# Longest wait for odometry at the pose of the localizer, whose scan may be newer.
+_CARRY_S = 0.2
 _POLL_S = 0.1
 # AMCL publishes a new pose after its next scan. If it has not by then, initialpose was lost.
 _REPEAT_S = 1.0
@@ -69,12 +77,13 @@ class NoLocalizerError(HandOffError):
 class HandOff:
     """Publishes `initialpose` for a robot at rest, and lets its localizer converge.
 
-    `odometry` must be open: it detects motion of the robot.
+    `odometry` must be open: it detects motion of the robot. `transforms` looks up its frame.
     """
 
-    def __init__(self, node: Node, odometry: OdometrySource) -> None:
-        self._node = node
-        self._odometry = odometry
+    def __init__(self, node: Node, odometry: OdometrySource, transforms: CoordinateFrames
+                 ) -> None:
+        self._node, self._odometry, self._transforms = node, odometry, transforms
+        self._base_frame = ''
         self._changed = threading.Condition()
         self._stopped = threading.Event()
         # The localizer's latest pose since initialpose was last published.
@@ -129,9 +138,10 @@ class HandOff:
                   deadline: float, received_at: float, jumps: TimeJumps) -> None:
         """Publish a pose on `initialpose` until the localizer takes it, and let it converge.
 
-        The localizer has taken the pose when it publishes a pose that agrees. `initialpose` is
-        then not repeated. The localizer must still run after it has converged: it answers each
-        update or publishes another pose, and its topics exist at the end.
+        The localizer has taken the pose when it publishes a pose that agrees, after odometry has
+        carried the given pose to its stamp. `initialpose` is then not repeated. The localizer must
+        still run after it has converged: it answers each update or publishes another pose, and its
+        topics exist at the end.
 
         Parameters
         ----------
@@ -152,6 +162,7 @@ class HandOff:
         TimeJumpError
             Time has jumped back since the image.
         """
+        self._base_frame = parameters.base_frame
         if not parameters.base_frame:
             self._node.get_logger().warning(
                 "base_frame is empty, so initialpose is the camera's pose; for AMCL set "
@@ -161,9 +172,10 @@ class HandOff:
         must_show = parameters.require_localizer and self._subscription is not None
         given, times, begun_at = pose, 0, time.monotonic()
         while not times or (must_show and not self._is_shown(given, deadline)):
+            # first, because with any time left a robot that moves is told to stop
+            self.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s, deadline)
             if must_show and _left_s(deadline) < _LEAST_S:
                 raise NoLocalizerError(self._not_taken(given, times, begun_at))
-            self.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s, deadline)
             self._check_place(pose.header.stamp, deadline)
             jumps.check(pose.header.stamp, received_at)
             if self._stopped.is_set():
@@ -175,7 +187,7 @@ class HandOff:
         if must_show and (gone := silent or self.missing()):
             raise NoLocalizerError('the localizer took the pose, but has ended or hangs: '
                                    f'{gone}; see its log, then retry')
-        if must_show and not is_taken(given, self._shown):
+        if must_show and not self._is_taken(given, _CARRY_S):
             raise NoLocalizerError(self._not_taken(given, times, begun_at))
         if silent:
             self._node.get_logger().warning(
@@ -209,9 +221,31 @@ class HandOff:
         """Return whether the localizer's pose agrees with `given`; wait briefly for that."""
         with self._changed:
             self._changed.wait_for(
-                lambda: self._stopped.is_set() or is_taken(given, self._shown),
+                lambda: self._stopped.is_set() or self._is_taken(given),
                 min(_REPEAT_S, _left_s(deadline)))
-            return is_taken(given, self._shown)
+            return self._is_taken(given)
+
+    def _is_taken(self, given: PoseWithCovarianceStamped, patience_s: float = 0.0) -> bool:
+        """Return whether the localizer's pose agrees with `given`; wait for odometry at it."""
+        shown = self._shown
+        return shown is not None and is_taken(
+            self._carried(given, shown.header.stamp, patience_s), shown)
+
+    def _carried(self, given: PoseWithCovarianceStamped, stamp: Stamp, patience_s: float = 0.0
+                 ) -> PoseWithCovarianceStamped:
+        """Return a given pose, moved by odometry to a stamp; unchanged if that is unknown."""
+        pose = pose_from_msg(given.pose.pose)
+        try:
+            motion, frame = self._odometry.motion(given.header.stamp, stamp, patience_s)
+            base_from_body = np.eye(4) if frame == self._base_frame else self._transforms.lookup(
+                self._base_frame, frame, given.header.stamp, 0.0)
+        except CliplocError:
+            return given
+        assert pose is not None  # it was accepted
+        carried = deepcopy(given)
+        carried.pose.pose = pose_to_msg(
+            pose @ base_from_body @ motion @ invert_transform(base_from_body))
+        return carried
 
     def _not_taken(self, given: PoseWithCovarianceStamped, times: int, begun_at: float) -> str:
         """Return why the localizer has not taken the given pose, for a message."""
@@ -226,6 +260,7 @@ class HandOff:
         if frames[0] != frames[1]:
             return (f"{why}{self._pose_topic} is in frame '{frames[0]}', the pose in "
                     f"'{frames[1]}': correct the map's frame_id")
+        given = self._carried(given, shown.header.stamp)
         distance_m, angle_deg = pose_error(_planar(given), _planar(shown))
         near = tolerance_of(given)
         return (f'{why}{self._pose_topic} differs from it by {distance_m:.2f} m and '

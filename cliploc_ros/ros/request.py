@@ -11,16 +11,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import count
+from typing import NamedTuple
 
-import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_msgs.msg import Header
 
-from cliploc_ros.core.acceptance.verdict import RefusalKind, needed_confidence
+from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict, deviations
+from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict, answer_to
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
 from cliploc_ros.ros.handoff import HandOff, HandOffError, MapToOdom, NoLocalizerError
@@ -29,7 +29,7 @@ from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
-from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
+from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.visualization import Visualization
@@ -43,22 +43,31 @@ _GRACE_S = 0.2
 # Refusals of images without objects of the map.
 _WITHOUT_OBJECTS = (RefusalKind.TOO_FEW_OBJECTS, RefusalKind.WRONG_DETECTIONS)
 
-_SMALLER = 'choose a faster profile or a smaller'
 # The name of each stage in messages, and how to make it faster.
-_STAGES = {'image': 'waiting for an image with detections', 'detection': 'the detector',
-           'waiting': 'waiting for earlier work or for /tf', 'decoding': 'reading the image',
-           'CLIP': 'CLIP', 'search': 'the search', 'keyframes': 'matching keyframes'}
-_REMEDIES = {'image': 'raise the rate of the camera or of the detector',
-             'detection': f'{_SMALLER} detector',
-             'waiting': 'retry', 'decoding': 'use smaller images', 'CLIP': f'{_SMALLER} CLIP',
-             'search': 'lower iterations or time_budget_ms',
-             'keyframes': "set keyframes_file to ''"}
+_STAGES = {
+    'image': ('waiting for an image with detections',
+              'raise the rate of the camera or of the detector'),
+    'detection': ('the detector', 'choose a faster profile or a smaller detector'),
+    'waiting': ('waiting for earlier work or for /tf', 'retry'),
+    'decoding': ('reading the image', 'use smaller images'),
+    'CLIP': ('CLIP', 'choose a faster profile or a smaller CLIP'),
+    'search': ('the search', 'lower iterations or time_budget_ms'),
+    'keyframes': ('matching keyframes', "set keyframes_file to ''")}
+
+
+class Look(NamedTuple):
+    """The result of one frame, which is not published yet."""
+
+    answer: Answer
+    localized: Localized
+    state: RobotState  #: The robot at the stamp of the frame
+    image: Header  #: Of the image of the frame
 
 
 class Pipeline:
     """Localizes with one frame at a time and publishes the result.
 
-    All methods run in the node's worker thread.
+    All methods except `publish` run in the node's worker thread.
     """
 
     def __init__(self, node: ManagedNode[RelocalizerParameters], robot: RobotStateSource,
@@ -88,8 +97,8 @@ class Pipeline:
         self._visualization.set_map(None)
 
     def localize(self, frame: Frame, times: StageTimes | None = None,
-                 deadline: float = math.inf) -> Answer:
-        """Localize with one frame and publish the result.
+                 deadline: float = math.inf) -> Look:
+        """Localize with a frame; publish nothing, because the request may end meanwhile.
 
         `times` start when the image arrived by default. No crops are compared after `deadline`
         (monotonic clock) [s].
@@ -97,8 +106,7 @@ class Pipeline:
         Raises
         ------
         TimeJumpError
-            Time jumped back since the frame arrived, or, with publish_tf, odometry restarted.
-            Nothing was published.
+            Time jumped back since the frame arrived.
         CliplocError
             The frame or the parameters are invalid.
         """
@@ -109,27 +117,43 @@ class Pipeline:
         self._node.check_active()
         localizer = self.localizer
         assert localizer is not None  # an active node has loaded it
-        image = frame.image.header
-        self._jumps.check(image.stamp, frame.received_at)
+        self._jumps.check(frame.image.header.stamp, frame.received_at)
         known = self._robot.at_instant(frame, parameters, localizer.frame_ids, localizer.map_hash,
                                        deadline)
         localized = localizer.localize(frame, parameters, known, times, deadline)
-        state = known.state
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
         if faults := '; '.join(fault.text for fault in localizer.instants.faults):
             self._node.get_logger().warning(faults, throttle_duration_sec=_LOG_PERIOD_S)
+        return Look(answer_to(frame, localized, known.state, parameters, localizer.map_hash,
+                              stages_ms), localized, known.state, frame.image.header)
+
+    def publish(self, look: Look, deadline: float = math.inf) -> Answer:
+        """Publish the result of a frame; return its answer, withheld if its tf is missing.
+
+        No transform is waited for after `deadline` (monotonic clock) [s].
+
+        TimeJumpError: time jumped back since the frame arrived, or, with publish_tf, odometry
+        restarted. Nothing was published.
+        """
+        answer, localized, state, image = look
+        found, pose, header = localized.found, answer.pose, answer.header
         self._node.check_active()
-        self._jumps.check(image.stamp, frame.received_at)
-        header = Header(stamp=image.stamp, frame_id=localized.landmark_map.frame_id)
-        found = localized.found
-        answer = Answer(Verdict.REFUSED, f'{found.reason} {_summary(localized, stages_ms)}',
-                        None, frame.received_at, localized.query, localized.is_cut, stages_ms,
-                        localizer.map_hash, found.refusal_kind, header,
-                        _figures(localized, parameters))
-        if found.accepted:
-            answer = self._publish(header, localized, state, replace(
-                answer, verdict=Verdict.ACCEPTED, detail=_summary(localized, stages_ms)))
+        self._jumps.check(image.stamp, answer.received_at)
+        assert header is not None
+        if pose is not None:
+            assert found.map_from_camera is not None and localized.for_filter is not None
+            parameters = self._node.settings.snapshot()
+            parameters = replace(parameters, tf_timeout_s=min(
+                parameters.tf_timeout_s, max(0.0, deadline - time.monotonic())))
+            map_from_base = found.map_from_camera @ state.camera_from_base
+            try:
+                self._map_to_odom.update(header, map_from_base, parameters, answer.received_at)
+            except NoTransformError as error:
+                answer = answer.withheld(f'publish_tf: {error}')
+            self._pose.publish(pose_with_covariance_msg(header, map_from_base, move_covariance(
+                localized.for_filter, map_from_base[:3, 3] - found.map_from_camera[:3, 3])))
+            self._robot.prior.keep(pose, parameters, answer.map_hash)
         self._visualization.show(header, localized.landmark_map, found, state.camera_from_base)
         if self._visualization.wants_debug_image:  # drawn later, so that it delays no answer
             self._node.worker.submit(partial(
@@ -143,35 +167,6 @@ class Pipeline:
                                     else localizer.keyframes.localizer.layer)
         self.on_map()
         return localizer
-
-    def _publish(self, header: Header, localized: Localized, state: RobotState,
-                 answer: Answer) -> Answer:
-        """Publish an accepted pose; return the answer with it, withheld if its tf is missing."""
-        found = localized.found
-        assert found.covariance is not None and found.map_from_camera is not None
-        assert localized.for_filter is not None
-        map_from_base = found.map_from_camera @ state.camera_from_base
-        lever = map_from_base[:3, 3] - found.map_from_camera[:3, 3]
-        pose, for_filter = (pose_with_covariance_msg(header, map_from_base, move_covariance(
-            covariance, lever)) for covariance in (found.covariance, localized.for_filter))
-        parameters = self._node.settings.snapshot()
-        x, y, z = map_from_base[:3, 3]
-        # the heading of a robot is its x axis, that of a camera its viewing direction (z axis)
-        ahead = map_from_base[:2, 0 if parameters.base_frame else 2]
-        heading_deg = math.degrees(math.atan2(ahead[1], ahead[0]))
-        position_m, turn_deg = deviations(np.reshape(pose.pose.covariance, (6, 6)))
-        answer = replace(answer, pose=pose, detail=(
-            f'x {x:.2f} y {y:.2f} z {z:.2f} m in {header.frame_id}, heading {heading_deg:.0f} '
-            f'deg, deviation {position_m:.2f} m and {turn_deg:.1f} deg {answer.detail}'),
-            heading_deg=heading_deg)
-        try:
-            self._map_to_odom.update(header, map_from_base, parameters, answer.received_at)
-        except NoTransformError as error:
-            answer = replace(answer, verdict=Verdict.WITHHELD, pose=None,
-                             detail=f'publish_tf: {error} (accepted: {answer.detail})')
-        self._pose.publish(for_filter)
-        self._robot.prior.keep(pose, parameters, answer.map_hash)
-        return answer
 
 
 class Requests:
@@ -237,8 +232,10 @@ class Requests:
                 frame = self._frames.next_frame(after, deadline)
                 times.begin('detection', frame.received_at)
                 times.begin('waiting', frame.detected_at)
-                answer = self._node.worker.run(
-                    partial(self._look, frame, times, deadline), deadline)
+                # published here and not by the worker, which goes on after a time-out
+                answer = self._pipeline.publish(self._node.worker.run(
+                    partial(self._pipeline.localize, frame, times, deadline), deadline), deadline)
+                self._cases.add(answer)
                 answer, may_go_on = self._hand_over(answer, deadline)
             except (TimeJumpError, NoTransformError) as error:  # a newer frame may work
                 problem, after = error, time.monotonic()
@@ -271,12 +268,6 @@ class Requests:
         return replace(last, detail=f'{last.detail} [{looks} frames in '
                                     f'{time.monotonic() - arrived_at:.1f} s]')
 
-    def _look(self, frame: Frame, times: StageTimes, deadline: float) -> Answer:
-        """Localize with a frame and record it; runs in the worker's thread."""
-        answer = self._pipeline.localize(frame, times, deadline)
-        self._cases.add(answer)
-        return answer
-
     def _hand_over(self, answer: Answer, deadline: float) -> tuple[Answer, bool]:
         """Deliver an accepted pose; return the answer, and whether another frame may help."""
         if answer.pose is None:
@@ -285,60 +276,13 @@ class Requests:
             self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
                                     answer.received_at, self._jumps)
         except HandOffError as error:
-            return (replace(answer, verdict=Verdict.WITHHELD, pose=None,
-                            detail=f'{error} ({answer.message})'),
-                    not isinstance(error, NoLocalizerError))
+            return answer.withheld(str(error)), not isinstance(error, NoLocalizerError)
         return answer, False
-
-
-def _summary(localized: Localized, stages_ms: Mapping[str, float]) -> str:
-    found, seen = localized.found, localized.seen.observation
-    crops = '' if seen.similarities is None else \
-        f', CLIP of {localized.compared} of {len(seen.detections)} crops'
-    keyframes = '' if found.source == 'objects' else f', pose by {found.source}'
-    if found.recognized is not None:
-        keyframes += f', {found.recognized.inliers} points of keyframes agree'
-    if found.keyframe_search == 'thorough':
-        keyframes += ', thorough search of keyframes'
-    count = len(localized.query.frames)
-    cameras = f', {count} cameras' if count > 1 else ''
-    if localized.left_out:
-        cameras += f', no image of {", ".join(localized.left_out)}'
-    depth = ''
-    if found.depth is not None:
-        depth = f', depth of {found.depth.objects} objects' if found.depth.is_passed \
-            else ', depth contradicts the boxes'
-    prior = ''
-    if found.evidence is not None and found.evidence.prior:
-        prior = f', prior {found.evidence.prior:.1f}'
-    # do not repeat, with other rounding, a confidence that the reason of a refusal already states
-    confidence = '' if 'confidence' in found.reason else f'confidence {found.confidence:.3f}, '
-    frames = f' in {len(found.frame_matches)} frames' if len(found.frame_matches) > 1 else ''
-    return (f'[{confidence}score {found.score:.2f}, '
-            f'{0 if found.evidence is None else found.evidence.inliers} landmarks{frames}, '
-            f'{found.tried} hypotheses, '
-            f'{100 * found.coverage:.3g} % of the search{crops}{keyframes}{depth}{cameras}'
-            f'{prior}; '
-            f'{in_words(stages_ms)}]')
-
-
-def _figures(localized: Localized, parameters: RelocalizerParameters) -> dict[str, object]:
-    """Return the values that decided the answer to a frame, for its diagnostic message."""
-    found = localized.found
-    evidence, points = found.evidence, found.recognized
-    needed = parameters.min_confidence if evidence is None else needed_confidence(
-        evidence, parameters.options())
-    return {'source': found.source if found.solved else '', 'frames': len(found.frame_matches),
-            'cameras': len(localized.query.frames), 'confidence': f'{found.confidence:.6f}',
-            'confidence needed': f'{needed:g}',
-            'landmarks': 0 if evidence is None else evidence.inliers,
-            'keyframe points': 0 if points is None else points.inliers,
-            'keyframe search': found.keyframe_search}
 
 
 def time_is_up(stages_ms: Mapping[str, float]) -> str:
     """Return a message with the slowest stage of a request and its remedy."""
     stage = max(stages_ms, key=lambda name: stages_ms[name])
-    total_s = sum(stages_ms.values()) / 1e3
-    return (f'time is up: {_STAGES[stage]} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; '
-            f'{_REMEDIES[stage]}, or raise timeout_s')
+    (name, remedy), total_s = _STAGES[stage], sum(stages_ms.values()) / 1e3
+    return (f'time is up: {name} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; {remedy}, '
+            'or raise timeout_s')

@@ -6,6 +6,8 @@ A separate thread waits for frames and transforms. Only the check itself runs in
 and no check begins while a request is being answered. Thus the watch never delays a request.
 """
 
+import math
+import re
 import threading
 import time
 import traceback
@@ -48,6 +50,8 @@ _LEAST_S, _DUTY = 1.0, 0.1
 # After a move [m] or a turn [deg] of this size the camera sees other objects.
 _WAY_M, _TURN_DEG = 1.0, 90.0
 _POLL_S = 0.1
+# Least time between two log lines of one state, which state different problems.
+_SAY_PERIOD_S = 30.0
 # A camera at 1 Hz and a detector that takes one second complete a frame within this time.
 _FRAME_PATIENCE_S = 5.0
 # Without a check for this long, the verdict is no longer valid.
@@ -100,6 +104,8 @@ class Watcher:
         # Checks that began before this number changed are discarded.
         self._age = 0
         self._cost_s = 0.0
+        # The state and the problem that were logged last, and when (monotonic clock) [s].
+        self._said, self._said_at = (WatchState.UNCERTAIN, ''), -math.inf
         # Reaction to a lost robot, and whether it is at rest.
         self._reaction, self._is_at_rest = '', False
         self._rest_stamp: Time | None = None
@@ -179,8 +185,11 @@ class Watcher:
                 except PoselessError as error:
                     self._miss(stopped, str(error))
                     self._wake_up(stopped)
-                else:
-                    self._react(stopped, stamp)
+                else:  # relocalize a lost robot at rest if on_lost asks for it
+                    if self._known.state is WatchState.LOST and stamp is not None:
+                        self._relocalize_at_rest(stopped, stamp, 'lost')
+                    else:
+                        self._rest_stamp = None
             except StoppedError:
                 return
             except (NoFrameError, NoTransformError, LaterError, TimeJumpError, TimeUpError
@@ -256,7 +265,11 @@ class Watcher:
             self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if known.state is not WatchState.LOST:
             self._is_at_rest = False
-        if (known.state, known.problem) != (before.state, before.problem):
+        # stamps and ages make each problem a new text
+        now, said = time.monotonic(), (known.state, re.sub(r'\d[\d.]*', '', known.problem))
+        if said != self._said and (known.state is not before.state
+                                   or now >= self._said_at + _SAY_PERIOD_S):
+            self._said, self._said_at = said, now
             text = f'watch: {known.problem or known.reason}'
             if known.state is WatchState.LOST:
                 self._node.get_logger().warning(text)
@@ -284,13 +297,6 @@ class Watcher:
 
     # ---- what follows ---------------------------------------------------------------------------
 
-    def _react(self, stopped: threading.Event, stamp: Time | None) -> None:
-        """Relocalize a lost robot at rest if on_lost asks for it, at increasing intervals."""
-        if self._known.state is not WatchState.LOST or stamp is None:
-            self._rest_stamp = None
-            return
-        self._relocalize_at_rest(stopped, stamp, 'lost')
-
     def _wake_up(self, stopped: threading.Event) -> None:
         """Relocalize after a restart of the localizer: it has no pose, but had one before."""
         is_wanted = self._node.settings.values.on_lost != 'report' and self._had_pose
@@ -298,6 +304,7 @@ class Watcher:
             self._relocalize_at_rest(stopped, self._image_stamp, 'the localizer has no pose')
 
     def _relocalize_at_rest(self, stopped: threading.Event, stamp: Time, why: str) -> None:
+        """Relocalize a robot at rest at increasing intervals, unless on_lost is report."""
         parameters = self._node.settings.values
         self._reaction = self._why_not_at_rest(parameters, stamp)
         self._is_at_rest = not self._reaction

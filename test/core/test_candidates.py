@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Candidates of each detection by class, label and image, in small and large maps."""
 
+import threading
+import time
 from dataclasses import replace
 from math import comb
 
@@ -13,8 +15,10 @@ from reference import candidate_mask, same_class, verify
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
+from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.culling import FEW
 from cliploc_ros.core.map.landmark_details import LEAST_CLASS_SHARE, LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, with_images
@@ -25,7 +29,8 @@ from cliploc_ros.core.map.similarities import (
     nearest_landmarks,
 )
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.options import RelocalizerOptions, used_time_s
+from cliploc_ros.core.options import Deadline, RelocalizerOptions
+from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search import frame_search
 from cliploc_ros.core.search.frame_search import (
@@ -230,7 +235,8 @@ def time_budget_is_kept(observation, landmark_map, frames):
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(iterations=1_000_000,
                                                                time_budget_s=0.05))
     relocalizer.warm_up()
-    earlier = [relocalizer.search(observation, used_time_s() + 0.05)] * (frames - 1)
+    earlier = [relocalizer.search(observation, Deadline(time.thread_time() + 0.05))] \
+        * (frames - 1)
     took_ms = {}
     for budget_s in (1e-3, 0.05):
         took_ms[budget_s] = []
@@ -238,14 +244,29 @@ def time_budget_is_kept(observation, landmark_map, frames):
             budget = replace(relocalizer.begin(frames), total_s=budget_s)
             newest = relocalizer.search(observation, budget.search_end())
             found = relocalizer.locate([*earlier, newest], budget)
-            took_ms[budget_s].append(1e3 * (used_time_s() - budget.start))
+            took_ms[budget_s].append(1e3 * (time.thread_time() - budget.start))
     least_ms, took_ms = took_ms.values()
     print(f'\n{len(landmark_map)} landmarks, {frames} frames, 50 ms: took {min(took_ms):.1f} to '
           f'{max(took_ms):.1f} ms, without a budget {min(least_ms):.1f}, {found.tried} '
           f'hypotheses, {100 * found.coverage:.3g} % of all samples')
-    refined_ms = 1e3 * (budget.refinement_end - budget.start)
+    refined_ms = 1e3 * (budget.refinement_end.used_s - budget.start)
     assert min(took_ms) < max(55.0, refined_ms + min(least_ms))
     return found
+
+
+def test_other_programs_do_not_cut_a_search_but_the_end_of_its_request_does():
+    """The thread waits for ten times its budget, as on a busy machine."""
+    landmark_map, observation = make_world(60)
+    relocalizer = Relocalizer(landmark_map, RelocalizerOptions(time_budget_s=0.05))
+    relocalizer.warm_up()
+    waiting = relocalizer.begin(1)
+    threading.Event().wait(0.6)
+    assert not waiting.search_end().is_over and not waiting.refinement_end.is_over
+    late = relocalizer.begin(1, request=time.monotonic())
+    assert late.search_end().is_over and late.refinement_end.is_over
+    cut = Localizer(relocalizer).answer(Query((observation,)), deadline=time.monotonic())
+    assert cut.tried < Localizer(relocalizer).answer(Query((observation,))).tried
+    assert cut.refusal_kind == RefusalKind.SEARCH_CUT_SHORT
 
 
 @pytest.mark.clock

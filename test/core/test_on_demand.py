@@ -18,7 +18,7 @@ from cliploc_ros.core.localizer import (
 )
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.options import NEVER, RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 
@@ -42,7 +42,7 @@ class Searches(Relocalizer):
         super().__init__(ROOM, options)
         self.seen = []
 
-    def search(self, observation, deadline=np.inf):
+    def search(self, observation, deadline=NEVER):
         self.seen.append(observation)
         return super().search(observation, deadline)
 

@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.options import NEVER, Deadline, RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 
 FINE = np.diag([1e-4] * 3 + [1e-5] * 3)
@@ -159,7 +159,8 @@ def test_a_dozen_points_do_not_override_what_objects_lack(cause):
             looks = looks.with_look(Look(replace(seen, stamp_ns=stamp_ns), moved(9.0), 0.3))
     relocalizer = Relocalizer(ROOM, options)
     relocalizer.warm_up()
-    frame = relocalizer.search(seen, -1.0 if cause == 'a search cut short' else np.inf)
+    frame = relocalizer.search(
+        seen, Deadline(-1.0) if cause == 'a search cut short' else NEVER)
     found = relocalizer.locate([frame], looks=looks, recognizer=Says(place(0.0, inliers=12)))
     assert not found.accepted, found
 

@@ -12,18 +12,19 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from processes import wait_for
 from rclpy.qos import qos_profile_system_default
-from scene import write_map
+from scene import make_layer, write_map
 from std_msgs.msg import Header
 from test_prior_node import SEARCH, TWINS, at
 from tester import class_matching, make_frame
 
+from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.ros.qos import LATCHED
 
 LINE = re.compile('^(.{12}) (pass|fail|not checked|refused) +(.*)$', re.MULTILINE)
 WHOLE = {'parameters': 'valid', 'map': '12 landmarks', 'camera': '640 x 480 px',
          'clock': 'images come', 'calibration': '65 degrees wide', 'tf': '0.50 m above',
          'odometry': 'the robot is at rest', 'detector': '12 boxes', 'localizer': 'amcl_pose',
-         'time': 'search', 'pose': 'accepted with'}
+         'time': 'search', 'pose': 'accepted: x '}
 # Upright, and half a metre above the robot.
 MOUNT = [0.0, 0.0, 0.5, -0.70710678, 0.0, 0.0, 0.70710678]
 
@@ -111,6 +112,8 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
                     base_from_camera=MOUNT)
     found, code = examine('--relocalizer', '/relocalizer')
     assert code == 0
+    assert re.fullmatch(r'accepted: x 0\.\d+ y .* m in map, heading .* 12 landmarks, .*; map \w+',
+                        found['pose'][1])
     assert found['relocalizer'][0] == 'pass'
     for what, text in WHOLE.items():
         assert found[what][0] == 'pass' and text in found[what][1]
@@ -149,10 +152,12 @@ def test_what_is_broken_fails_with_what_to_do(examine, robot, what, text, broken
 
 
 def test_a_prior_decides_for_the_doctor_as_for_the_relocalizer(examine, tester, tmp_path):
-    """Of two rooms that look alike."""
+    """Of two rooms that look alike; the keyframes are searched as far as a request does it."""
     write_map(TWINS, tmp_path / 'twins.yaml')
+    save_layer(layer_path(tmp_path / 'twins.yaml'), make_layer(TWINS))
     parameters = {'map_file': str(tmp_path / 'twins.yaml'), **SEARCH}
-    assert 'look alike' in examine(**parameters)[0]['pose'][1]
+    refused = examine(**parameters)[0]['pose'][1]
+    assert 'look alike' in refused and ', thorough search of keyframes' in refused
     publisher = tester.create_publisher(PoseWithCovarianceStamped, 'relocalizer/prior', LATCHED)
     publisher.publish(at(0.0))
     assert 'accepted' in examine(**parameters)[0]['pose'][1]

@@ -164,6 +164,19 @@ def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester
     assert 'internal error' not in watched.process.output()
 
 
+def test_a_dead_localizer_is_logged_once_however_long_it_is_dead(watch):
+    """Its age in the message grows with each look."""
+    watched = watch()
+    watched.until_state('localized')
+    watched.robot.has_localizer = watched.robot.has_odom = False
+    watched.until_reason('s older than the image')
+    watched.looks(4)
+    assert watched.process.output().count('s older than the image') == 1
+    watched.robot.has_localizer = watched.robot.has_odom = True
+    watched.until_state('localized')
+    assert watched.process.output().count('watch: localized') == 2, 'changes are logged'
+
+
 @pytest.mark.full
 def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
     """The robot continues to drive, and nothing is done until it stands."""

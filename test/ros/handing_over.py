@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Empty
 
 from cliploc_ros.ros.handoff import HandOff
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -65,7 +66,7 @@ class Robot:
         self.node, self.wait = make_node('relocalizer'), wait
         self.localizer = Localizer(make_node('amcl'))
         self.odometry = OdometrySource(self.node)
-        self.handoff = HandOff(self.node, self.odometry)
+        self.handoff = HandOff(self.node, self.odometry, CoordinateFrames(self.node))
         self.jumps = TimeJumps(self.node, self.odometry.forget)
 
     def hand_over(self, timeout_s=10.0, **changes):
@@ -93,10 +94,10 @@ def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
     stand(robot, wheels, {moment_s: speed_m_s * moment_s for moment_s in moments_s}, twist_m_s)
 
 
-def stand(robot, wheels, places, twist_m_s=0.0, rad_per_m=0.0):
+def stand(robot, wheels, places, twist_m_s=0.0, rad_per_m=0.0, body=''):
     """Publish poses of the robot at times since the image, and wait until they are received."""
     for moment_s, x_m in places.items():
-        odometry = Odometry()
+        odometry = Odometry(child_frame_id=body)
         odometry.header.stamp = stamp(100.0 + moment_s)
         odometry.pose.pose.position.x, odometry.twist.twist.linear.x = x_m, twist_m_s
         odometry.pose.pose.orientation.z = math.sin(rad_per_m * x_m / 2)

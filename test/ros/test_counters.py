@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Counts of refusals by kind, and the hash of a map."""
+"""Counts of refusals by kind, an answer that is withheld, and the hash of a map."""
 
 import hashlib
 
 import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from scene import make_room, write_map
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.errors import MapError
-from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict
+from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.frame_localizer import load_hashed_map
 
 
@@ -24,6 +25,14 @@ def test_counts_add_up():
     assert {kind: values[f'refused: {kind}'] for kind in RefusalKind if values[f'refused: {kind}']
             } == {'ambiguous': 1}
     assert (values['requests total [s]'], values['requests longest [s]']) == ('3.500', '2.000')
+
+
+def test_a_withheld_answer_states_no_pose():
+    withheld = Answer(Verdict.ACCEPTED, 'here', PoseWithCovarianceStamped(), map_hash='ab',
+                      pose_figures={'x [m]': 1.0}).withheld('the robot moves')
+    status, = answer_msg(withheld, '/relocalizer').status
+    assert status.message == 'withheld: the robot moves (accepted: here; map ab); map ab'
+    assert withheld.pose is None and 'x [m]' not in {value.key for value in status.values}
 
 
 def test_the_hash_of_a_file_is_that_of_sha256sum(tmp_path):

@@ -112,12 +112,15 @@ def test_options_hold_from_the_next_frame_on(localizer, values):
 
 
 def test_a_camera_of_another_run_of_odometry_is_left_out_and_named(localizer, values):
+    """The images of an instant have one stamp, by which its cameras are recognized."""
     places = [RobotState(np.eye(4), place=OdometryPlace(np.eye(4), run, 0.0)) for run in (1, 1, 2)]
     frames = [replace(make_frame(), camera=name) for name in ('front', 'left', 'back')]
     first = replace(frames[0], left_out=('right',))
+    frames[1].image.header = Header(frame_id='camera', stamp=Time(sec=99, nanosec=980_000_000))
     found = localizer.localize(first, values, KnownBefore(places[0], list(zip(
         frames[1:], places[1:], strict=True))), timer())
-    assert [frame.camera_name for frame in found.query.frames] == ['left', 'front']
+    assert [(frame.camera_name, frame.stamp_ns) for frame in found.query.frames] == [
+        ('left', 100_000_000_000), ('front', 100_000_000_000)]
     assert found.left_out == ('right', 'back')
 
 

@@ -9,8 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 
 import pytest
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from handing_over import PARAMETERS, TEN_HZ, Robot, make_pose, tell
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from handing_over import PARAMETERS, TEN_HZ, Robot, make_pose, stamp, stand, tell
 
 from cliploc_ros.ros.handoff import (
     HandOffError,
@@ -144,7 +144,12 @@ def showing(served):
     node.create_subscription(PoseWithCovarianceStamped, 'initialpose', show, 10)
     served.handoff.open('amcl_pose')
     served.wait(lambda: not served.handoff.missing() and shows.get_subscription_count(), 'both')
-    localizer.show = lambda: show(make_pose())
+
+    def show_at(x_m, seconds):
+        pose = make_pose()
+        pose.pose.pose.position.x, pose.header.stamp = x_m, stamp(100.0 + seconds)
+        show(pose)
+    localizer.show = show_at
     yield served
     served.handoff.close()
 
@@ -158,13 +163,39 @@ def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):
     showing.localizer.may_answer.set()
 
 
-def test_a_localizer_that_answers_no_update_but_shows_its_pose_has_taken_it(showing):
+class RearTransforms:
+    """Replaces tf2's buffer: it knows a frame at the robot's origin, turned by 180 degrees."""
+
+    def lookup_transform(self, target, source, stamp, timeout):
+        if (target, source) != ('base_link', 'rear'):
+            raise LookupError('unknown frame')
+        found = TransformStamped()
+        found.transform.rotation.z, found.transform.rotation.w = 1.0, 0.0
+        return found
+
+
+@pytest.mark.parametrize(('x_m', 'driven_m', 'body', 'named'), [
+    (0.0, 0.0, 'base_link', ''), (2.0, 0.0, 'base_link', r'differs from it by 2\.00 m'),
+    (2.0, 2.0, 'base_link', ''), (0.0, 2.0, 'base_link', r'differs from it by 2\.00 m'),
+    (2.0, 2.0, 'wheels', r'differs from it by 2\.00 m'), (-2.0, 2.0, 'rear', '')])
+def test_where_the_localizer_is_once_it_has_settled_decides(showing, wheels, x_m, driven_m, body,
+                                                            named):
+    """It answers no update but shows a pose, also that of a robot that has driven off.
+
+    The robot drives after the pose was taken. Nobody places `wheels` at the robot; `rear` looks
+    back.
+    """
+    showing.handoff._transforms._buffer = RearTransforms()
+    stand(showing, wheels, dict.fromkeys((-0.1, 0.0, 0.1, 0.2, 0.3, 0.4), 0.0), body=body)
     showing.localizer.may_answer.clear()
     with ThreadPoolExecutor(1) as pool:
         handing_over = pool.submit(showing.hand_over)
         showing.wait(lambda: showing.localizer.updates, 'an update')
-        showing.localizer.show()
-        handing_over.result()
+        stand(showing, wheels, {0.4 + 0.1 * tick: driven_m * tick / 20 for tick in range(1, 21)},
+              twist_m_s=5.0 * driven_m / 10, body=body)
+        showing.localizer.show(x_m, 2.4)
+        with pytest.raises(NoLocalizerError, match=named) if named else nullcontext():
+            handing_over.result()
     showing.localizer.may_answer.set()
 
 
@@ -174,6 +205,14 @@ def test_the_pose_comes_again_until_time_is_up(silent, timeout_s, named, times):
     with pytest.raises(NoLocalizerError, match=named):
         silent.hand_over(timeout_s)
     assert len(silent.localizer.poses) == times
+
+
+@pytest.mark.parametrize('timeout_s', [10.0, 0.3])
+def test_a_robot_that_drives_is_told_so_however_little_time_is_left(silent, wheels, timeout_s):
+    tell(silent, wheels, TEN_HZ, twist_m_s=0.5)
+    with pytest.raises(HandOffError, match=r'moves at 0\.50'):
+        silent.hand_over(timeout_s)
+    assert not silent.localizer.poses
 
 
 def test_a_robot_that_moves_meanwhile_gets_the_pose_no_more(silent, wheels):

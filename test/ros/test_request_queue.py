@@ -46,12 +46,15 @@ class Answering(ManagedNode):
         self.loads = lambda: 'nothing'
         self.localize = lambda frame: Answer(Verdict.REFUSED, 'nothing known',
                                              received_at=frame.received_at)
+        self.publish = lambda answer: answer
         self.robot = RobotStateSource(self)
         self.frames = CameraRig(self, RelocalizerParameters())
-        pipeline = SimpleNamespace(localize=lambda frame, times, deadline: self.localize(frame))
+        pipeline = SimpleNamespace(localize=lambda frame, times, deadline: self.localize(frame),
+                                   publish=lambda answer, deadline: self.publish(answer))
         jumps = TimeJumps(self, self.frames.forget)
         self.requests = Requests(self, self.frames, self.robot, jumps, pipeline,
-                                 CaseRecorder(False), HandOff(self, self.robot.odometry))
+                                 CaseRecorder(False), HandOff(
+            self, self.robot.odometry, self.robot.transforms))
 
     def load(self):
         return self.loads()
@@ -152,14 +155,17 @@ def test_a_request_gets_no_image_older_than_itself(node, camera, clients, wait):
 
 
 def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, clients, wait):
+    """The search ends later; then nothing of it is published."""
     set_values(node, timeout_s=0.6)
-    release = threading.Event()
-    node.localize = lambda frame: release.wait(10.0)
+    release, published = threading.Event(), []
+    node.localize, node.publish = lambda frame: release.wait(10.0), published.append
     start = time.monotonic()
     request = clients.submit(node.requests.answer)
     shoot_until(camera, wait, request)
     took_s = time.monotonic() - start
     release.set()
+    node.worker.run(lambda: None)  # after the search
+    assert not published
     assert request.result().verdict is Verdict.REFUSED
     assert 'time is up: waiting for' in request.result().message
     assert took_s < 1.0

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import batched, pairwise
-from math import comb, inf
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     make_transform,
 )
-from cliploc_ros.core.options import used_time_s
+from cliploc_ros.core.options import NEVER, Deadline
 from cliploc_ros.core.search.frame_search import REFINED, SearchedFrame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
@@ -69,7 +69,7 @@ def poses_of(found: Sequence[Finalist]) -> NDArray[np.float64]:
     return np.array([pose.map_from_camera for pose in found]).reshape(-1, 4, 4)
 
 
-def find_with_rivals(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, deadline: float
+def find_with_rivals(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, deadline: Deadline
                      ) -> tuple[list[Finalist], NDArray[np.bool_]]:
     """Return the best poses, best first, and which of them use the known vertical.
 
@@ -87,12 +87,12 @@ def find_with_rivals(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, de
 
 
 def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, count: int,
-                   deadline: float = inf) -> list[Finalist]:
+                   deadline: Deadline = NEVER) -> list[Finalist]:
     """Return the best poses among the leaders of all frames, by their scores, best first.
 
     Without refinement, all poses are at different places. With refinement, there may be several
     poses with different matches at one place. Their support decides between them later. At most
-    `count` poses are refined, until a deadline on the clock of used_time_s [s]. The other poses
+    `count` poses are refined, until a deadline. The other poses
     have lower scores and stay unrefined.
     """
     found = [leader for frame in range(len(frames))
@@ -107,7 +107,7 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
         return found[:MAX_DISTINCT]
     improved: list[Finalist] = []
     for batch in batched(found, _REFINED_AT_ONCE):
-        in_time = not improved or used_time_s() <= deadline
+        in_time = not improved or not deadline.is_over
         improved += [pose._replace(**refine_rig(rig, pose.rotation, pose.translation)._asdict())
                      for pose in batch] if in_time else batch
     improved.sort(key=lambda pose: -pose.score)

@@ -513,7 +513,7 @@ class ImageRecognizer:
                  begin_stage: Callable[[str], None] = lambda stage: None,
                  may_be_thorough: bool = True) -> None:
         self._keyframes, self._features = keyframes, features
-        self._deadline = deadline
+        self.deadline = deadline
         self._begin_stage = begin_stage
         self._may_be_thorough = may_be_thorough
         self._known: tuple[set[int], Recognition] | None = None
@@ -524,7 +524,7 @@ class ImageRecognizer:
     def begin_thorough(self) -> bool:
         """Switch to the thorough pass; False if already in it, not allowed, or out of time."""
         if self._fast is not None or self._known is None or not self._may_be_thorough or (
-                self._deadline - time.monotonic() < LEAST_S):
+                self.deadline - time.monotonic() < LEAST_S):
             return False
         (_, self._fast), self._known = self._known, None
         return True
@@ -541,7 +541,7 @@ class ImageRecognizer:
                 self.spent_ms += features_ms
             begin = time.perf_counter()
             self._known = near, self._keyframes.localize_features(
-                features, self._features.camera, guesses, self._deadline, constraint, self._fast)
+                features, self._features.camera, guesses, self.deadline, constraint, self._fast)
             self.spent_ms += 1e3 * (time.perf_counter() - begin)
             self._begin_stage('search')
         return self._known[1]

@@ -14,12 +14,12 @@ of k consecutive misses is B(a, b + k) / B(a, b).
 
 from collections import deque
 from collections.abc import Iterable
-from math import exp, log
-from typing import NamedTuple
+from math import log
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaln
+from scipy.special import betaln, expit
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import (
@@ -31,6 +31,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 
+Values = float | NDArray[Any]
 #: A detector finds a landmark only if the image shows this share of its box.
 SHOWN_SHARE = 0.6
 #: A landmark is out of view if nearer landmarks hide more than this share of it. Chosen.
@@ -156,6 +157,24 @@ def expect(landmark_map: LandmarkMap, camera: Camera, map_from_camera: NDArray[n
     return Expected(near[rows], was_seen[rows], in_sight[rows], sides)
 
 
+def log_evidence(found: Values, missed: Values, seen: Values, misses: Values) -> Values:
+    """Return the logarithm of the beta-binomial probability of looks at an object in its place.
+
+    `found` and `missed` are the parameters of the prior of the share of looks that find it, `seen`
+    and `misses` the numbers of looks. The binomial coefficient is omitted.
+    """
+    return betaln(found + seen, missed + misses) - betaln(found, missed)
+
+
+def log_odds_there(stays: float, there: Values, away: Values) -> Values:
+    """Return the log odds that an object is in its place: the watch and map updates ask this.
+
+    `stays` is its prior probability; `there` and `away` are the log evidence of the looks if the
+    object is in its place, and if it is gone.
+    """
+    return log(stays / (1.0 - stays)) + there - away
+
+
 class _Record(NamedTuple):
     """Weighted numbers of looks that found and that missed a landmark."""
 
@@ -175,9 +194,8 @@ class _Record(NamedTuple):
         found = _OF_SHARE * share + self.found
         missed = _OF_SHARE * (1.0 - share) + self.missed
         misses = min(self.misses, max(0.0, found / _BY_CHANCE - found - missed))
-        there = betaln(found, missed + misses) - betaln(found, missed)
-        odds = log(_GONE / (1.0 - _GONE)) + misses * log(1.0 - _BY_CHANCE) - there
-        return float(1.0 / (1.0 + exp(-odds)))
+        there = log_evidence(found, missed, 0.0, misses)
+        return float(expit(-log_odds_there(1.0 - _GONE, there, misses * log(1.0 - _BY_CHANCE))))
 
 
 class Missing:

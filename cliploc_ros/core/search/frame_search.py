@@ -23,7 +23,7 @@ from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
 from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks, split_similarities
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.core.options import RelocalizerOptions, used_time_s
+from cliploc_ros.core.options import Deadline, RelocalizerOptions
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Constraint, Scene, make_scene
 from cliploc_ros.core.search.strategies import (
     MAX_DISTINCT,
@@ -310,8 +310,8 @@ class SearchedFrame(NamedTuple):
 
 
 def search_frame(landmark_map: LandmarkMap, observation: Observation,
-                 options: RelocalizerOptions, deadline: float) -> SearchedFrame:
-    """Search one frame until used_time_s reaches the deadline [s].
+                 options: RelocalizerOptions, deadline: Deadline) -> SearchedFrame:
+    """Search one frame until a deadline.
 
     Raises OptionsError if similarities that the matching type needs are missing or of the wrong
     shape, or if the vertical is not a unit vector.
@@ -378,11 +378,11 @@ def vertical_of(observation: Observation, options: RelocalizerOptions) -> NDArra
     return np.array([*up, *_UP_IN_MAP, np.radians(options.vertical_deviation_deg)])
 
 
-def _run(search: Iterator[Progress], deadline: float) -> Progress:
+def _run(search: Iterator[Progress], deadline: Deadline) -> Progress:
     """Run a search to its end or to a deadline; return its progress."""
     progress = Progress(0, 1.0)
     for step in search:
         progress = step
-        if used_time_s() > deadline:
+        if deadline.is_over:
             break
     return progress

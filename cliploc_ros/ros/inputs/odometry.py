@@ -18,6 +18,7 @@ from rclpy.node import Node
 
 from cliploc_ros.core.geometry.transforms import (
     SAME_SPOT,
+    invert_transform,
     make_transform,
     pose_error,
     transform_from_pose,
@@ -484,6 +485,21 @@ class OdometrySource(qos.Listener):
         with self._heard:
             self._heard.wait_for(lambda: self._window.spans(at_ns, 0), patience_s)
             return self._window.moved_since(at_ns)
+
+    def motion(self, since: Time, until: Time, patience_s: float
+               ) -> tuple[NDArray[np.float64], str]:
+        """Return the motion between two stamps as since_from_until (4, 4), and the moving frame.
+
+        Waits up to `patience_s` for the message that follows the stamps.
+
+        NoOdometryError: odometry does not cover both stamps.
+        """
+        first_ns, last_ns = stamp_ns(since), stamp_ns(until)
+        with self._heard:
+            self._heard.wait_for(lambda: not self._window.is_ahead(max(first_ns, last_ns)),
+                                 patience_s)
+            first, last = self._window.pose_at(first_ns), self._window.pose_at(last_ns)
+            return invert_transform(first) @ last, self._frames[1]
 
     def covers_soon(self, stamp: Time, patience_s: float) -> bool:
         """Return whether odometry covers roughly the stamp of an image, and so the next image.

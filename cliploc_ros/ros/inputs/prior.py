@@ -94,8 +94,9 @@ class PriorSource:
         `map_hash` is that of the loaded map: a stored pose of another map is not used.
         """
         told, probability = self._told, parameters.prior_probability
-        if told is None and self._last is not None and self._last[1] == map_hash:
-            told, probability = self._last[0], parameters.last_pose_probability
+        last = self._last  # read once, because a request may drop it
+        if told is None and last is not None and last[1] == map_hash:
+            told, probability = last[0], parameters.last_pose_probability
         if told is None:
             return None
         try:

@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaln, expit
+from scipy.special import expit
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.visibility import log_evidence, log_odds_there
 from cliploc_ros.offline.mapping.association import associate, find_overlaps
 from cliploc_ros.offline.mapping.building import LeftOut, NothingFoundError, build_map, rounded
 from cliploc_ros.offline.mapping.doubles import Relation, close_pairs, relation
@@ -205,15 +206,10 @@ def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
         scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
         certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH,
                                   _PRIOR_VIEWS))
-    there = _log_evidence(sight, ratios, certainty)
-    away = _log_evidence(sight, np.full(len(ratios), _CHANCE_RATIO), _PRIOR_VIEWS)
-    return np.asarray(expit(np.log(_STAYS / (1.0 - _STAYS)) + there - away))
-
-
-def _log_evidence(sight: Sight, ratios: NDArray[np.float64], views: float) -> NDArray[np.float64]:
-    """Return the logarithm of the beta-binomial probability, without the binomial coefficient."""
-    a, b = views * ratios, views * (1.0 - ratios)
-    return np.asarray(betaln(a + sight.seen, b + sight.expected - sight.seen) - betaln(a, b))
+    there, away = (log_evidence(views * share, views * (1.0 - share), sight.seen,
+                                sight.expected - sight.seen)
+                   for views, share in ((certainty, ratios), (_PRIOR_VIEWS, _CHANCE_RATIO)))
+    return np.asarray(expit(log_odds_there(_STAYS, there, away)))
 
 
 def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_]
