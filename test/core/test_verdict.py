@@ -581,7 +581,7 @@ def shown(counts, likenesses, first=0):
     """Return the support of a pose that explains some boxes, starting with the first."""
     rows = {(0, first + row): np.array([count, count, 0.0, likeness, 0.0, 0.0, 0.0])
             for row, (count, likeness) in enumerate(zip(counts, likenesses, strict=True))}
-    return Support(inliers=sum(counts), likeness=sum(likenesses), shown=rows)
+    return Support(sum(counts), sum(counts), likeness=sum(likenesses), shown=rows)
 
 
 def test_labels_tell_places_apart_and_what_one_place_lacks_does_not():
@@ -595,3 +595,16 @@ def test_labels_tell_places_apart_and_what_one_place_lacks_does_not():
     assert lead_over_twin(pose, shown([1], [2.0])) == pytest.approx(5 * 0.88, abs=0.01)
     # the same, but the landmarks around look alike: the objects in the image have moved
     assert lead_over_twin(pose, shown([1], [2.0]), 0.7) < 1.4
+
+
+def test_within_a_room_a_twin_that_explains_fewer_objects_is_a_rival_of_the_search():
+    """One map shows both places, so neither is out of date alone."""
+    pose = shown([1] * 10, [0.0] * 10)
+    utility = (1.0 + CALIBRATION.objects.slope) * CALIBRATION.objects.score
+    leads = [lead_over_twin(pose, shown([1] * count, [0.0] * count), 0.5, is_room=False)
+             for count in (3, 6, 9)]
+    assert leads[:2] == pytest.approx([7 * utility, 4 * utility])
+    assert leads[2] == pytest.approx(0.0), 'nearly the same objects: alike'
+    assert lead_over_twin(pose, shown([1] * 6, [0.0] * 6), 0.5) < 1.4, 'a room of its own'
+    better = shown([1] * 12, [0.0] * 12, first=20)
+    assert lead_over_twin(pose, better, 0.5, is_room=False) == pytest.approx(0.0), 'never below'

@@ -411,15 +411,18 @@ def _mirrored(joined: JoinedFrames) -> JoinedFrames:
     flipped camera is not mirrored. In front of a mirror, odometry is; a flipped camera that moves
     contradicts its odometry anyway.
     """
-    options, frames = joined.options, []
-    options = replace(options, iterations=int(CALIBRATION.mirror.samples), refine=False,
-                      algorithm='ransac' if options.algorithm == 'bf' else options.algorithm)
+    is_auto, frames = joined.options.algorithm == 'auto', []
+    options = replace(joined.options, algorithm='auto', refine=False,
+                      iterations=int(CALIBRATION.mirror.samples))
     for seen in (frame.observation for frame in joined.frames):
         odom, camera = seen.odom_from_camera, seen.camera
         boxes = camera.normalize_bboxes(seen.detections.bboxes_xyxy)
         frames.append(search_frame(joined.landmark_map, replace(
             seen, odom_from_camera=None if odom is None else _FLIP @ odom @ _FLIP,
             camera=Camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0),
+            # the paper's algorithms use neither
+            depths=seen.depths if is_auto else None,
+            up_in_camera=seen.up_in_camera if is_auto else None,
             detections=replace(seen.detections,
                                bboxes_xyxy=boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1))),
             options, math.inf))
