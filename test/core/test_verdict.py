@@ -133,18 +133,36 @@ def test_no_pose_is_its_own_look_alike(office_queries, knows_vertical):
             assert np.linalg.norm(one - other) > 0.9
 
 
+def mirrored(observation):
+    seen, camera = observation.detections, observation.camera
+    boxes = seen.bboxes_xyxy[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (camera.width, 0) * 2
+    return replace(observation, detections=replace(seen, bboxes_xyxy=boxes),
+                   camera=replace(camera, cx=camera.width - camera.cx))
+
+
+@pytest.mark.parametrize('algorithm', ['auto', 'ransac'])
+def test_the_true_pose_of_a_mirrored_image_is_a_rival(office_queries, algorithm):
+    """It is far from all reflections of the wrong pose, which explains five objects or more."""
+    landmark_map, queries = office_queries
+    relocalizer = Relocalizer(landmark_map, replace(OPTIONS, matching='class',
+                                                    algorithm=algorithm))
+    for number in (176, 200):
+        observation = next(query for query in queries if query.number == number).observation
+        found = relocalizer.relocalize([observation])
+        assert found.accepted, found.reason
+        assert found.evidence.not_mirrored > 0.95
+        wrong = relocalizer.relocalize([mirrored(observation)])
+        assert wrong.evidence.likely > 0.9
+        assert wrong.evidence.not_mirrored < 0.4
+
+
 @pytest.mark.full
 def test_mirror_images_are_refused(office_queries):
     landmark_map, queries = office_queries
     relocalizer = Relocalizer(landmark_map, replace(OPTIONS, matching='class'))
-    accepted = 0
-    for query in queries[::4]:
-        seen, camera = query.observation.detections, query.observation.camera
-        boxes = seen.bboxes_xyxy[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (camera.width, 0) * 2
-        mirrored = replace(query.observation, detections=replace(seen, bboxes_xyxy=boxes),
-                           camera=replace(camera, cx=camera.width - camera.cx))
-        accepted += relocalizer.relocalize([mirrored]).accepted
-    assert accepted <= 1, f'of {len(queries[::4])}'
+    accepted = [relocalizer.relocalize([mirrored(query.observation)]).accepted
+                for query in queries[::4]]
+    assert sum(accepted) <= 1, f'of {len(accepted)}'
 
 
 def test_each_number_states_its_unit_and_meaning_and_the_command_that_fits_it():
@@ -564,7 +582,7 @@ def shown(counts, likenesses, first=0):
     """Return the support of a pose that explains some boxes, starting with the first."""
     rows = {(0, first + row): np.array([count, count, 0.0, likeness, 0.0, 0.0, 0.0])
             for row, (count, likeness) in enumerate(zip(counts, likenesses, strict=True))}
-    return Support(inliers=sum(counts), likeness=sum(likenesses), shown=rows)
+    return Support(sum(counts), sum(counts), likeness=sum(likenesses), shown=rows)
 
 
 def test_labels_tell_places_apart_and_what_one_place_lacks_does_not():
@@ -578,3 +596,16 @@ def test_labels_tell_places_apart_and_what_one_place_lacks_does_not():
     assert lead_over_twin(pose, shown([1], [2.0])) == pytest.approx(5 * 0.88, abs=0.01)
     # the same, but the landmarks around look alike: the objects in the image have moved
     assert lead_over_twin(pose, shown([1], [2.0]), 0.7) < 1.4
+
+
+def test_within_a_room_a_twin_that_explains_fewer_objects_is_a_rival_of_the_search():
+    """One map shows both places, so neither is out of date alone."""
+    pose = shown([1] * 10, [0.0] * 10)
+    utility = (1.0 + CALIBRATION.objects.slope) * CALIBRATION.objects.score
+    leads = [lead_over_twin(pose, shown([1] * count, [0.0] * count), 0.5, is_room=False)
+             for count in (3, 6, 9)]
+    assert leads[:2] == pytest.approx([7 * utility, 4 * utility])
+    assert leads[2] == pytest.approx(0.0), 'nearly the same objects: alike'
+    assert lead_over_twin(pose, shown([1] * 6, [0.0] * 6), 0.5) < 1.4, 'a room of its own'
+    better = shown([1] * 12, [0.0] * 12, first=20)
+    assert lead_over_twin(pose, better, 0.5, is_room=False) == pytest.approx(0.0), 'never below'

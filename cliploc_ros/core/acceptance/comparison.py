@@ -9,15 +9,15 @@ pose leads, and the evidence about it alone decides whether it is accepted.
 An image may be mirrored, by a mirror or a flipped camera. A wrong pose may then explain it well: a
 camera on the other side of a plane sees the points of the plane mirrored, at the same distances.
 For example, it sees objects on a table from below, or objects along a wall from behind. The image
-is therefore mirrored back, and the best pose of the mirrored image competes with the pose found.
-The search for it starts at reflections of the camera in planes through the matched objects.
+is therefore mirrored back, and the best pose of the mirrored image competes with the pose found. A
+short search of the mirrored image and reflections of the camera in planes through the matched
+objects find it.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,13 @@ from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import fuse, share_within
-from cliploc_ros.core.fit.finalists import Finalist, covariance_of, matches_of, meetings_of
+from cliploc_ros.core.fit.finalists import (
+    Finalist,
+    covariance_of,
+    find_finalists,
+    matches_of,
+    meetings_of,
+)
 from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE
@@ -54,7 +60,7 @@ from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.joined_map import Place, place_of
 from cliploc_ros.core.map.visibility import expect
-from cliploc_ros.core.search.frame_search import constraint_of, coverage_of, match_frame
+from cliploc_ros.core.search.frame_search import constraint_of, coverage_of, search_frame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
 _NO_LOOKS = Looks()
@@ -240,8 +246,8 @@ class Comparison:
                           np.array([match.landmark for match in seen], dtype=np.int64))
         return signs_of(
             self.place, self._last.detections.bboxes_xyxy[[match.detection for match in seen]],
-            camera, min(float((expected.in_sight & ~expected.was_seen).sum()),
-                        best.support.unexplained))
+            camera, max(0.0, min(float((expected.in_sight & ~expected.was_seen).sum()),
+                                 best.support.unexplained) - 1.0))
 
     def _motion(self) -> Motion | None:
         """Compare the motion since an earlier look by keyframes; None without such a look."""
@@ -387,7 +393,11 @@ def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.
 
 
 def _chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
-    """Return the probability that the image is not mirrored, given the best mirrored pose."""
+    """Return the probability that the image is not mirrored, given the best mirrored pose.
+
+    A short search of the mirrored image finds the pose if the image is mirrored. The wrong pose is
+    then often far from a reflection of it.
+    """
     terms = CALIBRATION.mirror
     first = [row for row, found in enumerate(best.matches) if found][-int(terms.frames):][0]
     joined = join_frames(joined.landmark_map, joined.options, joined.frames[first:])
@@ -395,10 +405,11 @@ def _chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
     mirrored = _mirrored(joined)
     centers = joined.landmark_map.centers[
         sorted({match.landmark for of_frame in matches for match in of_frame})]
-    starts = [unrefined(pose) for pose in _reflections(centers) @ best.pose @ _FLIP]
-    starts.sort(key=lambda start: -verify_rig(mirrored.rig, start.rotation,
-                                              start.translation).score)
-    found = [refined(mirrored, start) for start in starts[:int(terms.refined)]]
+    reflected = [unrefined(pose) for pose in _reflections(centers) @ best.pose @ _FLIP]
+    starts = [*find_finalists(mirrored.frames, mirrored.rig, False, MAX_DISTINCT)[
+        :int(terms.refined)], max(reflected, key=lambda start: verify_rig(
+            mirrored.rig, start.rotation, start.translation).score)]
+    found = [refined(mirrored, start) for start in starts]
     supports = supports_of(mirrored, np.array([pose.map_from_camera for pose in found]),
                            [matches_of(mirrored.rig, pose) for pose in found])
     own, = utilities([best.support] if len(joined.frames) == len(best.matches)
@@ -408,42 +419,35 @@ def _chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
 
 
 def _mirrored(joined: JoinedFrames) -> JoinedFrames:
-    """Return the frames with their images mirrored left to right, without a new search.
+    """Return the frames with their images mirrored left to right, searched with few samples.
 
-    The boxes are mirrored on the plane z = 1, where there is no distortion.
+    The boxes are mirrored on the plane z = 1, where there is no distortion. The vertical of a
+    flipped camera is not mirrored. In front of a mirror, odometry is; a flipped camera that moves
+    contradicts its odometry anyway.
     """
-    frames = []
-    for frame in joined.frames:
-        seen = frame.observation
+    is_auto, frames = joined.options.algorithm == 'auto', []
+    options = replace(joined.options, algorithm='auto', refine=False,
+                      iterations=int(CALIBRATION.mirror.samples))
+    for seen in (frame.observation for frame in joined.frames):
         odom, camera = seen.odom_from_camera, seen.camera
         boxes = camera.normalize_bboxes(seen.detections.bboxes_xyxy)
-        observation = replace(
+        frames.append(search_frame(joined.landmark_map, replace(
             seen, odom_from_camera=None if odom is None else _FLIP @ odom @ _FLIP,
             camera=Camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0),
+            # the paper's algorithms use neither
+            depths=seen.depths if is_auto else None,
+            up_in_camera=seen.up_in_camera if is_auto else None,
             detections=replace(seen.detections,
-                               bboxes_xyxy=boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1)))
-        frames.append(frame._replace(
-            observation=observation, vertical=frame.vertical * (-1, 1, 1, 1, 1, 1, 1),
-            scene=match_frame(joined.landmark_map, observation, joined.options)[0]))
+                               bboxes_xyxy=boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1))),
+            options, math.inf))
     return join_frames(joined.landmark_map, joined.options, frames)
 
 
 def _reflections(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the reflections (m, 4, 4) in planes through points (n, 3).
-
-    The planes are a level plane, a plane fitted to all points, and planes through three points.
-    """
+    """Return the reflections (2, 4, 4) in a level plane and in a plane fitted to points (n, 3)."""
     middle = points.mean(axis=0)
-    triples = np.array([*combinations(range(len(points)), 3)], dtype=np.int64).reshape(-1, 3)
-    most = int(CALIBRATION.mirror.planes)
-    chosen = np.linspace(0, len(triples) - 1, min(most, len(triples))).astype(np.int64)
-    first, second, third = np.moveaxis(points[triples[chosen]], 1, 0)
-    normals = np.cross(second - first, third - first)
-    lengths = np.linalg.norm(normals, axis=1)
-    normals = (normals.T / np.maximum(lengths, 1e-6)).T[lengths > 1e-6]
-    normals = np.vstack([_UP, np.linalg.svd(points - middle)[2][-1], normals])
-    points = np.vstack([middle, middle, first[lengths > 1e-6]])
-    reflections = np.tile(np.eye(4), (len(points), 1, 1))
+    normals = np.array([_UP, np.linalg.svd(points - middle)[2][-1]])
+    reflections = np.tile(np.eye(4), (2, 1, 1))
     reflections[:, :3, :3] -= 2.0 * normals[:, :, None] * normals[:, None]
-    reflections[:, :3, 3] = 2.0 * (points * normals).sum(axis=1, keepdims=True) * normals
+    reflections[:, :3, 3] = 2.0 * (normals @ middle)[:, None] * normals
     return reflections

@@ -96,9 +96,9 @@ class Signs(NamedTuple):
     #: share is greater. A picture ends within the image.
     reach: float
     apart: float  #: See RecognizedPlace, limited to 1: next to a keyframe, all surroundings match
-    #: Number of landmarks in sight that no detection shows, at most the number of detections that
-    #: no landmark explains. Either alone is no sign: detectors miss objects, and most objects of a
-    #: room are never mapped.
+    #: Number of landmarks in sight that no detection shows, except one, at most the number of
+    #: detections that no landmark explains. Either alone is no sign: detectors miss objects, and
+    #: most objects of a room are never mapped.
     contradicted: float
 
 

@@ -14,6 +14,9 @@ Two poses at places that look alike explain the same detections. It is then weak
 of them matches one object more, or fits better, because maps lack objects, and objects move.
 Labels distinguish the places. All objects that only one of the places explains have one common
 cause: the map of one place is out of date. They therefore count once, not separately.
+
+Within one room, places look alike by chance, and one map shows both. A twin there that explains
+clearly fewer objects is a rival like the other poses of a search.
 """
 
 import math
@@ -23,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import Support
+from cliploc_ros.core.acceptance.confidence import Support, utilities
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import (
     RIGHT_M,
@@ -202,8 +205,7 @@ def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
         Share of the landmarks around the pose that the other place has, too.
     is_room : bool
         Whether the other place is a separate room. Rooms that are furnished alike may have the
-        same errors in their labels, so the labels count less. Within a room, places look alike by
-        chance.
+        same errors in their labels, so the labels count less.
     """
     terms = CALIBRATION.places
     common = its.shown.keys() & twin.shown.keys()
@@ -222,7 +224,13 @@ def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
     most = min(abs(further), terms.unlabelled * abs(counts), terms.aged)
     if is_room:
         lead *= 1.0 - (1.0 - terms.labels) * alike
-    return lead + (1.0 - alike) * further + alike * math.copysign(most, further)
+    lead += (1.0 - alike) * further + alike * math.copysign(most, further)
+    if is_room:
+        return lead
+    own, other = utilities((its, twin))
+    by_search = (1.0 + CALIBRATION.objects.slope) * float(own - other)  # see confidences
+    differing = float(np.interp(share, (terms.differ_within, terms.alike_within), (1.0, 0.0)))
+    return lead + differing * max(0.0, by_search - lead)
 
 
 def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray[np.float64]:
