@@ -60,6 +60,7 @@ from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.joined_map import Place, place_of
 from cliploc_ros.core.map.visibility import expect
+from cliploc_ros.core.options import NEVER
 from cliploc_ros.core.search.frame_search import constraint_of, coverage_of, search_frame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
@@ -439,7 +440,7 @@ def _mirrored(joined: JoinedFrames) -> JoinedFrames:
             up_in_camera=seen.up_in_camera if is_auto else None,
             detections=replace(seen.detections,
                                bboxes_xyxy=boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1))),
-            options, math.inf))
+            options, NEVER))
     return join_frames(joined.landmark_map, joined.options, frames)
 
 
