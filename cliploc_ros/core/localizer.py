@@ -392,6 +392,10 @@ class Localizer:
                              and found.recognition.is_thorough)
         if is_alone:
             return found
+        while earlier and sum(len(instant.searched) for instant in earlier) + len(beside) \
+                >= found.frames:
+            del earlier[0]  # odometry does not link it
+            self._filter = None
         self._instants = [*earlier, KeptInstant((*beside, searched), anchor)]
         if found.map_from_camera is not None and found.evidence is not None:
             self._looks = self._looks.with_look(Look(

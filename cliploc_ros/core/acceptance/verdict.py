@@ -50,7 +50,7 @@ class RefusalKind(StrEnum):
 
 
 # Factors of the confidence other than likely and found. A refusal names the first of equal ones.
-_FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted')
+_FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted', 'linked')
 # Kind and message of a refusal, by the weakest factor of its Evidence.
 _ADVICE = {
     'near': (RefusalKind.UNCERTAIN_POSITION, 'position uncertain by {0.deviation_m:.2g} m; turn '
@@ -62,6 +62,8 @@ _ADVICE = {
                                      'picture or a changed place; move and request again'),
     'not_mirrored': (RefusalKind.AMBIGUOUS, 'the mirrored image fits another pose; turn the '
                                             'camera to more objects'),
+    'linked': (RefusalKind.FRAMES_DISAGREE, 'the newest image does not support the pose of the '
+                                            'earlier ones; turn the camera to more objects'),
     'found': (RefusalKind.SEARCH_CUT_SHORT,
               'pose found only {0.meetings:g} times in {0.tried} samples; raise iterations or set '
               'algorithm to auto')}
@@ -123,6 +125,8 @@ class Evidence:
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: The place that keyframes recognize at the pose
     prior: float = 0.0  #: Log odds, at most 0, of the pose given the prior region
+    #: Probability that odometry links all frames of the pose, see cliploc_ros.core.acceptance.links
+    linked: float = 1.0
     #: Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks
     earlier: tuple[float, ...] = ()
     crops_left: int = 0  #: Number of crops that have not been compared with labels yet
