@@ -79,7 +79,13 @@ def weakest_link(joined: JoinedFrames, pose: NDArray[np.float64], seen: Recognit
         # odometry is not exact
         fits = [unrefined(its), refined(own, unrefined(its))]
         fits = [fit for fit in fits if SAME_LOOK.agree(fit.map_from_camera, its)]
-        return own, its, max(fit.odds for fit in contenders_of(own, fits, [True] * len(fits)))
+        # the support of a pose without matches does not count unexplained objects
+        index = joined.landmark_map.classes
+        lost = CALIBRATION.objects.unexplained * sum(
+            index.are_own(index.classes_of(frame.observation.detections.class_ids)).sum()
+            for frame in frames) / len(frames)
+        return own, its, max(fit.odds if fit.support.inliers else lost for fit in contenders_of(
+            own, fits, [True] * len(fits)))
 
     newest, its, utility = part(starts[-1], len(stamps))
     met = meet(newest)
@@ -96,6 +102,4 @@ def weakest_link(joined: JoinedFrames, pose: NDArray[np.float64], seen: Recognit
         broken = min(terms.most_broken, terms.broken + terms.broken_per_s * gap_s)
         links.append(Link(math.log(1.0 / broken - 1.0) + min(none, after - missed)
                           + min(none, before) - none, len(stamps) - start))
-    import os
-    if os.environ.get("LINKS"): print("LINK", none, [(round(l.log_odds,1), l.kept) for l in links], "here", round(here,1), "missed", round(missed,1), "best", round(max((o.odds for o in others), default=-9),1))
     return min(links, key=lambda link: link.log_odds)
