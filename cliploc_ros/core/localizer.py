@@ -400,7 +400,8 @@ class Localizer:
         if found.map_from_camera is not None and found.evidence is not None:
             self._looks = self._looks.with_look(Look(
                 replace(newest, similarities=None, compared=None), found.map_from_camera,
-                found.evidence.with_right_camera.confidence, found.recognized), found.accepted)
+                found.evidence.with_right_camera.confidence, found.recognized,
+                found.evidence.confidence), found.accepted)
         return found
 
     def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:

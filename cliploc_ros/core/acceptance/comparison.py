@@ -219,7 +219,7 @@ class Comparison:
             unexplained=best.support.unexplained, signs=self._signs(best), motion=self._motion(),
             not_mirrored=self._not_mirrored(by_points), uncontradicted=self._uncontradicted(),
             recognized=self.place, prior=self.contenders[0].prior,
-            earlier=self._looks.confidences_in(self._last, self.poses[0]), crops_left=0
+            earlier=self._looks.earlier(self._last, self.poses[0]), crops_left=0
             if self._last.compared is None
             else len(self._last.detections) - len(self._last.compared))
 
