@@ -92,7 +92,7 @@ class Relocalization:
     #: Evidence about the cameras, from a pose that depends on boxes and would be accepted if the
     #: cameras were right
     cameras: tuple[CameraLook, ...] = ()
-    #: Number of last frames that the answer is from. Odometry does not link the frames before them
+    #: Number of last frames that the answer is from. Odometry does not link earlier frames to them
     frames: int = 1
 
     @property
@@ -287,7 +287,7 @@ class Relocalizer:
                                 lambda own: self._meet(own, self.begin(len(own.frames))))
         if link.chance < self.options.min_confidence:
             alone = self.locate(frames[-link.kept:], None, looks, recognizer, cameras)
-            if alone.accepted or link.log_odds < 0.0:
+            if alone.accepted:
                 return replace(alone, tried=result.tried, search_ms=budget.elapsed_ms)
         evidence = replace(compared.evidence(covariance), linked=link.chance)
         seen: list[CameraLook] = []

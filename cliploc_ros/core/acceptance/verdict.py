@@ -126,7 +126,7 @@ class Evidence:
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: The place that keyframes recognize at the pose
     prior: float = 0.0  #: Log odds, at most 0, of the pose given the prior region
-    #: Probability that odometry links all frames of the pose, see cliploc_ros.core.acceptance.links
+    #: Probability that odometry links all frames, see cliploc_ros.core.acceptance.links
     linked: float = 1.0
     #: The earlier looks and their confidence in this pose
     earlier: tuple[EarlierLook, ...] = ()
