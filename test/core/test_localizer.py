@@ -545,7 +545,7 @@ def test_a_look_repeats_a_view_as_far_as_odometry_has_not_moved(degrees, metres,
 
 
 def test_doubts_about_the_camera_count_for_the_view_alone(session):
-    found = session.answer(Query((frame(1.0, detections=SEEN.select(np.arange(4))),)))
+    found = session.answer(Query((frame(1.0, detections=SEEN.select(np.arange(3))),)))
     look, = session._looks.past
     assert found.evidence.camera < 1.0 and not found.accepted
     assert look.doubted == found.confidence

@@ -14,8 +14,9 @@ cliploc_ros.core.acceptance.confidence. Frames support a pose by
 
 which is 0 for frames without objects, at most N, and low for frames that contradict the pose or
 fit another pose better. Two sides that are not linked have independent poses. The log odds of a
-link are therefore prior + S(after) + S(before) - N. The sum is computed for the newest instant,
-which is the one that a new pose is about. The other sides are limited to N.
+link are therefore prior + S(after) + S(before) - N. If it does not hold, the pose is right with the
+probability exp(S(after) - N) that the frames after the gap give it alone. The sum is computed for
+the newest instant, whose pose is asked for. The other sides are limited to N.
 
 The cameras of one instant are mounted on one robot. They need no odometry.
 """
@@ -48,13 +49,9 @@ from cliploc_ros.units import NS_PER_S
 class Link(NamedTuple):
     """The weakest link between the instants of some frames."""
 
-    log_odds: float = math.inf  #: That the frames on both sides belong to one pose
+    #: Probability that the frames after it belong to the pose
+    chance: float = 1.0
     kept: int = 0  #: Number of last frames, which are those after this link
-
-    @property
-    def chance(self) -> float:
-        """Return the probability that the link holds."""
-        return 1.0 / (1.0 + math.exp(-max(self.log_odds, -50.0)))
 
 
 def weakest_link(joined: JoinedFrames, pose: NDArray[np.float64], seen: Recognition | None,
@@ -99,7 +96,11 @@ def weakest_link(joined: JoinedFrames, pose: NDArray[np.float64], seen: Recognit
         after = here if start == starts[-1] else part(start, len(stamps))[2]
         before = part(0, start)[2]
         gap_s = abs(stamps[start] - stamps[start - 1]) / NS_PER_S
-        broken = min(terms.most_broken, terms.broken + terms.broken_per_s * gap_s)
-        links.append(Link(math.log(1.0 / broken - 1.0) + min(none, after - missed)
-                          + min(none, before) - none, len(stamps) - start))
-    return min(links, key=lambda link: link.log_odds)
+        # an earlier link held when its instant was the newest one
+        broken = terms.broken if start == starts[-1] else terms.broken_before
+        broken = min(terms.most_broken, broken + terms.broken_per_s * gap_s)
+        supported = min(none, after - missed)
+        log_odds = math.log(1.0 / broken - 1.0) + supported + min(none, before) - none
+        holds = 1.0 / (1.0 + math.exp(-max(log_odds, -50.0)))
+        links.append(Link(holds + (1.0 - holds) * math.exp(supported - none), len(stamps) - start))
+    return min(links)
