@@ -185,8 +185,8 @@ def _half_turned(offsets: NDArray[np.float64], angle_deg: float, rng: np.random.
 def carry(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], frames: float,
           rng: np.random.Generator) -> World:
     """Give each query some frames of another query, as if odometry linked them to its image."""
-    others = [queries[row] for row in np.roll(np.arange(len(queries)), int(rng.integers(
-        1, max(2, len(queries)))))]
+    step = int(rng.integers(1, max(2, len(queries))))
+    others = [*queries[step:], *queries[:step]]
     return landmark_map, [replace(
         query, neighbours=other.neighbours[:int(frames)], observation=replace(
             query.observation, odom_from_camera=other.observation.odom_from_camera))

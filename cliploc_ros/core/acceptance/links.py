@@ -14,9 +14,9 @@ cliploc_ros.core.acceptance.confidence. Frames support a pose by
 
 which is 0 for frames without objects, at most N, and low for frames that contradict the pose or
 fit another pose better. Two sides that are not linked have independent poses. The log odds of a
-link are therefore prior + S(after) + S(before) - N. If it does not hold, the pose is right with the
-probability exp(S(after) - N) that the frames after the gap give it alone. The sum is computed for
-the newest instant, whose pose is asked for. The other sides are limited to N.
+link are therefore prior + S(after) + S(before) - N. If it does not hold, the pose is right with
+the probability exp(S(after) - N) that the frames after the gap give it alone. The sum is computed
+for the newest instant, whose pose is asked for. The other sides are limited to N.
 
 The cameras of one instant are mounted on one robot. They need no odometry.
 """
