@@ -285,7 +285,7 @@ class Relocalizer:
         if len(frames) > 1 and self.options.refine:
             link = weakest_link(joined, pose, compared.recognition,
                                 lambda own: self._meet(own, self.begin(len(own.frames))))
-        if link.chance < self.options.min_confidence:
+        if link.holds < self.options.min_confidence:
             alone = self.locate(frames[-link.kept:], None, looks, recognizer, cameras)
             if alone.accepted:
                 return replace(alone, tried=result.tried, search_ms=budget.elapsed_ms)

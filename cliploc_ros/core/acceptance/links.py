@@ -49,8 +49,8 @@ from cliploc_ros.units import NS_PER_S
 class Link(NamedTuple):
     """The weakest link between the instants of some frames."""
 
-    #: Probability that the frames after it belong to the pose
-    chance: float = 1.0
+    holds: float = 1.0  #: Probability that the frames on both sides have a common pose
+    chance: float = 1.0  #: Probability, at most that of any link, that the frames after it have it
     kept: int = 0  #: Number of last frames, which are those after this link
 
 
@@ -102,5 +102,6 @@ def weakest_link(joined: JoinedFrames, pose: NDArray[np.float64], seen: Recognit
         supported = min(none, after - missed)
         log_odds = math.log(1.0 / broken - 1.0) + supported + min(none, before) - none
         holds = 1.0 / (1.0 + math.exp(-max(log_odds, -50.0)))
-        links.append(Link(holds + (1.0 - holds) * math.exp(supported - none), len(stamps) - start))
-    return min(links)
+        links.append(Link(holds, holds + (1.0 - holds) * math.exp(supported - none),
+                          len(stamps) - start))
+    return min(links)._replace(chance=min(link.chance for link in links))
