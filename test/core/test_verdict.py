@@ -74,7 +74,7 @@ WEAK = {
                   RefusalKind.CONTRADICTION),
     'found': ({'meetings': 0.1, 'coverage': 0.5, 'tried': 700}, RefusalKind.SEARCH_CUT_SHORT),
     'looks': ({'earlier': looks(*[0.1] * 9)}, RefusalKind.FRAMES_DISAGREE),
-    'same view': ({'earlier': looks(0.9, doubted=0.6, same_view=1.0)},
+    'same view': ({'earlier': looks(0.9, 0.9, doubted=0.6, same_view=1.0)},
                   RefusalKind.FRAMES_DISAGREE),
     'linked': ({'linked': 0.5}, RefusalKind.FRAMES_DISAGREE),
     'crops': ({'likely': 0.95, 'crops_left': 12}, RefusalKind.NOT_ALL_CROPS),

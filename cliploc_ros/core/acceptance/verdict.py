@@ -63,8 +63,8 @@ _ADVICE = {
                                      'picture or a changed place; move and request again'),
     'not_mirrored': (RefusalKind.AMBIGUOUS, 'the mirrored image fits another pose; turn the '
                                             'camera to more objects'),
-    'linked': (RefusalKind.FRAMES_DISAGREE, 'the newest image does not support the pose of the '
-                                            'earlier ones; turn the camera to more objects'),
+    'linked': (RefusalKind.FRAMES_DISAGREE, 'the newest image does not fit the earlier '
+                                            'ones; turn the camera to more objects'),
     'found': (RefusalKind.SEARCH_CUT_SHORT,
               'pose found only {0.meetings:g} times in {0.tried} samples; raise iterations or set '
               'algorithm to auto')}
