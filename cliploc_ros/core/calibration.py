@@ -45,6 +45,7 @@ class Calibration(NamedTuple):
     search: Terms  #: How thorough a search must be for its pose to be accepted
     refusals: Terms  #: Choice of the cause that a refusal names
     looks: Terms  #: Agreement of successive looks
+    links: Terms  #: Odds that odometry links successive instants
     camera: Terms  #: Errors of a camera and its boxes, and their limits
     covariance: Terms  #: Weights of covariances
     watch: Terms  #: Log odds of a look of the watch, and how looks are combined

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import SAME_VIEW, pose_error
 from cliploc_ros.core.keyframes.localization import (
@@ -213,6 +214,19 @@ class Localizer:
         self.depth_scale = DepthScale()
         self.cameras = CameraCheck()
 
+    def successor(self, relocalizer: Relocalizer) -> 'Localizer':
+        """Return a localizer with other options on the same map, which keeps the evidence.
+
+        Looks, cameras, depth scale and filter are kept. Instants are not, because they were
+        searched with these options. On another map, use a new localizer: cameras and depths were
+        compared with this map.
+        """
+        next_one = Localizer(relocalizer, self._keyframes)
+        next_one._looks, next_one._filter = self._looks, self._filter
+        next_one._run, next_one._stamp_ns = self._run, self._stamp_ns
+        next_one.depth_scale, next_one.cameras = self.depth_scale, self.cameras
+        return next_one
+
     def answer(self, query: Query, crops: CropSource | None = None, deadline: float = math.inf,
                begin_stage: Callable[[str], None] = lambda stage: None) -> Relocalization:
         """Localize with the frames of an instant and, if odometry links them, earlier instants.
@@ -381,16 +395,28 @@ class Localizer:
             self._relocalizer,
             [*(frame for instant in earlier for frame in instant.searched), *beside],
             newest, crops, looks, recognizer, budget, self.cameras, request)
+        seen = found.recognition
         self.query = replace(query, frames=(*others, searched.observation), rooms=tuple(rooms),
-                             is_thorough=found.recognition is not None
-                             and found.recognition.is_thorough)
+                             by_keyframes=query.by_keyframes and (
+                                 seen is None or seen.is_complete),
+                             is_thorough=seen is not None and seen.is_thorough)
+        if (self._keyframes is not None and query.images and not self.query.by_keyframes
+                and not found.accepted):
+            late = 'keyframes: time was up; raise timeout_s'
+            found = replace(found, reason=f'{found.reason}; {late}') if found.solved else replace(
+                found, reason=late, refusal_kind=RefusalKind.TIME_UP)
         if is_alone:
             return found
+        while earlier and sum(len(instant.searched) for instant in earlier) + len(beside) \
+                >= found.frames:
+            del earlier[0]  # odometry does not link it
+            self._filter = None
         self._instants = [*earlier, KeptInstant((*beside, searched), anchor)]
         if found.map_from_camera is not None and found.evidence is not None:
             self._looks = self._looks.with_look(Look(
                 replace(newest, similarities=None, compared=None), found.map_from_camera,
-                found.evidence.with_right_camera.confidence, found.recognized), found.accepted)
+                found.evidence.with_right_camera.confidence, found.recognized,
+                found.evidence.confidence), found.accepted)
         return found
 
     def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:

@@ -20,6 +20,7 @@ from cliploc_ros.core.acceptance.contenders import (
     without_depth,
 )
 from cliploc_ros.core.acceptance.depth_check import DepthCheck, check_depth
+from cliploc_ros.core.acceptance.links import Link, weakest_link
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.calibration import CALIBRATION
@@ -91,6 +92,8 @@ class Relocalization:
     depth: DepthCheck | None = None
     #: Evidence about the cameras, from a pose that depends on boxes and is likely right
     cameras: tuple[CameraLook, ...] = ()
+    #: Number of last frames that the answer is from. Odometry does not link earlier frames to them
+    frames: int = 1
 
     @property
     def matches(self) -> tuple[Match, ...]:
@@ -278,12 +281,20 @@ class Relocalizer:
         result = Relocalization(
             False, '', tried=sum(frame.progress.tried for frame in frames),
             coverage=coverage_of(frames), stamp_ns=frames[-1].observation.stamp_ns,
-            recognition=compared.recognition)
+            recognition=compared.recognition, frames=len(frames))
         if not compared.contenders:
             kind, reason = _nothing_found(self.landmark_map, frames)
             return replace(result, reason=reason, refusal_kind=kind, search_ms=budget.elapsed_ms)
         pose, covariance = compared.pose()
-        evidence = compared.evidence(covariance)
+        link = Link()
+        if len(frames) > 1 and self.options.refine:
+            link = weakest_link(joined, pose, compared.recognition,
+                                lambda own: self._meet(own, self.begin(len(own.frames))))
+        if link.holds < self.options.min_confidence:
+            alone = self.locate(frames[-link.kept:], None, looks, recognizer, cameras)
+            if alone.accepted:
+                return replace(alone, tried=result.tried, search_ms=budget.elapsed_ms)
+        evidence = replace(compared.evidence(covariance), linked=link.chance)
         seen: list[CameraLook] = []
         if compared.by_boxes is not None and self.options.refine:
             # a wrong camera may be the cause of low confidence

@@ -103,7 +103,8 @@ class FrameLocalizer:
         self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
         self.observer = observer
         self.instants = Instants(landmark_map, options.matching != 'clip')
-        self._begin(relocalizer, options)
+        self._options, self.watch = options, Watch(relocalizer)
+        self.localizer = Localizer(relocalizer, None if keyframes is None else keyframes.localizer)
         relocalizer.warm_up()
 
     @property
@@ -195,16 +196,12 @@ class FrameLocalizer:
         pose[:3, 3] += shift
         return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
 
-    def _begin(self, relocalizer: Relocalizer, options: RelocalizerOptions) -> None:
-        """Use a relocalizer and its options for all further queries and checks of the watch."""
-        self._options, self.watch = options, Watch(relocalizer)
-        self.localizer = Localizer(
-            relocalizer, None if self.keyframes is None else self.keyframes.localizer)
-
     def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
-        """Return the localizer. If the options changed, make a new one, and a new watch."""
+        """Return the localizer. If the options changed, it has a successor, and the watch too."""
         if options != self._options:
-            self._begin(Relocalizer(self.landmark_map, options), options)
+            relocalizer = Relocalizer(self.landmark_map, options)
+            self._options, self.watch = options, Watch(relocalizer)
+            self.localizer = self.localizer.successor(relocalizer)
         return self.localizer
 
 

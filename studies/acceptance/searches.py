@@ -148,7 +148,7 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], options: Rel
         session = Localizer(relocalizer)
         alone, accepted, errors_m = [], [], []
         for number in range(LOOKS):
-            look = replace(_flickering(query.observation, rng), odom_from_camera=np.eye(4),
+            look = replace(flickering(query.observation, rng), odom_from_camera=np.eye(4),
                            stamp_ns=(number + 1) * _PERIOD_NS)
             found = session.answer(Query((look,)))
             accepted.append(found.accepted)
@@ -158,7 +158,7 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], options: Rel
         yield Retries(np.array(alone), np.array(accepted), np.array(errors_m))
 
 
-def _flickering(observation: Observation, rng: np.random.Generator) -> Observation:
+def flickering(observation: Observation, rng: np.random.Generator) -> Observation:
     """Return an observation with some boxes missing and the others shifted."""
     detections = observation.detections
     rows = np.nonzero(rng.random(len(detections)) > _MISSED_SHARE)[0]

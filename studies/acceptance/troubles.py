@@ -183,6 +183,17 @@ def _half_turned(offsets: NDArray[np.float64], angle_deg: float, rng: np.random.
     return turned
 
 
+def carry(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], frames: float,
+          rng: np.random.Generator) -> World:
+    """Give each query some frames of another query, as if odometry linked them to its image."""
+    step = int(rng.integers(1, max(2, len(queries))))
+    others = [*queries[step:], *queries[:step]]
+    return landmark_map, [replace(
+        query, neighbours=other.neighbours[:int(frames)], observation=replace(
+            query.observation, odom_from_camera=other.observation.odom_from_camera))
+        for query, other in zip(queries, others, strict=True)]
+
+
 def random_detections(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], count: float,
                       rng: np.random.Generator) -> World:
     """Replace the boxes of each query by random boxes, each of a random landmark's class."""
@@ -351,6 +362,7 @@ FAMILIES = {
     'B fisheye taken for a pinhole': _of_camera(wrong_sensors.fisheye_boxes, (0.0,)),
     'B odometry too long by a factor': _of_sensor(
         wrong_sensors.scaled_odometry, (1.2, 0.8), (FIVE,)),
+    'B carried after so many images': Trouble(carry, (1.0, 3.0), (FIVE,)),
     'B mount off by [degrees]': _of_sensor(wrong_sensors.wrong_mount, (5.0,), (VERTICAL, FIVE)),
     'C equal rooms, own out of date by a share': Trouble(add_aged_twin, (0.1, 0.2, 0.3), _BOTH),
     'C equal rooms, other out of date by a share': Trouble(add_aged_twin, (-0.2,), _BOTH),

@@ -29,6 +29,7 @@ from cliploc_ros.core.acceptance.confidence import (
 )
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
 from cliploc_ros.core.acceptance.look_alikes import lead_over_twin, turned_about_axis
+from cliploc_ros.core.acceptance.looks import EarlierLook
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
 from cliploc_ros.core.calibration import CALIBRATION, FILE
 from cliploc_ros.core.fit.covariance import share_within
@@ -51,6 +52,13 @@ SURE = Evidence(inliers=9, likely=0.99)
 GENUINE = Signs(math.log(30), 0.8, 0.0, 0.0, 1.0, 0.5, 0.0)
 SMALL = GENUINE._replace(reach=0.3, confirmed=0.4)
 RECOGNIZED = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 200, 0.9, 0.9)
+
+
+def looks(*confidences, doubted=0.0, same_view=0.0):
+    """Return earlier looks with these confidences, by default from other views."""
+    return tuple(EarlierLook(confidence, doubted, same_view) for confidence in confidences)
+
+
 # Factors that reduce the confidence, and the kind of refusal that names them.
 WEAK = {
     'rival': ({'likely': 0.5, 'rival': Rival(0.49, (9.0, 9.0, 9.0))}, RefusalKind.AMBIGUOUS),
@@ -65,7 +73,10 @@ WEAK = {
     'keyframes': ({'uncontradicted': 0.1, 'rival': Rival(0.01, (9.0, 9.0, 9.0))},
                   RefusalKind.CONTRADICTION),
     'found': ({'meetings': 0.1, 'coverage': 0.5, 'tried': 700}, RefusalKind.SEARCH_CUT_SHORT),
-    'looks': ({'earlier': (0.1,) * 9}, RefusalKind.FRAMES_DISAGREE),
+    'looks': ({'earlier': looks(*[0.1] * 9)}, RefusalKind.FRAMES_DISAGREE),
+    'same view': ({'earlier': looks(0.9, 0.9, doubted=0.6, same_view=1.0)},
+                  RefusalKind.FRAMES_DISAGREE),
+    'linked': ({'linked': 0.5}, RefusalKind.FRAMES_DISAGREE),
     'crops': ({'likely': 0.95, 'crops_left': 12}, RefusalKind.NOT_ALL_CROPS),
     'inliers': ({'inliers': 2}, RefusalKind.TOO_FEW_OBJECTS)}
 
@@ -400,10 +411,10 @@ def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
     (Evidence(5, 0.995, meetings=1), {'algorithm': 'ransac'},
      'confidence 0.77 < 0.99; pose found'),
     (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'b-prosac'}, 'iterations 100 < 500'),
-    (Evidence(5, 0.995, earlier=(0.0,) * 6), {},
+    (Evidence(5, 0.995, earlier=looks(*[0.0] * 6)), {},
      'mean confidence 0.14 < 0.5 in this pose over the last 7 frames'),
-    (Evidence(5, 0.995, earlier=(0.0, 0.99, 0.0)), {}, 'mean confidence 0.49 < 0.5'),
-    (Evidence(5, 0.995, earlier=(0.0, 0.99)), {}, '')])
+    (Evidence(5, 0.995, earlier=looks(0.0, 0.99, 0.0)), {}, 'mean confidence 0.49 < 0.5'),
+    (Evidence(5, 0.995, earlier=looks(0.0, 0.99)), {}, '')])
 def test_refusal_names_its_reason(evidence, options, reason):
     refused = refusal(evidence, RelocalizerOptions(**{'min_confidence': 0.99} | options))
     answer = refused.reason if refused else ''

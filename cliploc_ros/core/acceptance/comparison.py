@@ -116,7 +116,7 @@ class Comparison:
                     else contender._replace(odds=contender.odds + CALIBRATION.keyframes.missed
                                             * recognizer.coverage(contender.pose))
                     for contender in contenders]
-            contenders += self._proposed(seen, contenders)
+            contenders += self.proposed(seen, contenders)
             contenders.sort(key=lambda contender: (not contender.is_upright, -contender.rank))
         #: The leading contender first; each source has at most one contender for each place
         self.contenders = contenders
@@ -158,7 +158,7 @@ class Comparison:
         return confidences(np.array(odds), self.poses[rows], self._none, prior=np.array(
             [self.contenders[row].prior for row in rows]))
 
-    def _proposed(self, seen: Recognition, met: Sequence[Contender]) -> list[Contender]:
+    def proposed(self, seen: Recognition, met: Sequence[Contender]) -> list[Contender]:
         """Return the places that keyframes recognize, as contenders.
 
         If the search of objects found a pose at the same place, the points add to its odds. They
@@ -231,7 +231,7 @@ class Comparison:
             unexplained=best.support.unexplained, signs=self._signs(best), motion=self._motion(),
             not_mirrored=self._not_mirrored(by_points), uncontradicted=self._uncontradicted(),
             recognized=self.place, prior=self.contenders[0].prior,
-            earlier=self._looks.confidences_in(self._last, self.poses[0]), crops_left=0
+            earlier=self._looks.earlier(self._last, self.poses[0]), crops_left=0
             if self._last.compared is None
             else len(self._last.detections) - len(self._last.compared))
 

@@ -11,11 +11,17 @@ confidence of one look, divided by the limit, however often the robot looks (Ram
 2023). With a limit of .5, the probability that a robot outside the map ever accepts a pose is
 therefore at most twice the mean confidence of its looks.
 
+Looks with one camera share its errors and those of the map, so another look at the same view is no
+new chance: the mean log odds of the looks of a view must be as high as those of a single look. A
+look that finds another pose, or is unsure, counts as even odds. Looks after the robot has moved or
+turned count less, as far as their views differ.
+
 An accepted pose ends a series of looks, and the next request starts a new one. The places that
 keyframes recognized are kept for a while, because the motion between two of them distinguishes a
 place from a picture of it.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.calibration import CALIBRATION
-from cliploc_ros.core.geometry.transforms import SAME_LOOK, invert_transform
+from cliploc_ros.core.geometry.transforms import SAME_LOOK, invert_transform, pose_error
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.observation import Observation
 
@@ -33,8 +39,17 @@ class Look(NamedTuple):
 
     observation: Observation
     map_from_camera: NDArray[np.float64]  #: (4, 4)
-    confidence: float  #: From the frames of this look alone
+    confidence: float  #: From the frames of this look alone, if all cameras are right
     recognized: RecognizedPlace | None = None  #: The place that keyframes recognize
+    doubted: float = 0.0  #: The confidence including doubts about the camera
+
+
+class EarlierLook(NamedTuple):
+    """The evidence of an earlier look for the pose of a later one."""
+
+    confidence: float  #: In this pose, if all cameras are right
+    doubted: float  #: In this pose, including doubts about the camera
+    same_view: float  #: To what degree both looks have the same view, 0 to 1
 
 
 @dataclass(frozen=True)
@@ -60,9 +75,9 @@ class Looks:
             recognized = (*recognized, look)[-int(CALIBRATION.looks.most_recognized):]
         return Looks(() if accepted else (*past, look)[-int(CALIBRATION.looks.most):], recognized)
 
-    def confidences_in(self, observation: Observation, map_from_camera: NDArray[np.float64]
-                       ) -> tuple[float, ...]:
-        """Return the confidence of each earlier look in the pose (4, 4) of an observation.
+    def earlier(self, observation: Observation, map_from_camera: NDArray[np.float64]
+                ) -> tuple['EarlierLook', ...]:
+        """Return the earlier looks, given the pose (4, 4) of an observation.
 
         A look with another pose has confidence 0. The tolerance between two poses grows with the
         distance driven between them.
@@ -72,13 +87,16 @@ class Looks:
             return ()
         found = []
         for look in _before(self.past, observation)[1 - int(terms.most):]:
-            assert look.observation.odom_from_camera is not None
-            carried = look.map_from_camera @ invert_transform(
-                look.observation.odom_from_camera) @ odom_from_camera
+            before = look.observation.odom_from_camera
+            assert before is not None
+            carried = look.map_from_camera @ invert_transform(before) @ odom_from_camera
             way_m = max(observation.odom_way_m - look.observation.odom_way_m,
                         float(np.linalg.norm(carried[:3, 3] - look.map_from_camera[:3, 3])))
             tolerance = SAME_LOOK.wider(terms.drift_m * way_m, terms.drift_deg * way_m)
-            found.append(look.confidence if tolerance.agree(carried, map_from_camera) else 0.0)
+            moved_m, turned_deg = pose_error(before, odom_from_camera)
+            same_view = math.exp(-moved_m / terms.view_m - turned_deg / terms.view_deg)
+            agrees = float(tolerance.agree(carried, map_from_camera))
+            found.append(EarlierLook(agrees * look.confidence, agrees * look.doubted, same_view))
         return tuple(found)
 
     def passed(self, observation: Observation) -> tuple[Look, NDArray[np.float64]] | None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
+from cliploc_ros.core.acceptance.looks import EarlierLook
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
@@ -50,7 +51,7 @@ class RefusalKind(StrEnum):
 
 
 # Factors of the confidence other than likely and found. A refusal names the first of equal ones.
-_FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted')
+_FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted', 'linked')
 # Kind and message of a refusal, by the weakest factor of its Evidence.
 _ADVICE = {
     'near': (RefusalKind.UNCERTAIN_POSITION, 'position uncertain by {0.deviation_m:.2g} m; turn '
@@ -62,6 +63,8 @@ _ADVICE = {
                                      'picture or a changed place; move and request again'),
     'not_mirrored': (RefusalKind.AMBIGUOUS, 'the mirrored image fits another pose; turn the '
                                             'camera to more objects'),
+    'linked': (RefusalKind.FRAMES_DISAGREE, 'the newest image does not fit the earlier '
+                                            'ones; turn the camera to more objects'),
     'found': (RefusalKind.SEARCH_CUT_SHORT,
               'pose found only {0.meetings:g} times in {0.tried} samples; raise iterations or set '
               'algorithm to auto')}
@@ -123,8 +126,10 @@ class Evidence:
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: The place that keyframes recognize at the pose
     prior: float = 0.0  #: Log odds, at most 0, of the pose given the prior region
-    #: Confidence of each earlier look in this pose, see cliploc_ros.core.acceptance.looks
-    earlier: tuple[float, ...] = ()
+    #: Probability that odometry links all frames, see cliploc_ros.core.acceptance.links
+    linked: float = 1.0
+    #: The earlier looks and their confidence in this pose
+    earlier: tuple[EarlierLook, ...] = ()
     crops_left: int = 0  #: Number of crops that have not been compared with labels yet
 
     @property
@@ -158,9 +163,19 @@ class Evidence:
         return replace(self, camera=1.0, camera_fault='')
 
     @property
+    def confidence_of_view(self) -> float:
+        """Return the confidence by the mean log odds of all looks of this view."""
+        most = CALIBRATION.covariance.most_confidence
+        looks = np.clip([self.confidence, *(max(0.5, look.doubted) for look in self.earlier)],
+                        1.0 - most, most)
+        mean = np.average(np.log(looks / (1.0 - looks)),
+                          weights=[1.0, *(look.same_view for look in self.earlier)])
+        return float(1.0 / (1.0 + np.exp(-mean)))
+
+    @property
     def mean_confidence(self) -> float:
         """Return the mean confidence of all looks in this pose."""
-        return (sum(self.earlier) + self.confidence) / (len(self.earlier) + 1)
+        return float(np.mean([self.confidence, *(look.confidence for look in self.earlier)]))
 
 
 def is_exhaustive(coverage: float, options: RelocalizerOptions) -> bool:
@@ -181,6 +196,11 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     refused = None if by_points else _too_little(evidence, options)
     refused = refused or _too_unlikely(evidence, options)
     needed = min(CALIBRATION.looks.mean_confidence, options.min_confidence)
+    if refused is None and evidence.confidence_of_view < options.min_confidence - 1e-9:
+        return Refusal(RefusalKind.FRAMES_DISAGREE,
+                       f'confidence {_rounded_down(evidence.confidence_of_view)} < '
+                       f'{options.min_confidence:g} over the last {len(evidence.earlier) + 1} '
+                       'frames of this view; move, or turn the camera')
     if refused or evidence.mean_confidence >= needed:
         return refused
     return Refusal(RefusalKind.FRAMES_DISAGREE,

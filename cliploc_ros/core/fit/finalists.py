@@ -165,12 +165,12 @@ def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
     """
     if pose.information is not None and not pose.information.any():
         return POSE_UNKNOWN
-    return refined_covariance(rig, pose.rotation, pose.translation, _instants(frames), shared,
+    return refined_covariance(rig, pose.rotation, pose.translation, instants_of(frames), shared,
                               mount_deviation=mount_deviation,
                               camera_deviations=camera_deviations)
 
 
-def _instants(frames: Sequence[SearchedFrame]) -> NDArray[np.int64]:
+def instants_of(frames: Sequence[SearchedFrame]) -> NDArray[np.int64]:
     """Return the number (F,) of each frame's instant, which several cameras may share.
 
     Frames of one camera with equal stamps count as successive instants.
