@@ -24,7 +24,7 @@ from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
@@ -40,10 +40,6 @@ from cliploc_ros.units import NS_PER_S
 _QUERIES_A_PART = 8
 # Separates the name of a method from its number of iterations in a sweep.
 _AT = '@'
-
-
-class RunError(CliplocError):
-    """A run is incomplete."""
 
 
 class _Part(NamedTuple):
@@ -84,10 +80,8 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
 
     Raises
     ------
-    RunError
-        Workers died repeatedly at some queries. The other queries are done.
     WorkersError
-        From the workers.
+        Workers cannot be started, or died.
     """
     known = {(result.method, result.trial, result.query) for result in done}
     # methods that draw no samples come first, since they take longest
@@ -98,23 +92,14 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
         for places in batched((place for place, query in enumerate(queries)
                                if (method.name, trial, query.number) not in known),
                               1 if method.draws_nothing else _QUERIES_A_PART)]
-    results, lost = list(done), []
+    results = list(done)
     # a single part is done sooner than a process starts
     workers = workers if len(parts) > 1 else 1
     make_search = _MakeSearch(landmark_map, noisy or [queries], layer)
     with closing(run_tasks(make_search, parts, workers=workers, scheduler=scheduler)) as finished:
-        for part, found in finished:
-            if found is None:
-                lost.append(part)
-            else:
-                results += found
-                advance(found)
-    if lost:
-        first = lost[0]
-        raise RunError(f'workers died repeatedly at {len(lost)} of {len(parts)} parts, first at '
-                       f'{first.method.name}, trial {first.trial}, queries {first.places[0]}-'
-                       f'{first.places[-1]}; the others are done: continue with --resume and '
-                       'fewer --workers')
+        for _, found in finished:
+            results += found
+            advance(found)
     order = {method.name: number for number, method in enumerate(methods)}
     return sorted(results, key=lambda result: (order[result.method], result.trial, result.query))
 
