@@ -207,8 +207,8 @@ def evaluate(options: argparse.Namespace) -> int:
                     workers=options.workers or _cores(), scheduler=options.scheduler,
                     layer=layer, noisy=draws if len(draws) > 1 else (),
                     sweep=options.sweep if options.figures else None,
-                    resume=options.resume, frames=recorded.frames,
-                    given=others, about=_describe(options, given, layer is not None),
+                    resume=options.resume, given=others,
+                    about=_describe(options, given, layer is not None),
                     remarks=[*_notes_on_maps(options), *_notes_on_detector(queries, landmark_map)])
     return 0
 

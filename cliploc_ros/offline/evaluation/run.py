@@ -24,11 +24,10 @@ from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.errors import OptionsError
+from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
-from cliploc_ros.offline.datasets.observations import QueryFrame
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.methods import Method
@@ -40,6 +39,10 @@ from cliploc_ros.units import NS_PER_S
 _QUERIES_A_PART = 8
 # Separates the name of a method from its number of iterations in a sweep.
 _AT = '@'
+
+
+class RunError(CliplocError):
+    """A run is incomplete."""
 
 
 class _Part(NamedTuple):
@@ -80,8 +83,10 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
 
     Raises
     ------
+    RunError
+        Workers died repeatedly at some queries. The other queries are done.
     WorkersError
-        Workers cannot be started, or died.
+        From the workers.
     """
     known = {(result.method, result.trial, result.query) for result in done}
     # methods that draw no samples come first, since they take longest
@@ -92,14 +97,23 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
         for places in batched((place for place, query in enumerate(queries)
                                if (method.name, trial, query.number) not in known),
                               1 if method.draws_nothing else _QUERIES_A_PART)]
-    results = list(done)
+    results, lost = list(done), []
     # a single part is done sooner than a process starts
     workers = workers if len(parts) > 1 else 1
     make_search = _MakeSearch(landmark_map, noisy or [queries], layer)
     with closing(run_tasks(make_search, parts, workers=workers, scheduler=scheduler)) as finished:
-        for _, found in finished:
-            results += found
-            advance(found)
+        for part, found in finished:
+            if found is None:
+                lost.append(part)
+            else:
+                results += found
+                advance(found)
+    if lost:
+        first = lost[0]
+        raise RunError(f'workers died repeatedly at {len(lost)} of {len(parts)} parts, first at '
+                       f'{first.method.name}, trial {first.trial}, queries {first.places[0]}-'
+                       f'{first.places[-1]}; the others are done: continue with --resume and '
+                       'fewer --workers')
     order = {method.name: number for number, method in enumerate(methods)}
     return sorted(results, key=lambda result: (order[result.method], result.trial, result.query))
 
@@ -132,8 +146,7 @@ class _MakeSearch:
 
 def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
                     methods: Sequence[Method], out: Path, *, sweep: Sequence[int] | None = (),
-                    resume: bool = False, frames: Sequence[QueryFrame] = (),
-                    remarks: Sequence[str] = (),
+                    resume: bool = False, remarks: Sequence[str] = (),
                     given: Mapping[str, TimedPoses] = MappingProxyType({}),
                     about: Mapping[str, Any] = MappingProxyType({}), **running: Any
                     ) -> list[summary.Summary]:
@@ -149,8 +162,6 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         Further numbers of iterations of each sampling method, for a figure. None: no figures.
     resume : bool
         Continue an unfinished run.
-    frames : sequence of QueryFrame
-        Frames of the query file, which hold the times of detector and CLIP.
     remarks : sequence of str
         Notes on the input, shown with the table.
     given : mapping of str to TimedPoses
@@ -206,7 +217,7 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         write_text(out / 'summary.csv', summary.as_csv(summaries, summary.relative_errors(
             shown, {query.number: query.map_from_camera for query in queries})))
         pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
-                         summaries, methods, frames) if sweep is not None else []
+                         summaries, methods) if sweep is not None else []
         write_report(out, summaries, rows, remarks, pictures, facts)
         log.remove()
     print(f'results: {out.resolve() / PAGE}', flush=True)
@@ -277,7 +288,7 @@ def _digest(parts: Iterable[object]) -> str:
 
 def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
           results: Sequence[Result], summaries: Sequence[summary.Summary],
-          methods: Sequence[Method], frames: Sequence[QueryFrame]) -> list[Path]:
+          methods: Sequence[Method]) -> list[Path]:
     try:
         from cliploc_ros.offline.evaluation.figures import draw_all
     except ImportError as error:
@@ -291,14 +302,10 @@ def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         name, _, count = statistics.method.partition(_AT)
         if name in iterations:
             sweep.setdefault(name, {})[int(count or iterations[name])] = statistics
-    observing = {stage: np.array([getattr(frame, name) for frame in frames])
-                 for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
     return draw_all(
         out, landmark_map, queries, [result for result in results if _AT not in result.method],
         summaries,
-        {name: dict(sorted(counts.items())) for name, counts in sweep.items() if len(counts) > 1},
-        {stage: float(np.nanmean(times)) for stage, times in observing.items()
-         if np.isfinite(times).any()})
+        {name: dict(sorted(counts.items())) for name, counts in sweep.items() if len(counts) > 1})
 
 
 def write_trajectories(folder: Path, queries: Sequence[PosedQuery], results: Sequence[Result]
