@@ -247,7 +247,7 @@ _OBSERVATIONS = npz.Schema('observation file', {
     'depth_spreads': npz.Field('floats', ('n',), (_NOT_NEGATIVE,), is_optional=True),
     'open_edges': npz.Field('booleans', ('n', 4), is_optional=True),
     # large, and few rows are needed at a time
-    'embeddings': npz.Field('floats', ('n', 'd'), (npz.FINITE,), is_optional=True, stays=True),
+    'embeddings': npz.Field('floats', ('n', 'd'), (npz.FINITE,), is_optional=True),
     'encoder_key': npz.Field('text', is_optional=True),
     # a row without odometry is NaN
     'odom_from_camera': npz.Field('floats', ('F', 4, 4), (npz.Check(
