@@ -38,8 +38,8 @@ EXTRAS = {
     'cluster': ['distributed>=2024.8,<2028'],
 }
 EXTRAS['all'] = sorted({name for extra in EXTRAS.values() for name in extra})
-EXTRAS['test'] = ['hypothesis>=6.100,<7', 'pytest>=7.4,<10', 'pytest-rerunfailures>=14,<17',
-                  'pytest-xdist>=3.5,<4']
+EXTRAS['test'] = ['hypothesis>=6.100,<7', 'onnx>=1.17,<2', 'pytest>=7.4,<10',
+                  'pytest-rerunfailures>=14,<17', 'pytest-xdist>=3.5,<4']
 EXTRAS['docs'] = ['myst-parser>=4,<6', 'sphinx>=8,<10', 'sphinx-rtd-theme>=3,<4']
 # A placeholder, like the maintainers' address: the project has no public repository yet.
 REPOSITORY = 'https://example.org/cliploc_ros'

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.stats import chi2
 from tqdm import tqdm
 
 from cliploc_ros.core.fit.covariance import normalized_square
@@ -22,11 +23,10 @@ from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.files.parallel import MakeWork, WorkersError, run_tasks
 from cliploc_ros.files.storage import make_folder
 from cliploc_ros.offline.evaluation.figures import (
+    JUDGED_COLORS,
     add_legend,
-    draw_reliability,
     new_axes,
     save_figure,
-    within_ellipsoid,
 )
 from cliploc_ros.offline.evaluation.summary import wilson_interval
 
@@ -35,6 +35,10 @@ SUCCESS_M = (0.1, 0.25, 0.5, 1.0)
 #: Poses with greater errors can mislead a robot even if they are not false accepts.
 FAR_M, FAR_DEG = 0.5, 20.0
 _PRECISION = 0.99
+# Bins of confidence, finer where poses are accepted
+_BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
+_FREEDOM = 6  # degrees of freedom of a pose
+_MARKERS = 'osD^vP'
 #: Confidences (n,), and whether each pose is correct (n,).
 Judged = tuple[NDArray[np.float64], NDArray[np.bool_]]
 
@@ -266,3 +270,32 @@ def chance(predictors: NDArray[np.float64], coefficients: NDArray[np.float64]
            ) -> NDArray[np.float64]:
     """Return the logistic chance (n,) of predictors (n, k)."""
     return np.asarray(1.0 / (1.0 + np.exp(-np.clip(predictors @ coefficients, -50.0, 50.0))))
+
+
+def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
+                                                            NDArray[np.bool_]]],
+                     title: str = '') -> None:
+    """Draw the share of correct poses over the confidence, with 95 % intervals.
+
+    `judged` maps each name to confidences (n,) and a mask of the correct poses (n,).
+    """
+    if title:
+        axes.set_title(title, fontsize=9)
+    axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.0, label='ideal')
+    for number, (name, (confidence, right)) in enumerate(judged.items()):
+        bins = np.clip(np.digitize(confidence, _BINS) - 1, 0, len(_BINS) - 2)
+        color = JUDGED_COLORS[number % len(JUDGED_COLORS)]
+        for row in np.unique(bins):
+            chosen = bins == row
+            share, mean = right[chosen].mean(), confidence[chosen].mean()
+            low, high = wilson_interval(int(right[chosen].sum()), int(chosen.sum()))
+            axes.errorbar(mean, share, np.maximum([[share - low], [high - share]], 0.0),
+                          color=color, capsize=2, marker=_MARKERS[number % len(_MARKERS)],
+                          markersize=5, linewidth=1.0,
+                          label=f'{name} ({len(right)} poses)' if row == bins.min() else None)
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
+
+
+def within_ellipsoid(squares: NDArray[np.float64], share: float = 0.95) -> float:
+    """Return the share of poses within the confidence ellipsoids of a given probability."""
+    return float((squares < chi2.ppf(share, _FREEDOM)).mean())

@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tasks on a real Dask cluster with workers that die, are missing, or have another version."""
+"""Tasks on a real Dask cluster with workers that die or are missing."""
 
+import os
+import signal
 from dataclasses import dataclass
 
 import pytest
@@ -14,25 +16,30 @@ pytestmark = pytest.mark.full
 
 @dataclass(frozen=True, eq=False)
 class Cube:
-    """Cubes numbers."""
+    """Cubes numbers; kills its worker at one of them."""
+
+    deadly: int = -1
 
     def __call__(self):
-        return lambda number: number ** 3
+        return self.cube
+
+    def cube(self, number):
+        if number == self.deadly:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number ** 3
 
 
-@pytest.fixture(scope='module')
-def cluster():
-    with local_cluster(allowed_failures=0) as running:
-        yield running
-
-
-def test_a_dead_worker_costs_time_only(cluster):
+def test_a_dead_worker_costs_time_only_and_a_deadly_task_is_an_error():
     found = {}
-    for task, result in run_tasks(Cube(), range(40), scheduler=cluster.scheduler_address):
-        if len(found) == 5:
-            kill_a_worker(cluster)
-        found[task] = result
-    assert found == {number: number ** 3 for number in range(40)}
+    with local_cluster(allowed_failures=1) as cluster:
+        address = cluster.scheduler_address
+        for task, result in run_tasks(Cube(), range(40), scheduler=address):
+            if len(found) == 5:
+                kill_a_worker(cluster)
+            found[task] = result
+        assert found == {number: number ** 3 for number in range(40)}
+        with pytest.raises(WorkersError, match='its workers died'):
+            dict(run_tasks(Cube(7), range(20), scheduler=address))
 
 
 def test_no_scheduler_and_no_workers():

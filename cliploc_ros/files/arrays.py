@@ -9,7 +9,6 @@ takes more memory than the file declares.
 
 import math
 import os
-import struct
 import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -29,8 +28,6 @@ Arrays = Mapping[str, NDArray[Any]]
 # Groups of NumPy types by their kind codes. A field may also name a single NumPy type.
 _KINDS = {'text': 'U', 'numbers': 'fiu', 'floats': 'f', 'integers': 'iu', 'booleans': 'b'}
 _ROWS_AT_ONCE = 10_000
-# Offsets in a member of a zip file: of the lengths of its name and extra field, and of its name.
-_ZIP_LENGTHS, _ZIP_HEAD = 26, 30
 # Maximum memory of the arrays: this number of bytes, or this multiple of the file's size on disk.
 # A small or sparse file may declare arrays of any size.
 _MOST_BYTES, _MOST_GROWTH = 512 * 2**20, 8
@@ -74,7 +71,7 @@ class Offsets:
 
 
 def _is_not_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
-    """Check blocks of rows: a memory-mapped array may be larger than the memory."""
+    """Check blocks of rows: their copies as floats take up to eight times the memory."""
     within_row = tuple(range(1, values.ndim))
     return np.concatenate([~(np.abs(rows.astype(float)) <= _MOST).all(axis=within_row)
                            for rows in np.array_split(values, len(values) // _ROWS_AT_ONCE + 1)])
@@ -105,9 +102,6 @@ class Field:
     #: Checks that take the name and all arrays, and raise ArrayError
     checks: tuple[Callable[[str, Arrays], None], ...] = ()
     is_optional: bool = False
-    #: Whether it is memory-mapped, so that memory contains only the rows in use. Compressed arrays
-    #: cannot be mapped and are read.
-    stays: bool = False
 
 
 @dataclass(frozen=True)
@@ -123,9 +117,6 @@ class Schema:
     #: Arrays of other kinds of files, and hints for the message if a file has them instead
     others: Mapping[str, str] = field(default_factory=dict)
     is_stored: bool = False  #: Whether compressed arrays are refused
-    #: Arrays of files up to this size [bytes] are read and not mapped: a program that overwrites a
-    #: mapped file in place may cause a bus error in this process
-    largest_read: int = 0
 
     def read(self, path: Path) -> dict[str, NDArray[Any]]:
         """Read and validate the arrays of a file; missing optional arrays are omitted.
@@ -221,24 +212,19 @@ class Schema:
                 hints = [f' ({what})' for other, what in self.others.items() if other in members]
                 raise ArrayError(f'array {name} is missing{"".join(hints)}')
         status = os.fstat(file.fileno())
-        is_large = status.st_size > self.largest_read
-        # the member of each array, and whether it is memory-mapped
-        wanted = {name: (members[name], entry.stays and is_large
-                         and members[name].compress_type == zipfile.ZIP_STORED)
-                  for name, entry in self.fields.items() if name in members}
-        unpacked = sum(member.file_size for member, stays in wanted.values() if not stays)
+        wanted = {name: members[name] for name in self.fields if name in members}
+        unpacked = sum(member.file_size for member in wanted.values())
         # some network file systems report 0 blocks
         on_disk = 512 * status.st_blocks or status.st_size
         if unpacked > max(_MOST_BYTES, _MOST_GROWTH * on_disk):
             raise ArrayError(f'unpacks to {unpacked >> 20} MiB, more than {_MOST_GROWTH} times '
                              'its size on disk')
         arrays = {}
-        for name, (member, stays) in wanted.items():
+        for name, member in wanted.items():
             if self.is_stored and member.compress_type != zipfile.ZIP_STORED:
                 raise ArrayError(f'array {name} is compressed')
             try:
-                arrays[name] = (_mapped(file, archive, member) if stays
-                                else _array(archive, member))
+                arrays[name] = _array(archive, member)
             except Exception as error:  # NumPy and zipfile may raise any exception, see above
                 raise ArrayError(f'array {name} cannot be read: {error}') from error
         return arrays
@@ -246,38 +232,16 @@ class Schema:
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     """Read an array of a file; it takes no more memory than the archive declares."""
-    _header(archive, member)
-    with archive.open(member) as stream:
-        array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
-    return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array
-
-
-def _mapped(file: BinaryIO, archive: zipfile.ZipFile, member: zipfile.ZipInfo
-            ) -> NDArray[Any]:
-    """Memory-map an array of a file after verifying its checksum."""
-    shape, by_columns, dtype, start = _header(archive, member)
-    with archive.open(member) as stream:
-        while stream.read(1 << 20):
-            pass  # to the end, where zipfile verifies the checksum
-    # the local header repeats the name and has an extra field, whose length may differ
-    file.seek(member.header_offset + _ZIP_LENGTHS)
-    start += member.header_offset + _ZIP_HEAD + sum(struct.unpack('<HH', file.read(4)))
-    if 0 in shape:
-        return np.empty(shape, dtype)
-    return np.memmap(file, dtype, 'r', start, shape, 'F' if by_columns else 'C')
-
-
-def _header(archive: zipfile.ZipFile, member: zipfile.ZipInfo
-            ) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Return the shape, whether the order is Fortran's, the type, and the offset of the values."""
     with archive.open(member) as stream:
         version = np.lib.format.read_magic(stream)
         read = (np.lib.format.read_array_header_1_0 if version == (1, 0)
                 else np.lib.format.read_array_header_2_0)
-        shape, by_columns, dtype = read(stream)
+        shape, _, dtype = read(stream)
         start = stream.tell()
     if dtype.hasobject:
         raise ValueError('it contains Python objects')
     if (size := math.prod(shape) * dtype.itemsize) != member.file_size - start:
         raise ValueError(f'it has {member.file_size - start} bytes, expected {size}')
-    return shape, by_columns, dtype, start
+    with archive.open(member) as stream:
+        array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+    return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array

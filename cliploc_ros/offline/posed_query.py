@@ -7,7 +7,6 @@ the frames of a recording in order gathers the same evidence about cameras and d
 A frame that gets a new localizer is an independent question.
 """
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -37,9 +36,6 @@ class PosedQuery:
     is_main: bool = True  #: Whether it is asked about, or is only a neighbour of others
     #: (n,): index into the landmarks, -1 where unknown; None if unknown for all. For studies only.
     true_landmark: NDArray[np.int64] | None = None
-    #: Processing time of the image [ms]; NaN if not recorded
-    detector_ms: float = math.nan
-    clip_ms: float = math.nan
 
     def in_order(self) -> Iterator[Query]:
         """Yield the queries of a robot with this input, oldest first; the last one is the frame's.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from cliploc_ros.core.kernels.compiled import KERNEL_FOLDERS
+from cliploc_ros.core.kernels.compiled import KernelCache
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layer_of_map
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
@@ -212,7 +212,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
     CliplocError: a file or parameter is invalid, or a download failed.
     """
     if parameters.cache_dir:
-        KERNEL_FOLDERS.prefer(resolve_cache_dir(parameters.cache_dir) / 'kernels')
+        KernelCache.folder = resolve_cache_dir(parameters.cache_dir) / 'kernels'
     options = parameters.options()
     files = map_files(parameters)
     landmark_map, map_hash = load_hashed_map(node, files)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from cliploc_ros.files.parallel import WorkersError, run_tasks
+from cliploc_ros.files.parallel import run_tasks
 from demo.world.recording import record, write_true_map
 from demo.world.renderer import Light, Renderer
 from demo.world.room import make_room
@@ -41,11 +41,10 @@ def main() -> None:
     parser.add_argument('--jobs', type=int, default=os.cpu_count(),
                         help='parallel processes (%(default)s)')
     options = parser.parse_args()
-    for number, is_made in tqdm(run_tasks(
+    for _ in tqdm(run_tasks(
             partial(_make_work, options.folder, options.seed, options.frames),
             range(options.count), workers=options.jobs), total=options.count, unit='world'):
-        if not is_made:
-            raise WorkersError(f'workers died repeatedly at world {number}; use fewer --jobs')
+        pass
 
 
 def _make_work(folder: Path, seed: int, frames: int) -> Callable[[int], bool]:

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
-from cliploc_ros.core.keyframes import layer as layers
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.features import (
     DIMENSIONS,
@@ -62,14 +61,6 @@ def test_a_layer_comes_back_as_it_was(file):
     for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words',
                  'vocabulary'):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name
-    assert not isinstance(after.descriptors, np.memmap), 'a small file may be overwritten'
-
-
-def test_the_arrays_of_a_large_file_stay_in_it(file, monkeypatch):
-    monkeypatch.setattr(layers, '_SCHEMA', replace(layers._SCHEMA, largest_read=0))
-    layer = load_layer_of_map(file, ROOM)
-    assert isinstance(layer.descriptors, np.memmap)
-    assert np.array_equal(layer.descriptors, make_layer(ROOM).descriptors)
 
 
 def test_an_edited_map_keeps_its_layer(file):

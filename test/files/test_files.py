@@ -2,12 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The append-only log, and tasks on processes, some of which die."""
 
-import logging
 import os
 import signal
 import subprocess
 import sys
-import time
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,8 +159,7 @@ class Square:
 
 
 def results(make_work, count=12, **options):
-    return {task: None if result is None else result[0]
-            for task, result in run_tasks(make_work, range(count), **options)}
+    return {task: result[0] for task, result in run_tasks(make_work, range(count), **options)}
 
 
 SQUARES = {number: number * number for number in range(12)}
@@ -188,49 +185,14 @@ def test_tasks_are_taken_as_workers_become_free():
     stream.close()
 
 
-@dataclass(frozen=True)
-class OneDies:
-    """Task 0 kills its worker once, while task 1 runs; task 1 ends later."""
-
-    folder: Path
-
-    def __call__(self):
-        return self.do
-
-    def do(self, number):
-        begun, other = self.folder / f'{number}', self.folder / f'{1 - number}'
-        is_first = not begun.exists()
-        with begun.open('a') as file:
-            file.write(f'{os.getpid()}\n')
-        self.wait(other.exists)
-        if number == 0 and is_first:
-            os.kill(os.getpid(), signal.SIGKILL)
-        if number == 1:
-            self.wait(lambda: not Path(f'/proc/{other.read_text().split()[0]}').exists())
-        return number
-
-    @staticmethod
-    def wait(condition):
-        deadline = time.monotonic() + 60.0
-        while not condition():
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+def test_the_death_of_a_worker_is_an_error_that_names_the_remedy():
+    with pytest.raises(WorkersError, match=r'out of memory; .* fewer workers'):
+        results(Square(5), workers=2)
 
 
-def test_the_death_of_a_worker_costs_its_own_tasks_only(tmp_path):
-    assert dict(run_tasks(OneDies(tmp_path), range(2), workers=2)) == {0: 0, 1: 1}
-    assert [len((tmp_path / name).read_text().split()) for name in '01'] == [2, 1]
-
-
-def test_workers_that_all_die_end_the_run():
-    with pytest.raises(WorkersError):
-        list(run_tasks(Square(7), [7] * 20, workers=2))
-
-
-def test_a_deadly_task_is_given_up_alone(caplog):
-    with caplog.at_level(logging.WARNING):
-        assert results(Square(5), workers=2) == SQUARES | {5: None}
-    assert 'skipped: its workers died twice' in caplog.text
+def test_an_error_of_a_task_is_not_that_of_a_worker():
+    with pytest.raises(TypeError):
+        dict(run_tasks(Square(), ['text'], workers=2))
 
 
 def test_without_dask(monkeypatch):

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Detectors in ONNX files give the same boxes as their weights in PyTorch; invalid files.
-
-Published files cannot be downloaded here: D-FINE has random weights.
-"""
+"""Detectors in ONNX files: small ones with constant outputs, invalid and damaged files."""
 
 import json
 import shutil
@@ -13,17 +10,13 @@ import cv2
 import numpy as np
 import onnx
 import pytest
-import torch
 from onnx import TensorProto, helper, numpy_helper
-from onnx_exports import NAMES, SIDE, an_image, export_yolo, make_d_fine, pixels
 
 from cliploc_ros.errors import ImageError, ModelError, OptionsError
 from cliploc_ros.models.hub import is_hub_name
-from cliploc_ros.models.onnx_detector import OnnxDetector
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
-
-pytestmark = pytest.mark.full
+from demo import ASSETS
 
 
 @pytest.fixture(scope='module')
@@ -39,122 +32,51 @@ def load(cache):
     return detector
 
 
-@pytest.fixture(scope='session')
-def images(shared_data) -> list[np.ndarray]:
-    files = sorted((shared_data / 'tum_fr3_office/rgb').iterdir())[::6]
-    return [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in files]
+def an_image(height=90, width=160):
+    """Return an image of noise."""
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
-@pytest.fixture(scope='session')
-def weights(shared_data) -> Path:
-    return shared_data / 'weights/yolov8n_coco.pt'
+@pytest.fixture
+def queries(load, tmp_path):
+    """Return a function that finds boxes with a network like D-FINE: 4 queries, 2 classes."""
+    logits = np.array([[[0.0, -1.0], [2.0, -9.0], [1.0, -9.0], [-9.0, 1.5]]], np.float32)
+    boxes = np.array([[[0.5, 0.5, 0.2, 0.4], [0.3, 0.3, 0.2, 0.2], [0.31, 0.3, 0.2, 0.2],
+                       [0.9, 0.9, 0.4, 0.4]]], np.float32)
+    write_network(tmp_path / 'model.onnx', {'logits': logits, 'pred_boxes': boxes})
+    write_configs(tmp_path, ('mug', 'box'))
+    detector = load(tmp_path)
+
+    def find(image=None, **changes):
+        detector.configure(DetectorOptions(str(tmp_path), **{'conf': 0.0, 'iou': 1.0} | changes))
+        return detector.detect(an_image(100, 200) if image is None else image)
+    return find
 
 
-@pytest.fixture(scope='session')
-def plain(weights, tmp_path_factory) -> Path:
-    return export_yolo(weights, tmp_path_factory.mktemp('plain'))
+def sigmoid(*logits):
+    return 1.0 / (1.0 + np.exp(-np.array(logits)))
 
 
-@pytest.fixture(scope='session')
-def dynamic(weights, tmp_path_factory) -> Path:
-    return export_yolo(weights, tmp_path_factory.mktemp('dynamic'), dynamic=True)
+def test_the_pairs_of_a_query_and_a_class_compete(queries):
+    """As in transformers: as many pairs as queries, by the sigmoid of their logits."""
+    found = queries()
+    assert found.class_ids == ('mug', 'box', 'mug', 'mug')
+    assert found.scores == pytest.approx(sigmoid(2.0, 1.5, 1.0, 0.0), abs=1e-6)
+    np.testing.assert_allclose(found.bboxes_xyxy, [
+        [40, 20, 80, 40], [140, 70, 200, 100], [42, 20, 82, 40], [80, 30, 120, 70]], atol=1e-4)
 
 
-@pytest.fixture(scope='session')
-def selected(weights, tmp_path_factory) -> Path:
-    return export_yolo(weights, tmp_path_factory.mktemp('selected'), nms=True, conf=0.1, iou=0.7,
-                       agnostic_nms=False)
-
-
-@pytest.fixture(scope='session')
-def d_fine(tmp_path_factory):
-    """Return a folder in the hub's layout, and the network in PyTorch."""
-    folder = tmp_path_factory.mktemp('d-fine')
-    return folder, make_d_fine(folder)
-
-
-def in_boxes(images, size):
-    """Return images padded to a square with grey borders, as an export of fixed size sees them."""
-    return [cv2.copyMakeBorder(image, 80, 80, 0, 0, cv2.BORDER_CONSTANT, value=(114,) * 3)
-            for image in images]
-
-
-def compare(first, second, images) -> tuple[float, float]:
-    """Return the largest differences of boxes [px] and scores."""
-    boxes, scores, count = [0.0], [0.0], 0
-    for image in images:
-        found, again = first.detect(image), second.detect(image)
-        assert found.class_ids == again.class_ids
-        boxes.append(np.abs(found.bboxes_xyxy - again.bboxes_xyxy).max(initial=0.0))
-        scores.append(np.abs(found.scores - again.scores).max(initial=0.0))
-        count += len(found)
-    assert count > 20
-    return max(boxes), max(scores)
-
-
-@pytest.mark.parametrize('form', ['dynamic', 'plain', 'selected'])
-def test_boxes_of_ultralytics_equal_those_of_pytorch(form, weights, images, load, request):
-    exported = load(request.getfixturevalue(form))
-    assert isinstance(exported, OnnxDetector) and exported.inference == 'openvino'
-    assert len(exported.class_names) == 80
-    squares = images if form == 'dynamic' else in_boxes(images, 640)
-    px, score = compare(exported, load(weights, inference='pytorch'), squares)
-    print(f'\n{form}: boxes at most {px:.4f} px apart, scores {score:.5f}')
-    assert px < 0.5 and score < 0.01
-
-
-def test_an_export_with_half_precision(plain, tmp_path, images, load):
-    network = onnx.load(plain)
-    network.graph.input[0].type.tensor_type.elem_type = TensorProto.FLOAT16
-    network.graph.node.insert(0, helper.make_node('Cast', ['images'], ['images32'],
-                                                  to=TensorProto.FLOAT))
-    for node in list(network.graph.node)[1:]:
-        node.input[:] = ['images32' if name == 'images' else name for name in node.input]
-    onnx.save(network, tmp_path / 'half.onnx')
-    px, score = compare(load(tmp_path / 'half.onnx'), load(plain), images)
-    assert px < 1.0 and score < 0.01
-
-
-@pytest.mark.needs('transformers')
-def test_boxes_of_d_fine_equal_those_of_the_library(d_fine, load):
-    import transformers
-
-    folder, network = d_fine
-    detector, image = load(folder, conf=0.0, iou=1.0), an_image(SIDE, SIDE)
-    assert (detector.class_names, detector.device) == (NAMES, 'cpu')
-    found = detector.detect(image)
-    with torch.inference_mode():
-        outputs = network(torch.from_numpy(pixels(image)))
-    theirs = transformers.RTDetrImageProcessor().post_process_object_detection(
-        outputs, threshold=0.0, target_sizes=[(SIDE, SIDE)])[0]
-    assert found.class_ids == tuple(NAMES[int(number)] for number in theirs['labels'])
-    px = np.abs(found.bboxes_xyxy - np.clip(theirs['boxes'].numpy(), 0, SIDE)).max()
-    score = np.abs(found.scores - theirs['scores'].numpy()).max()
-    print(f'\nboxes at most {px:.5f} px apart, scores {score:.6f}')
-    assert px < 0.5 and score < 0.01
-
-
-@pytest.mark.needs('transformers')
-def test_options_choose_boxes(d_fine, load, cache):
-    folder, _ = d_fine
-    image = an_image()
-    detector = load(folder, conf=0.0, iou=1.0)
-    every = detector.detect(image)
-
-    def configure(**changes):
-        detector.configure(DetectorOptions(str(folder), **{'conf': 0.0, 'iou': 1.0} | changes))
-        return detector.detect(image)
-
-    assert configure(conf=float(every.scores[4])).class_ids == every.class_ids[:4]
-    assert configure(max_det=3).class_ids == every.class_ids[:3]
-    few = configure(iou=0.0)  # of overlapping boxes, one of each class is left
-    assert set(few.class_ids) == set(every.class_ids) and len(few) <= len(every)
-    assert (configure(conf=1.0).bboxes_xyxy.shape) == (0, 4)
-    for other in (an_image(1, 1), an_image(3, 700)):
-        detector.detect(other)
-    for other in (an_image()[..., 0], an_image()[:0], an_image().astype(float)):
+def test_options_choose_boxes(queries):
+    every = queries()
+    assert queries(conf=float(every.scores[2])).class_ids == every.class_ids[:2]
+    assert queries(max_det=3).class_ids == every.class_ids[:3]
+    assert queries(iou=0.5).scores.tolist() == every.scores[[0, 1, 3]].tolist()
+    assert queries(conf=1.0).bboxes_xyxy.shape == (0, 4)
+    for image in (an_image(1, 1), an_image(3, 700)):
+        queries(image)
+    for image in (an_image()[..., 0], an_image()[:0], an_image().astype(float)):
         with pytest.raises(ImageError):
-            detector.detect(other)
+            queries(image)
 
 
 def test_a_network_with_a_class_for_nothing(tmp_path, load):
@@ -168,6 +90,53 @@ def test_a_network_with_a_class_for_nothing(tmp_path, load):
     np.testing.assert_allclose(found.bboxes_xyxy, [[0, 0, 100, 50], [80, 30, 120, 70]], atol=1e-4)
     assert found.scores == pytest.approx([np.exp(3) / (1 + np.exp(3) + np.e),
                                           np.exp(2) / (np.exp(2) + 2)], abs=1e-6)
+
+
+def write_probe(file, kind=TensorProto.FLOAT, layout='classes'):
+    """Write a YOLO whose two scores are its input at a corner (red) and in the middle (blue)."""
+    rows = np.array([[32, 32, 20, 10], [32, 32, 20, 10]], np.float32)
+    names = ['corner', 'middle']
+    nodes = [helper.make_node('Cast', ['images'], ['float'], to=TensorProto.FLOAT)]
+    constants = [numpy_helper.from_array(np.eye(2, dtype=np.float32), 'eye')]
+    for name, (channel, y, x) in zip(names, ((0, 0, 0), (2, 32, 32)), strict=True):
+        place = np.array([0, channel, y, x], np.int64)
+        constants += [numpy_helper.from_array(place, f'{name}_from'),
+                      numpy_helper.from_array(place + 1, f'{name}_to')]
+        nodes.append(helper.make_node('Slice', ['float', f'{name}_from', f'{name}_to'], [name]))
+    constants.append(numpy_helper.from_array(np.array([1, 2, 1], np.int64), 'column'))
+    if layout == 'classes':  # (1, 4 + classes, boxes): each box has one class
+        constants.append(numpy_helper.from_array(rows.T[None], 'boxes'))
+        nodes += [helper.make_node('Concat', names, ['pair'], axis=1),
+                  helper.make_node('Reshape', ['pair', 'column'], ['scores']),
+                  helper.make_node('Mul', ['scores', 'eye'], ['each']),
+                  helper.make_node('Concat', ['boxes', 'each'], ['output0'], axis=1)]
+        shape = (1, 6, 2)
+    else:  # (1, boxes, 6): corners, score, class
+        edges = np.array([[[22, 27, 42, 37], [22, 27, 42, 37]]], np.float32)
+        constants += [numpy_helper.from_array(edges, 'boxes'), numpy_helper.from_array(
+            np.array([[[0], [1]]], np.float32), 'numbers')]
+        nodes += [helper.make_node('Concat', names, ['pair'], axis=1),
+                  helper.make_node('Reshape', ['pair', 'column'], ['scores']),
+                  helper.make_node('Concat', ['boxes', 'scores', 'numbers'], ['output0'], axis=2)]
+        shape = (1, 2, 6)
+    save(file, nodes, constants, [helper.make_tensor_value_info('output0', TensorProto.FLOAT,
+                                                                shape)], TWO, kind)
+    return file
+
+
+@pytest.mark.parametrize('kind', [TensorProto.FLOAT, TensorProto.FLOAT16])
+@pytest.mark.parametrize('layout', ['classes', 'selected'])
+def test_an_image_is_scaled_into_a_grey_border_and_boxes_back(tmp_path, load, kind, layout):
+    """100 x 50 pixels become 64 x 32, 16 pixels below the upper border of 64 x 64."""
+    detector = load(write_probe(tmp_path / 'probe.onnx', kind, layout), conf=0.1, iou=1.0)
+    assert detector.inference == 'openvino' and detector.class_names == ('mug', 'box')
+    image = np.full((50, 100, 3), (10, 20, 200), np.uint8)  # RGB
+    found = detector.detect(image)
+    assert dict(zip(found.class_ids, found.scores, strict=True)) == pytest.approx(
+        {'mug': 114 / 255, 'box': 200 / 255}, abs=1e-3)
+    scale = 100 / 64
+    np.testing.assert_allclose(found.bboxes_xyxy, [[22 * scale, 11 * scale, 42 * scale,
+                                                    21 * scale]] * 2, atol=1e-3)
 
 
 def test_the_confidence_in_any_object_of_the_first_yolov5(tmp_path, load):
@@ -190,6 +159,11 @@ def write_network(file, outputs, metadata=None, kind=TensorProto.FLOAT, shape=(1
         constants.append(numpy_helper.from_array(value, f'{name}_value'))
         nodes.append(helper.make_node('Add', [f'{name}_value', 'nothing'], [name]))
         results.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, value.shape))
+    return save(file, nodes, constants, results, metadata, kind, shape, opset)
+
+
+def save(file, nodes, constants, results, metadata=None, kind=TensorProto.FLOAT,
+         shape=(1, 3, 64, 64), opset=17):
     images = helper.make_tensor_value_info('images', kind, shape)
     graph = helper.make_graph(nodes, 'test', [images], results, constants)
     network = helper.make_model(graph, opset_imports=[helper.make_opsetid('', opset)],
@@ -251,8 +225,11 @@ def test_configurations_that_do_not_fit(load, tmp_path):
     assert 'cannot be read' in refusal(load, tmp_path)
 
 
-def test_damaged_files(load, plain, tmp_path):
-    content = plain.read_bytes()
+YOLO_FILE = ASSETS / 'yolo.onnx'
+
+
+def test_damaged_files(load, tmp_path):
+    content = YOLO_FILE.read_bytes()
     (tmp_path / 'cut.onnx').write_bytes(content[:len(content) // 2])
     assert 'truncated or corrupt' in refusal(load, tmp_path / 'cut.onnx')
     (tmp_path / 'text.onnx').write_text('hello')
@@ -260,22 +237,27 @@ def test_damaged_files(load, plain, tmp_path):
     (tmp_path / 'empty.onnx').touch()
     assert 'is empty' in refusal(load, tmp_path / 'empty.onnx')
     assert 'does not exist' in refusal(load, tmp_path / 'gone.onnx')
-    network = onnx.load(plain)
+    network = onnx.load(YOLO_FILE)
     onnx.save(network, tmp_path / 'apart.onnx', save_as_external_data=True,
               location='apart.onnx_data')
     load(tmp_path / 'apart.onnx')
     (tmp_path / 'apart.onnx_data').unlink()
     assert 'apart.onnx_data' in refusal(load, tmp_path / 'apart.onnx')
-    network = onnx.load(plain)
+    network = onnx.load(YOLO_FILE)
     network.graph.node[0].op_type = 'Strange'
     onnx.save(network, tmp_path / 'strange.onnx')
     assert 'update OpenVINO' in refusal(load, tmp_path / 'strange.onnx')
 
 
-def test_a_damaged_compiled_network_is_compiled_again(plain, images, tmp_path, caplog):
+@pytest.fixture
+def demo_image():
+    return cv2.imread(str(min((ASSETS / 'sequence/rgb').iterdir())))[..., ::-1]
+
+
+def test_a_damaged_compiled_network_is_compiled_again(demo_image, tmp_path, caplog):
     def boxes():
-        return load_detector(DetectorOptions(str(plain), device='cpu', cache_dir=str(tmp_path))
-                             ).detect(images[0]).bboxes_xyxy
+        return load_detector(DetectorOptions(str(YOLO_FILE), device='cpu', cache_dir=str(tmp_path))
+                             ).detect(demo_image).bboxes_xyxy
 
     before = boxes()
     blob, = tmp_path.rglob('*.blob')
@@ -289,16 +271,16 @@ def test_a_damaged_compiled_network_is_compiled_again(plain, images, tmp_path, c
     caplog.clear()
     assert np.array_equal(boxes(), before) and not caplog.records
     # on a robot, file and cache are in other places
-    copied = shutil.copy(plain, moved / plain.name)
+    copied = shutil.copy(YOLO_FILE, moved / YOLO_FILE.name)
     load_detector(DetectorOptions(str(copied), device='cpu', cache_dir=str(moved)))
     assert len(list(moved.rglob('*.blob'))) == 1
 
 
-def test_other_requests_are_refused(load, plain):
+def test_other_requests_are_refused(load):
     with pytest.raises(OptionsError, match='has fixed classes'):
-        load(plain, prompts=(('cup', 'cup'),))
+        load(YOLO_FILE, prompts=(('cup', 'cup'),))
     with pytest.raises(OptionsError, match='runs in OpenVINO'):
-        load(plain, inference='pytorch')
+        load(YOLO_FILE, inference='pytorch')
 
 
 @pytest.mark.parametrize(('model', 'expected'), [

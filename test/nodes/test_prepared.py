@@ -128,7 +128,7 @@ def test_kernels_that_the_folder_does_not_take_are_missed(robot, prepared, tmp_p
     (carried / 'kernels').write_text('no folder')
     done = prepare('--params-file', robot, '--cache-dir', carried)
     assert done.returncode == 1
-    assert 'error: not ready: compiled kernels are not kept in' in done.stderr
+    assert 'error: not ready: cannot keep compiled kernels in' in done.stderr
 
 
 @pytest.mark.parametrize(('old', 'new', 'named'), [

@@ -6,9 +6,8 @@ Images are compared by the visual words of their features (Sivic and Zisserman, 
 2003): the descriptors of a layer are clustered, each cluster is a word, and the similarity of two
 images is that of their word histograms. Words that occur in many keyframes have less weight.
 
-The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Its arrays are stored uncompressed. The
-arrays of a large file are memory-mapped, not read: only the parts in use take memory, and a layer
-may be larger than the memory.
+The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Its arrays are stored uncompressed
+and are read completely.
 """
 
 import hashlib
@@ -52,7 +51,7 @@ _MOST_MOVED_M = 0.25
 
 @dataclass(frozen=True)
 class KeyframeLayer:
-    """K keyframes with n points in total. The large arrays may be memory-mapped."""
+    """K keyframes with n points in total."""
 
     frame_id: str  #: Coordinate frame of the poses: the map's
     #: Landmarks of the map when the layer was made; they identify the map
@@ -190,19 +189,18 @@ _SCHEMA = Schema('file of keyframes', {
     'map_from_camera': Field('float64', ('K', 4, 4), (
         FINITE, Check('is not a rigid transform', lambda poses: ~are_rigid(poses)))),
     'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
-    'pixels': Field('uint16', ('n', 2), stays=True),
-    'points': Field('float32', ('n', 3), (FINITE,), stays=True),
-    'descriptors': Field('uint8', ('n', 'd'), stays=True),
+    'pixels': Field('uint16', ('n', 2)),
+    'points': Field('float32', ('n', 3), (FINITE,)),
+    'descriptors': Field('uint8', ('n', 'd')),
     'words': Field('uint16', ('n',), (_check_words,)),
     'vocabulary': Field('uint8', ('W', 'd')),
     # both missing unless images were requested
-    'images': Field('uint8', ('b',), is_optional=True, stays=True),
+    'images': Field('uint8', ('b',), is_optional=True),
     'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
     # missing if there is a single camera; the header contains the cameras
     'camera_rows': Field('int64', ('K',), is_optional=True),
 }, MapError, 'make the layer again with build_map --keyframe-layer, or remove the file',
-    {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True,
-    largest_read=256_000_000)
+    {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True)
 
 
 def layer_path(map_path: str | os.PathLike[str]) -> Path:
@@ -260,7 +258,7 @@ def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds
 def layer_hash(path: Path) -> str:
     """Return a digest of a layer file, from the names, sizes and checksums of its arrays.
 
-    Only the table of contents is read: a layer may be larger than the memory.
+    Only the table of contents is read: a layer may have gigabytes.
     """
     with zipfile.ZipFile(path) as archive:
         content = [(entry.filename, entry.file_size, entry.CRC) for entry in archive.infolist()]

@@ -139,8 +139,6 @@ def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) 
     camera = camera_from_numbers(arrays.get('image_size', size.round().clip(1)),
                                  arrays['intrinsics_fx_fy_cx_cy'])
     frames, stamps_ns = [], _stamps_ns(arrays)
-    detector_ms, clip_ms = (arrays.get(name, np.full(len(stamps_ns), np.nan))
-                            for name in _STAGES)
     for index, (begin, end) in enumerate(pairwise(map(int, arrays['frame_offsets']))):
         rows = slice(begin, end)
         seen = Detections(arrays['boxes_xyxy'][rows].astype(np.float64),
@@ -153,8 +151,7 @@ def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) 
                 depths=arrays['depths'][rows].astype(np.float64) if 'depths' in arrays else None),
             arrays['map_from_camera'][index].astype(np.float64),
             group=int(arrays['query_group'][index]), is_main=bool(arrays['is_main'][index]),
-            true_landmark=arrays['true_landmark'][rows].astype(np.int64),
-            detector_ms=float(detector_ms[index]), clip_ms=float(clip_ms[index])))
+            true_landmark=arrays['true_landmark'][rows].astype(np.int64)))
     return Queries(tuple(map(str, arrays['landmark_ids'])), tuple(frames))
 
 
@@ -189,7 +186,6 @@ def save_queries(path: str | Path, queries: Queries) -> None:
             'query_group': np.array([frame.group for frame in frames], dtype=np.int64),
             'is_main': np.array([frame.is_main for frame in frames], dtype=np.bool_),
             'stamps_ns': np.array([one.stamp_ns for one in seen], dtype=np.int64),
-            **{name: np.array([getattr(frame, name) for frame in frames]) for name in _STAGES},
         }
         if any(one.depths is not None for one in seen):
             arrays['depths'] = np.concatenate([
@@ -222,7 +218,7 @@ _OBSERVATIONS = npz.Schema('observation file', {
     'depth_spreads': npz.Field('floats', ('n',), (_NOT_NEGATIVE,), is_optional=True),
     'open_edges': npz.Field('booleans', ('n', 4), is_optional=True),
     # large, and few rows are needed at a time
-    'embeddings': npz.Field('floats', ('n', 'd'), (npz.FINITE,), is_optional=True, stays=True),
+    'embeddings': npz.Field('floats', ('n', 'd'), (npz.FINITE,), is_optional=True),
     'encoder_key': npz.Field('text', is_optional=True),
     # a row without odometry is NaN
     'odom_from_camera': npz.Field('floats', ('F', 4, 4), (npz.Check(

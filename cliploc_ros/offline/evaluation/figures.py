@@ -4,7 +4,7 @@
 
 import io
 from collections.abc import Callable, Mapping, Sequence
-from itertools import cycle, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
 
 from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.files.storage import write_file
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
-from cliploc_ros.offline.evaluation.summary import Summary, find_best, wilson_interval
+from cliploc_ros.offline.evaluation.summary import Summary, find_best
 from cliploc_ros.offline.evaluation.trials import Result
 from cliploc_ros.offline.posed_query import PosedQuery
 
@@ -128,20 +127,14 @@ _STYLES = {'bf': ('-', 'o'), 'ransac': ((0, (1, 1.2)), '^'), 'prosac': ((0, (5, 
 _SIZE = (6.4, 4.0)
 _MAX_ERROR_M = 2.0
 _SUCCESS_M = 1.0
-_BOX_BINS = ((0, 2), (3, 4), (5, 6), (7, 9), (10, 14), (15, 10_000))
 _MARGIN_M = 0.5
-# Bins of confidence, finer where poses are accepted
-_BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0)
-_FREEDOM = 6  # degrees of freedom of a pose
-_JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
-_MARKERS = 'osD^vP'
-_STAGE_COLORS = {'detector': '#BBBBBB', 'CLIP': '#888888', 'keyframes': '#56B4E9'}
+#: Colours of curves, for colour-blind readers.
+JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 
 
 def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
              results: Sequence[Result], summaries: Sequence[Summary],
-             sweep: Mapping[str, Mapping[int, Summary]], observing_ms: Mapping[str, float]
-             ) -> list[Path]:
+             sweep: Mapping[str, Mapping[int, Summary]]) -> list[Path]:
     """Draw every figure that has data.
 
     Parameters
@@ -152,8 +145,6 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
         Summaries of the results. Poses of other programs appear in the figures of success only.
     sweep : mapping of str to mapping of int to Summary
         Summaries of each sampling method, by its number of iterations.
-    observing_ms : mapping of str to float
-        Mean times of the stages before the search, where they were recorded [ms].
 
     Returns
     -------
@@ -162,23 +153,14 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
     """
     searched = [summary for summary in summaries if not summary.is_given]
     best = find_best(searched)
-    found = np.isfinite(best.errors_m)
-    reliable = {best.method: (best.confidence[found], best.errors_m[found] < _SUCCESS_M)}
     success = f'success (within {_SUCCESS_M:g} m)'
     figures = {
         'success_over_threshold': _drawn('error threshold [m]', 'success',
                                          _success_over_threshold, summaries),
-        'success_by_boxes': _drawn('detections in the image', success, _success_by_boxes,
-                                   summaries),
         'precision_over_recall': _drawn(
             'recall: accepted share of the correct poses',
             f'precision: share of accepted poses within {_SUCCESS_M:g} m', _precision_over_recall,
             searched),
-        'reliability': _drawn('confidence', f'share of poses within {_SUCCESS_M:g} m',
-                              draw_reliability, reliable, 'installed calibration'),
-        'consistency': _drawn('normalized estimation error squared (NEES)',
-                              'cumulative share of accepted poses', _consistency, searched),
-        'time_by_stage': _drawn('mean time [ms]', '', _time_by_stage, searched, observing_ms),
         'top_view': _top_view(landmark_map, queries,
                               [result for result in results if result.method == best.method],
                               best.method),
@@ -217,7 +199,7 @@ def new_axes(xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
     figure = Figure(figsize=_SIZE, layout='constrained')
     axes = figure.add_subplot()
     axes.set(xlabel=xlabel, ylabel=ylabel)
-    axes.set_prop_cycle(color=_JUDGED_COLORS)
+    axes.set_prop_cycle(color=JUDGED_COLORS)
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
     return figure, axes
@@ -272,23 +254,6 @@ def _best_iteration(axes: Axes, summaries: Sequence[Summary]) -> None:
     axes.set_title('box: median and quartiles; whiskers: 1.5 interquartile ranges', fontsize=9)
 
 
-def _success_by_boxes(axes: Axes, summaries: Sequence[Summary]) -> None:
-    boxes = summaries[0].boxes
-    bins = [(low, high, chosen) for low, high in _BOX_BINS
-            if (chosen := (boxes >= low) & (boxes <= high)).any()]
-    for summary in summaries:
-        color, line, marker = _style(summary.method)
-        rates = [(summary.errors_m[:, chosen] < _SUCCESS_M).mean() for _, _, chosen in bins]
-        axes.plot(range(len(bins)), rates, color=color, linestyle=line, marker=marker,
-                  markersize=4, linewidth=1.2, label=summary.method)
-    names = [f'{low} to {high}' if high < _BOX_BINS[-1][1] else f'{low} or more'
-             for low, high, _ in bins]
-    axes.set_xticks(range(len(bins)), [f'{name}\n{int(chosen.sum())} images'
-                                       for name, (*_, chosen) in zip(names, bins, strict=True)],
-                    fontsize=8)
-    axes.set_ylim(-0.02, 1.02)
-
-
 def _precision_over_recall(axes: Axes, summaries: Sequence[Summary]) -> None:
     for summary in summaries:
         color, line, marker = _style(summary.method)
@@ -329,47 +294,6 @@ def precision_recall(summary: Summary, limit_m: float = _SUCCESS_M
     return (accepted / right.sum())[last], (accepted / np.arange(1, right.size + 1))[last]
 
 
-def _consistency(axes: Axes, summaries: Sequence[Summary]) -> None:
-    """Draw the distribution of the normalized squared errors (NEES) of accepted poses."""
-    levels = np.linspace(0.0, float(chi2.ppf(0.999, _FREEDOM)), 400)
-    axes.plot(levels, chi2.cdf(levels, _FREEDOM), color='#888888', linewidth=1.6,
-              label='ideal')
-    axes.axvline(chi2.ppf(0.95, _FREEDOM), color='#888888', linewidth=0.8, linestyle=':',
-                 label='95 % ellipsoid')
-    judged = {summary.method: summary.nees[summary.accepted] for summary in summaries
-              if summary.nees.size and summary.accepted.any()}
-    for (name, squares), color in zip(judged.items(), cycle(_JUDGED_COLORS), strict=False):
-        axes.plot(levels, np.searchsorted(np.sort(squares), levels, side='right') / len(squares),
-                  color=color, linewidth=1.4,
-                  label=f'{name}: {within_ellipsoid(squares):.3f} in the 95 % ellipsoid')
-    axes.set(xlim=(0, levels[-1]), ylim=(0, 1.02))
-
-
-def _time_by_stage(axes: Axes, summaries: Sequence[Summary], observing_ms: Mapping[str, float]
-                   ) -> None:
-    rows = np.arange(len(summaries))
-    start = np.zeros(len(summaries))
-    stages: dict[str, Any] = dict(observing_ms)
-    if any(summary.has_keyframes for summary in summaries):
-        stages['keyframes'] = np.array([
-            summary.keyframes_ms.mean() if summary.has_keyframes else 0.0
-            for summary in summaries])
-    for stage, duration in stages.items():
-        axes.barh(rows, duration, left=start, color=_STAGE_COLORS[stage], label=stage)
-        start += duration
-    search = np.array([summary.mean_search_ms for summary in summaries])
-    axes.barh(rows, search, left=start, color=[_style(summary.method)[0] for summary in summaries])
-    for row, total, own in zip(rows, start + search, search, strict=True):
-        axes.annotate(f'search {own:,.1f}' + (f', total {total:,.1f}' if total > own else ''),
-                      (total, row), xytext=(3, 0), va='center', fontsize=8,
-                      textcoords='offset points')
-    axes.set_yticks(rows, [summary.method for summary in summaries])
-    axes.invert_yaxis()
-    if not stages and search.max() > 50 * search.min():
-        axes.set_xscale('log')
-    axes.margins(x=0.4)
-
-
 def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results: Sequence[Result],
               method: str) -> Figure:
     truth = {query.number: query.map_from_camera for query in queries}
@@ -401,32 +325,3 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results:
                       label=f'{label} ({len(chosen)})' if number == 0 else None)
     add_legend(figure)
     return figure
-
-
-def draw_reliability(axes: Axes, judged: Mapping[str, tuple[NDArray[np.float64],
-                                                            NDArray[np.bool_]]],
-                     title: str = '') -> None:
-    """Draw the share of correct poses over the confidence, with 95 % intervals.
-
-    `judged` maps each name to confidences (n,) and a mask of the correct poses (n,).
-    """
-    if title:
-        axes.set_title(title, fontsize=9)
-    axes.plot([0, 1], [0, 1], color='#888888', linewidth=1.0, label='ideal')
-    for number, (name, (confidence, right)) in enumerate(judged.items()):
-        bins = np.clip(np.digitize(confidence, _BINS) - 1, 0, len(_BINS) - 2)
-        color = _JUDGED_COLORS[number % len(_JUDGED_COLORS)]
-        for row in np.unique(bins):
-            chosen = bins == row
-            share, mean = right[chosen].mean(), confidence[chosen].mean()
-            low, high = wilson_interval(int(right[chosen].sum()), int(chosen.sum()))
-            axes.errorbar(mean, share, np.maximum([[share - low], [high - share]], 0.0),
-                          color=color, capsize=2, marker=_MARKERS[number % len(_MARKERS)],
-                          markersize=5, linewidth=1.0,
-                          label=f'{name} ({len(right)} poses)' if row == bins.min() else None)
-    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-
-
-def within_ellipsoid(squares: NDArray[np.float64], share: float = 0.95) -> float:
-    """Return the share of poses within the confidence ellipsoids of a given probability."""
-    return float((squares < chi2.ppf(share, _FREEDOM)).mean())

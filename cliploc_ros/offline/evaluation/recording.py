@@ -73,9 +73,7 @@ def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
                 camera, replace(detections.detections_of(frame), bboxes_xyxy=boxes), similarities,
                 int(stamp_ns), depths=None if detections.depths is None
                 else detections.depths[rows].astype(np.float64)),
-            detections.map_from_camera[frame], group=frame,
-            detector_ms=float(recorded.detector_ms[frame]),
-            clip_ms=float(recorded.clip_ms[frame])))
+            detections.map_from_camera[frame], group=frame))
     return Queries(landmark_map.landmark_ids, tuple(frames))
 
 

@@ -16,11 +16,7 @@ _BRIEF = (0, 1, 2, 5, 7)
 CAPTIONS = {
     _TOP_VIEW: 'Top view of the map. A line joins each estimate of this method to the true pose.',
     'success_over_threshold': 'Share of poses, accepted or not, within a distance of the truth.',
-    'success_by_boxes': 'Success by the number of detections in the image.',
     'precision_over_recall': 'Precision and recall for all thresholds of the confidence.',
-    'reliability': 'Calibration of the confidence, with 95 % intervals.',
-    'consistency': 'Calibration of the covariance.',
-    'time_by_stage': 'Mean time of an answer, by stage.',
     'best_iteration': 'Iteration that found the best pose.',
     'success_over_iterations': 'Success over the number of iterations.'}
 

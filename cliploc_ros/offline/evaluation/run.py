@@ -213,14 +213,10 @@ def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         name, _, count = statistics.method.partition(_AT)
         if name in iterations:
             sweep.setdefault(name, {})[int(count or iterations[name])] = statistics
-    observing = {stage: np.array([getattr(query, name) for query in queries])
-                 for stage, name in (('detector', 'detector_ms'), ('CLIP', 'clip_ms'))}
     return draw_all(
         out, landmark_map, queries, [result for result in results if _AT not in result.method],
         summaries,
-        {name: dict(sorted(counts.items())) for name, counts in sweep.items() if len(counts) > 1},
-        {stage: float(np.nanmean(times)) for stage, times in observing.items()
-         if np.isfinite(times).any()})
+        {name: dict(sorted(counts.items())) for name, counts in sweep.items() if len(counts) > 1})
 
 
 def write_trajectories(folder: Path, queries: Sequence[PosedQuery], results: Sequence[Result]

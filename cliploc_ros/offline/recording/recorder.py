@@ -312,7 +312,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, log: Log,
                     unusable.append(result)
                     if len(unusable) > MOST_LEFT_OUT * frames.count:
                         break
-                elif result is not None:
+                else:
                     log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
                     seen[result.place] = result
                     # refuse an implausible unit at once, not after hours of work
