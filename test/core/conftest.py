@@ -10,8 +10,17 @@ import pytest
 import yaml
 from scene import make_room
 
+from cliploc_ros.core.acceptance import camera_check
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.observations import Queries, load_queries
+
+
+@pytest.fixture
+def verified_camera(monkeypatch):
+    """Let no camera be wrong, so that a covariance has the errors of the pose alone."""
+    weights = np.zeros_like(camera_check._WEIGHTS)
+    weights[0] = 1.0
+    monkeypatch.setattr(camera_check, '_WEIGHTS', weights)
 
 
 @pytest.fixture(scope='session')

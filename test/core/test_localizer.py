@@ -120,7 +120,7 @@ def fused(session, observation, run=0):
     return session.answer(Query((observation,), run=run, limit=5, length_s=5.0)).frames
 
 
-def test_a_session_finds_what_the_relocalizer_finds(session):
+def test_a_session_finds_what_the_relocalizer_finds(session, verified_camera):
     observations = [turning(number, 4.0 * number) for number in range(3)]
     for observation in observations:
         found = session.answer(Query((observation,), limit=5, length_s=5.0))
@@ -419,7 +419,7 @@ def tilt_deg(found):
 
 
 @pytest.mark.parametrize('deviation_deg', [0.1, 0.5])
-def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room):
+def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room, verified_camera):
     """The verticals come from one sensor on one mount, so their error does not average out."""
     relocalizer = Relocalizer(room, replace(OPTIONS, vertical_deviation_deg=deviation_deg))
     at_once, one_by_one = [[0, 1, 3, 8, 7]], [[0, 1], [3], [8], [7]]
@@ -432,7 +432,7 @@ def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room):
     assert four >= 0.95 * one
 
 
-def test_odometry_adds_more_error_to_frames_that_are_further_apart(room):
+def test_odometry_adds_more_error_to_frames_that_are_further_apart(room, verified_camera):
     relocalizer, spreads = Relocalizer(room, OPTIONS), []
     for step_m in (0.02, 0.1, 0.2):
         poses = [moved(MAP_FROM_CAMERA, step_m * number, 0.0) for number in range(4)]

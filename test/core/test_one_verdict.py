@@ -130,9 +130,11 @@ def test_objects_never_take_from_keyframes(fields, mapped):
     recognizer, relocalizer = Says(place(0.003, **fields)), Relocalizer(ROOM, OPTIONS)
     alone = ask(recognizer, objects=0)
     found = relocalizer.relocalize([Observation(CAMERA, joined)], recognizer)
-    assert found.confidence > alone.confidence - 1e-3 > 0.05, 'rivals from the boxes'
+    # the map's other objects are in sight and missed, while the strangers are not explained
+    assert (found.evidence.signs.contradicted > 0.0) == (mapped > 0 and fields['inliers'] < 100)
+    assert found.confidence > alone.confidence - 0.01 > 0.05, 'rivals from the boxes'
     assert found.evidence.likely > alone.evidence.likely - 1e-3
-    assert found.evidence.by_points > alone.evidence.by_points - 5e-3
+    assert found.evidence.by_points > alone.evidence.by_points - 0.01
     if mapped < 3 or fields['inliers'] > 12:  # else points do not determine the pose
         assert error_m(found, 0.003) < 1e-12
         np.testing.assert_array_equal(found.covariance, alone.covariance)

@@ -111,7 +111,7 @@ def test_a_picture_needs_motion_to_be_told_from_the_place_and_motion_tells():
     assert chance_genuine(GENUINE, moved_like_a_picture) < 1e-6
 
 
-def test_the_confidence_counts_the_published_covariance():
+def test_the_confidence_counts_the_published_covariance(verified_camera):
     seen = see_room(make_room())
     found = Relocalizer(make_room(), RelocalizerOptions(matching='class')).relocalize(
         [Observation(CAMERA, seen.select(np.arange(4)))])

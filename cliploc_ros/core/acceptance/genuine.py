@@ -98,7 +98,7 @@ class Signs(NamedTuple):
     apart: float  #: See RecognizedPlace, limited to 1: next to a keyframe, all surroundings match
     #: Number of landmarks in sight that no detection shows, except one, at most the number of
     #: detections that no landmark explains. Either alone is no sign: detectors miss objects, and
-    #: most objects of a room are never mapped.
+    #: most objects of a room are never mapped. It counts less the more points agree.
     contradicted: float
 
 
@@ -111,7 +111,7 @@ def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera,
     boxes : ndarray (b, 4)
         Boxes of the detections that the pose explains: left, top, right, bottom [px].
     contradicted : float
-        See Signs.
+        See Signs; before points are counted.
     """
     size = np.array([camera.width, camera.height], dtype=np.float64)
     corners = np.clip(boxes.reshape(-1, 2), 0.0, size)
@@ -123,7 +123,8 @@ def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera,
         _error(place.focal_ratio, place.focal_deviation),
         _error(place.aspect_ratio, place.aspect_deviation),
         float((np.ptp(ends, axis=0) / size).max()) if len(ends) else 0.0,
-        min(1.0, place.apart), contradicted)
+        min(1.0, place.apart),
+        contradicted * max(0.0, 1.0 - place.inliers / _TERMS.sure_points))
 
 
 def chance_genuine(signs: Signs, motion: Motion | None = None,
