@@ -8,8 +8,9 @@ their poses differ and the error stays the same. A look is the evidence of one f
 errors of its camera, with the pose eliminated, see cliploc_ros.core.fit.camera_fit. It consists of
 an information matrix and a vector, which add up over looks. Looks from one view share the errors
 of their boxes. Their mean therefore counts as one look. Errors of the map are errors of all looks
-at an object, so the information of all looks is reduced by their scatter, see Views.odds. Poses
-that are refused give looks, too, because the few poses that a wrong camera lets pass fit it well.
+at an object: a view that contradicts the others has less weight, and a verdict must hold without
+the views of any one place, see Views.odds. Poses that are refused give looks, too, because the few
+poses that a wrong camera lets pass fit it well.
 
 A camera is either right, with the small errors of any calibration, or wrong in one of a few ways
 (kinds), with large errors. The Bayes factor of wrong against right is a mean of likelihood ratios.
@@ -52,6 +53,7 @@ from cliploc_ros.core.geometry.ellipsoid import box_ious
 from cliploc_ros.core.geometry.transforms import (
     RIGHT_M,
     SAME_BOXES,
+    SAME_PLACE,
     invert_transform,
     make_transform,
 )
@@ -69,14 +71,15 @@ _WRONG = np.array([_TERMS.wrong_focal, _TERMS.wrong_aspect, _TERMS.wrong_point, 
 # camera.
 _KINDS = {'image': (0, 2, 3), 'focal length': (0,), 'aspect': (1,), 'principal point': (2, 3),
           'stretched image': (0, 1, 2, 3), 'convention': (4, 5), 'size': (6,)}
-_OF_OTHER_PIXELS = np.array([name in ('image', 'principal point', 'stretched image')
-                             for name in _KINDS])
+_OF_OTHER_PIXELS = np.isin([*_KINDS], ['image', 'principal point', 'stretched image'])
 _UNKNOWN_INFO = 1 + list(_KINDS).index('stretched image')
 _DEVIATIONS = np.array([_RIGHT, *(np.where(np.isin(np.arange(ERRORS), errors), _WRONG, _RIGHT)
                                   for errors in _KINDS.values())])
 _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
 _WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
+# Rounds of weights and mean; more than four change no odds by .1.
+_ROUNDS = 4
 # The largest coordinate of a recorded box [px]. A file with a larger one is damaged.
 _FAR = 1e9
 
@@ -106,6 +109,8 @@ class CameraOdds(NamedTuple):
     odds: NDArray[np.float64]  #: (1 + k,): log likelihood of each hypothesis, up to a constant
     means: NDArray[np.float64]  #: (1 + k, 7): mean errors under each hypothesis
     squares: NDArray[np.float64]  #: (1 + k, 7, 7): second moments of the errors
+    #: The least log odds without the views of any one place; infinite if no verdict depends on it
+    least: float = math.inf
 
     @property
     def log_odds(self) -> float:
@@ -115,7 +120,7 @@ class CameraOdds(NamedTuple):
     @property
     def is_wrong(self) -> bool:
         """Return whether the camera is certainly wrong."""
-        return self.log_odds > _TERMS.sure
+        return min(self.log_odds, self.least) > _TERMS.sure
 
     def effect(self, covariance: NDArray[np.float64], moves: NDArray[np.float64]
                ) -> tuple[float, NDArray[np.float64]]:
@@ -213,12 +218,11 @@ class Views(NamedTuple):
         if not len(same):
             new = (look.map_from_camera, 1, look.information, look.vector)
             return self.joined(Views(*(np.array([field]) for field in new)))
-        row, counts = same[0], self.counts.copy()
-        informations, vectors = self.informations.copy(), self.vectors.copy()
-        counts[row] += 1
-        informations[row] += (look.information - informations[row]) / counts[row]
-        vectors[row] += (look.vector - vectors[row]) / counts[row]
-        return Views(self.poses, counts, informations, vectors)
+        counts = self.counts + (np.arange(len(self.counts)) == same[0])
+        share = ((counts - self.counts) / counts)[:, None]
+        return Views(self.poses, counts, self.informations + share[:, None] * (
+            look.information - self.informations), self.vectors + share * (
+                look.vector - self.vectors))
 
     def joined(self, other: 'Views') -> 'Views':
         """Return these views followed by others; the oldest views are dropped if too many."""
@@ -228,19 +232,27 @@ class Views(NamedTuple):
     def odds(self, extent: float = 0.0) -> CameraOdds:
         """Return the odds of the camera from all looks; for extent see odds_of.
 
-        Errors of the map scatter the errors of the views more than their boxes do. The information
-        is then too large by the Birge ratio (Birge, "The Calculation of Errors by the Method of
-        Least Squares", 1932). Errors of the camera are common to all views, and do not scatter.
+        Errors of the map scatter the views more than their boxes do. A view that is far from the
+        mean of all therefore has the weight of a Student distribution (Lange, Little and Taylor,
+        "Robust Statistical Modeling Using the t Distribution", 1989). Errors of the camera are
+        common to all views, and do not scatter. The objects near a place share the errors of the
+        map, so a camera is only wrong if it is wrong without the views of any one place, too.
         """
-        information, vector = self.informations.sum(axis=0), self.vectors.sum(axis=0)
-        prior = np.diag(_WRONG ** -2.0)
-        common, each = np.linalg.inv(information + prior), np.linalg.inv(self.informations + prior)
-        apart = self.vectors - self.informations @ common @ vector
-        freedom = (np.einsum('vij,vji->', self.informations, each)
-                   - np.einsum('ij,ji->', information, common))
-        ratio = max(1.0, (_TERMS.scatter + float(np.einsum('vi,vij,vj->', apart, each, apart)))
-                    / (_TERMS.scatter + max(0.0, float(freedom))))
-        return odds_of(information / ratio, vector / ratio, extent)
+        prior, weights = np.diag(_WRONG ** -2.0), np.ones(len(self.poses))
+        each = np.linalg.inv(self.informations + prior)
+        for _ in range(_ROUNDS):
+            informations = weights[:, None, None] * self.informations
+            vectors = weights[:, None] * self.vectors
+            mean = np.linalg.solve(informations.sum(axis=0) + prior, vectors.sum(axis=0))
+            apart = self.vectors - self.informations @ mean
+            squares = np.einsum('vi,vij,vj->v', apart, each, apart)
+            weights = np.minimum(1.0, (_TERMS.scatter + ERRORS) / (_TERMS.scatter + squares))
+        odds = odds_of(informations.sum(axis=0), vectors.sum(axis=0), extent)
+        if odds.is_wrong:
+            odds = odds._replace(least=min((
+                odds_of(informations[~near].sum(axis=0), vectors[~near].sum(axis=0), extent
+                        ).log_odds for near in SAME_PLACE.agreeing(self.poses)), default=math.inf))
+        return odds
 
 
 class Extent:
@@ -287,30 +299,30 @@ class _Record:
     def __init__(self, name: str, camera: Camera) -> None:
         self.name, self.camera = name, camera
         self.views, self.since, self.extent = Views(), Views(), Extent()
-        self.by_looks, self.by_extent = 0.0, 0.0  # log odds that the camera is wrong
-        self.odds = self.views.odds()  # from looks and extent
+        self.by_extent = 0.0  # log odds that the camera is wrong
+        self.odds = self.by_looks = self.views.odds()  # from looks and extent; from looks alone
 
     def see(self, observation: Observation) -> None:
         """Add the boxes of a frame, unless looks have verified the camera."""
-        if self.by_looks > _TERMS.fits or self.by_extent > 0.0:
+        if self.by_looks.log_odds > _TERMS.fits or self.by_extent > 0.0:
             self.extent.add(observation.detections.bboxes_xyxy)
             self.by_extent = self.extent.log_odds(self.camera)
             self.odds = self.views.odds(self.by_extent)
 
     def add(self, look: CameraLook) -> None:
         """Add a look. After a verdict "wrong", new looks decide whether the camera is repaired."""
-        if self.by_looks <= _TERMS.sure:
+        if not self.by_looks.is_wrong:
             self.views, self.since = self.views.with_look(look), Views()
         else:
             self.since = self.since.with_look(look)
             # by how much the looks since the verdict raise the odds of the same errors
-            gain = self.views.joined(self.since).odds().log_odds - self.by_looks
+            gain = self.views.joined(self.since).odds().log_odds - self.by_looks.log_odds
             if gain > _TERMS.view:
                 self.views, self.since = self.views.joined(self.since), Views()
             elif (gain < -_TERMS.view and self.since.odds().log_odds < _TERMS.fits
                   and self.by_extent < -_TERMS.fits):
                 self.views, self.since = self.since, Views()
-        self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds().log_odds
+        self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds()
 
     def copied(self) -> '_Record':
         """Return a copy of the state. Views and boxes are shared, as they are never modified."""
@@ -339,7 +351,7 @@ class _Record:
             raise ValueError(f'values must be finite, and box coordinates below {_FAR:g} px')
         record.by_extent = record.extent.log_odds(record.camera)
         record.odds = record.views.odds(record.by_extent)
-        record.by_looks = record.views.odds().log_odds
+        record.by_looks = record.views.odds()
         return record
 
     @property
@@ -474,8 +486,6 @@ class CameraCheck:
 
 def _is_same(one: Camera, other: Camera) -> bool:
     """Return whether two cameras differ at most by the intrinsics that an autofocus changes."""
-    if one == other:
-        return True
     changes = np.array([one.fx, one.fy, one.cx, one.cy]) - [other.fx, other.fy, other.cx, other.cy]
     return bool(np.abs(changes).max() <= _TERMS.same_info * one.fx) and one == replace(
         other, fx=one.fx, fy=one.fy, cx=one.cx, cy=one.cy)

@@ -161,7 +161,7 @@ SAME_MINIMUM = Tolerance(0.05, 2.0)
 #: A camera that moves less than this has the same view.
 SAME_VIEW = Tolerance(0.05, 3.0)
 #: Within this, the boxes of an object at two poses have the same errors.
-SAME_BOXES = Tolerance(0.4, 15.0)
+SAME_BOXES = Tolerance(0.25, 10.0)
 #: Within this, a keyframe has the view of a camera; the shares of both tolerances are added.
 SAME_SIGHT = Tolerance(2.0, 40.0)
 #: If a robot has moved less than this since its image, its pose is still valid.
