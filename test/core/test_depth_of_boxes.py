@@ -25,7 +25,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.offline.evaluation.trials import simulate_depths
+from studies.worlds.depths import simulate_depths
 
 ROOM = make_room()
 CAMERA_FROM_MAP = invert_transform(MAP_FROM_CAMERA)

@@ -28,10 +28,10 @@ def golden_scenes(office, office_map, queries, observe):
             continue
         observation = observe(frame)
         nearest = nearest_candidates(observation.similarities, 3)
-        potential = same_class(frame.class_ids, office_map.class_ids)
+        potential = same_class(observation.detections.class_ids, office_map.class_ids)
         potential |= candidate_mask(nearest, potential.shape)
         pairs = balanced_order(nearest).pairs
-        scene = make_scene(observation.camera.normalize_bboxes(frame.bboxes_xyxy),
+        scene = make_scene(observation.camera.normalize_bboxes(observation.detections.bboxes_xyxy),
                            office_map.centers, office_map.shapes, potential, pairs,
                            float(golden['thr']))
         scenes.append((scene, nearest, potential, values))

@@ -77,6 +77,7 @@ _DEVIATIONS = np.array([_RIGHT, *(np.where(np.isin(np.arange(ERRORS), errors), _
                                   for errors in _KINDS.values())])
 _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
 _WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
+_UNVERIFIED = math.log(_TERMS.unverified / (1.0 - _TERMS.unverified))
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
 # Rounds of weights and mean; more than four change no odds by .1.
 _ROUNDS = 4
@@ -140,7 +141,8 @@ class CameraOdds(NamedTuple):
         ndarray (6, 6)
             What they add to the covariance: the errors of camera_info, weighted by the
             probability that the camera is wrong. Its kind does not matter, since few looks tell
-            the kinds apart.
+            the kinds apart. Before any look, this probability is `unverified`, which is smaller
+            than the caution that an acceptance needs.
         """
         weights = np.exp(self.odds - self.odds.max()) * _WEIGHTS
         weights /= weights.sum()
@@ -148,7 +150,8 @@ class CameraOdds(NamedTuple):
         added[0] = 0.0  # the covariance includes the errors of a right camera
         near = shares_within(RIGHT_M, (CALIBRATION.covariance.caution * covariance
                                        + added)[:, :3, :3])
-        return float(weights @ near / near[0]), (1.0 - weights[0]) * added[_UNKNOWN_INFO]
+        wrong = 1.0 / (1.0 + math.exp(-min(self.log_odds + _UNVERIFIED, 50.0)))
+        return float(weights @ near / near[0]), wrong * added[_UNKNOWN_INFO]
 
 
 def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], extent: float = 0.0
