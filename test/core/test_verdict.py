@@ -623,7 +623,16 @@ def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng):
     desk = of_things(DESK)
     groups = [ask(see_room(replace(desk, centers=desk.centers + shift), camera))[0]
               for shift in shifts]
+    weaker, = -np.diff(utilities([Support(4.0), Support(4.0, group=0.7)]))
+    assert weaker == pytest.approx(0.7)
     assert min(groups) >= terms.unmapped and np.sum(np.array(groups) > 1.0) >= 3
+
+
+def test_a_turn_about_a_level_line_through_things_is_a_rival():
+    row = of_things([(name, 0.5 * x, 0.0, 1.0) for x, name in enumerate('abcd')])
+    camera = make_transform(UP, np.array([0.7, -3.0, 1.0]))
+    turned = turned_about_axis(row, camera, np.arange(4))
+    np.testing.assert_allclose(turned[:, 0, 3], np.full(7, 0.7))
 
 
 @pytest.mark.parametrize('table', [[], [('table', 0.0, 0.0, 0.4)]])
