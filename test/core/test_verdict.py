@@ -617,7 +617,7 @@ def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng):
     room = see_room(OFFICE, camera)
     assert ask(room.select(np.arange(4))) == (pytest.approx(terms.unmapped), True)
     assert ask(room.select(np.arange(5))) == (0.0, True), 'more than four'
-    assert ask(room.select(np.array([0, 2, 3, 6]))) == (0.0, True), 'one of the rest of the room'
+    assert ask(room.select(np.array([0, 2, 3, 6]))) == (0.0, True), 'the rest of the room'
     turns, off_m = rng.uniform(0.0, 2.0 * np.pi, (20, 4)), rng.uniform(0.05, 0.1, (20, 4))
     shifts = np.stack([off_m * np.cos(turns), off_m * np.sin(turns), 0.0 * turns], axis=2)
     desk = of_things(DESK)
@@ -637,7 +637,7 @@ def test_a_turn_about_a_level_line_through_things_is_a_rival():
 
 @pytest.mark.parametrize('table', [[], [('table', 0.0, 0.0, 0.4)]])
 def test_a_turn_about_a_table_that_takes_chairs_to_chairs_is_a_rival(table):
-    """The axis is the table's, or the middle of the chairs; a turn by half a step fits no chair."""
+    """The axis is the table's, or the middle of the chairs; a turn by 45 degrees fits no chair."""
     room = of_things([*table, *(('chair', x, y, 0.4) for x, y in (
         (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)))])
     camera = make_transform(UP, np.array([0.0, -3.0, 1.4]))
