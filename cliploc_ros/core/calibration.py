@@ -38,6 +38,8 @@ class Calibration(NamedTuple):
     #: Log odds that a recognized place is real, not a picture of it
     genuine: Terms
     attitude: Terms  #: Evidence of the attitude against a pose
+    #: Evidence against a pose whose matches are all one small group
+    group: Terms
     mirror: Terms  #: Search for a pose of the mirrored image
     places: Terms  #: Log odds between places that look alike
     twins: Terms  #: Conditions for two places of a map to look alike

@@ -589,6 +589,63 @@ def test_a_turn_about_an_axis_that_all_objects_share_is_a_rival():
     assert found[1].evidence.distinct > 0.95
 
 
+def of_things(things):
+    """Return a map of things of known class and place, z up."""
+    sizes = {'tv': (0.25, 0.05, 0.2), 'keyboard': (0.2, 0.07, 0.02), 'mouse': (0.03, 0.05, 0.02)}
+    names = tuple(f'{name} {row}' for row, (name, *_) in enumerate(things))
+    return LandmarkMap('map', names, names, tuple(name for name, *_ in things),
+                       np.array([place for _, *place in things]),
+                       np.array([sizes.get(name, (0.2, 0.2, 0.3)) for name, *_ in things]),
+                       np.tile([0.0, 0.0, 0.0, 1.0], (len(things), 1)))
+
+
+DESK = [('tv', 0.0, 0.3, 1.0), ('tv', 0.6, 0.3, 1.0), ('keyboard', 0.2, -0.1, 0.75),
+        ('mouse', 0.55, -0.1, 0.75)]
+OFFICE = of_things([*DESK, ('cup', 0.4, 0.0, 0.75), ('chair', 0.3, 1.6, 0.4),
+                    ('potted plant', -1.2, 1.5, 0.5), ('oven', 4.0, -3.0, 0.5)])
+
+
+def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng):
+    """An image may show a desk that the map lacks; its things stand 5 to 10 cm otherwise."""
+    terms, camera = CALIBRATION.group, make_transform(UP, np.array([0.3, -1.8, 1.2]))
+
+    def ask(seen):
+        found = Relocalizer(OFFICE, RelocalizerOptions(matching='class')).relocalize(
+            [Observation(CAMERA, seen, up_in_camera=camera[2, :3])])
+        return found.hypotheses[0].support.group, found.accepted
+
+    room = see_room(OFFICE, camera)
+    assert ask(room.select(np.arange(4))) == (pytest.approx(terms.unmapped), True)
+    assert ask(room.select(np.arange(5))) == (0.0, True), 'more than four'
+    assert ask(room.select(np.array([0, 2, 3, 6]))) == (0.0, True), 'the rest of the room'
+    turns, off_m = rng.uniform(0.0, 2.0 * np.pi, (20, 4)), rng.uniform(0.05, 0.1, (20, 4))
+    shifts = np.stack([off_m * np.cos(turns), off_m * np.sin(turns), 0.0 * turns], axis=2)
+    desk = of_things(DESK)
+    groups = [ask(see_room(replace(desk, centers=desk.centers + shift), camera))[0]
+              for shift in shifts]
+    weaker, = -np.diff(utilities([Support(4.0), Support(4.0, group=0.7)]))
+    assert weaker == pytest.approx(0.7)
+    assert min(groups) >= terms.unmapped and np.sum(np.array(groups) > 1.0) >= 3
+
+
+def test_a_turn_about_a_level_line_through_things_is_a_rival():
+    row = of_things([(name, 0.5 * x, 0.0, 1.0) for x, name in enumerate('abcd')])
+    camera = make_transform(UP, np.array([0.7, -3.0, 1.0]))
+    turned = turned_about_axis(row, camera, np.arange(4))
+    np.testing.assert_allclose(turned[:, 0, 3], np.full(7, 0.7))
+
+
+@pytest.mark.parametrize('table', [[], [('table', 0.0, 0.0, 0.4)]])
+def test_a_turn_about_a_table_that_takes_chairs_to_chairs_is_a_rival(table):
+    """The axis is the table's, or the middle of the chairs; a turn by 45 degrees fits no chair."""
+    room = of_things([*table, *(('chair', x, y, 0.4) for x, y in (
+        (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)))])
+    camera = make_transform(UP, np.array([0.0, -3.0, 1.4]))
+    turned = turned_about_axis(room, camera, np.arange(len(room)))
+    np.testing.assert_allclose(turned[:3, :3, 3], [[3, 0, 1.4], [0, 3, 1.4], [-3, 0, 1.4]],
+                               atol=1e-9)
+
+
 def shown(counts, likenesses, first=0):
     """Return the support of a pose that explains some boxes, starting with the first."""
     rows = {(0, first + row): np.array([count, count, 0.0, likeness, 0.0, 0.0, 0.0])

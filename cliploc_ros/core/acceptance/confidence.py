@@ -35,6 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 
 from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.finalists import Match
@@ -79,6 +80,7 @@ class Support:
     #: Log odds of the depths of the matched objects, against depths of wrong matches
     depth: float = 0.0
     _: KW_ONLY
+    group: float = 0.0  #: Log odds against a pose that matches one small group, see _of_group
     #: For each matched detection, (frame, row): its share (7,) of inliers, score, misfit,
     #: likeness, rarity, unlabelled and depth
     shown: Mapping[tuple[int, int], NDArray[np.float64]] = field(
@@ -161,8 +163,25 @@ def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],
              for detection, row in of_object.items()}
     total = np.sum([*shown.values()], axis=0)
     views_of_each = len(shown) / len(rows)
+    centers = landmark_map.centers[[match.landmark for found in matches for match in found]]
     return Support(*map(float, [*total[:-1], unexplained / views_of_each, total[-1]]),
-                   shown=shown)
+                   group=_of_group(centers, *total[[0, 2]]), shown=shown)
+
+
+def _of_group(centers: NDArray[np.float64], inliers: float, misfit: float) -> float:
+    """Return the log odds against a pose whose matched landmarks (n, 3) are one small group.
+
+    Desks look like desks: the image may show things that the map lacks, arranged like a mapped
+    group. The map does not tell how many such groups there are. Their boxes fit less well than
+    those of the mapped group, so the odds grow with the misfit. More objects than four, or an
+    object elsewhere in the room, tell groups apart.
+    """
+    terms = CALIBRATION.group
+    if pdist(centers).max(initial=0.0) > terms.extent_m:
+        return 0.0
+    share = np.interp(inliers, (terms.small, terms.large), (1.0, 0.0))
+    return float(share * (terms.unmapped
+                          + terms.misfit * max(0.0, misfit - terms.fits * inliers)))
 
 
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,
@@ -275,7 +294,8 @@ def utilities(supports: Sequence[Support], calibration: Calibration = CALIBRATIO
     return np.array([
         terms.score * pose.score + terms.misfit * pose.misfit + terms.likeness * pose.likeness
         + terms.rarity * pose.rarity + terms.unlabelled * pose.unlabelled
-        + terms.unexplained * pose.unexplained + terms.depth * pose.depth for pose in supports])
+        + terms.unexplained * pose.unexplained + terms.depth * pose.depth - pose.group
+        for pose in supports])
 
 
 def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> float:

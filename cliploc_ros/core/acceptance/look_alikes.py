@@ -7,8 +7,8 @@ of one place onto those of the other. The map is searched for such twins of the 
 they count as rivals even if the search of poses found only one of the places. `check_map` lists
 the places of a map that have twins.
 
-Landmarks on one axis look the same from all directions around it. The pose turned about an axis
-that most matched landmarks share therefore counts as a twin, too.
+Landmarks on one axis look the same from all directions around it, and chairs around a table nearly
+so. The pose turned about such an axis therefore counts as a twin, too.
 
 Two poses at places that look alike explain the same detections. It is then weak evidence that one
 of them matches one object more, or fits better, because maps lack objects, and objects move.
@@ -49,7 +49,6 @@ _NEAR_M = (_TERMS.first_near_m, _TERMS.second_near_m, _TERMS.last_near_m)
 _COUNT, _LIKENESS, _UNLABELLED = 0, 3, 5
 # Turns about an axis [rad].
 _TURNS = np.radians(np.arange(_TERMS.axis_step_deg, 360.0, _TERMS.axis_step_deg))
-_UP = np.array([0.0, 0.0, 1.0])
 _NOBODY, _NOWHERE = np.empty(0, dtype=np.int64), np.empty((0, 4, 4))
 
 
@@ -159,8 +158,10 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
     """Return a pose turned about an axis that most matched landmarks share, as poses (m, 4, 4).
 
     Landmarks on one axis determine a pose up to a turn about the axis, because the camera sees the
-    same from all around. The axis is either vertical through one of the landmarks, or a line
-    fitted to all of them. An axis that touches less than half of the landmarks gives no pose.
+    same from all around. So do things around a table: a turn takes a chair to another chair. The
+    axis is either vertical, through one of the landmarks or their mean, or a line fitted to all
+    of them. A turn about a vertical axis must take half of the landmarks near landmarks of their
+    class; the line must touch half of them.
 
     Parameters
     ----------
@@ -172,20 +173,23 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
         return _NOWHERE
     centers, radii = landmark_map.centers[matched], landmark_map.semi_axes[matched].mean(axis=1)
     middle = centers.mean(axis=0)
+    # the axis with the most landmarks that turns take near landmarks of their class
+    points = np.repeat([*centers, middle], len(_TURNS), axis=0)
+    moves = _upright_moves(np.tile(_TURNS, len(centers) + 1), points, points)
+    ends = np.einsum('nij,rj->nri', moves[:, :3, :3], centers) + moves[:, None, :3, 3]
+    shares = landmark_map.of_class_near(ends, matched, _NEAR_M[-1])[1].mean(axis=1)
+    best = int(np.argmax(shares.reshape(-1, len(_TURNS)).sum(axis=1))) * len(_TURNS)
+    rows = np.arange(best, best + len(_TURNS))
+    found = moves[rows[shares[rows] >= _TERMS.on_axis]]
     line = np.linalg.svd(centers - middle)[2][0]
-    found = []
-    for axis, points in ((_UP, centers), (line, middle[None])):
-        offsets = centers - points[:, None]
-        offsets -= (offsets @ axis)[..., None] * axis
-        share = np.linalg.norm(offsets, axis=2) <= radii
-        best = int(np.argmax(share.sum(axis=1)))
-        if share[best].mean() >= _TERMS.on_axis:
-            turns = Rotation.from_rotvec(_TURNS[:, None] * axis).as_matrix()
-            moves = np.tile(np.eye(4), (len(turns), 1, 1))
-            moves[:, :3, :3] = turns
-            moves[:, :3, 3] = points[best] - turns @ points[best]
-            found.append(moves @ map_from_camera)
-    return np.concatenate(found) if found else _NOWHERE
+    offsets = centers - middle
+    offsets -= (offsets @ line)[:, None] * line
+    if (np.linalg.norm(offsets, axis=1) <= radii).mean() >= _TERMS.on_axis:
+        moves = np.tile(np.eye(4), (len(_TURNS), 1, 1))
+        moves[:, :3, :3] = Rotation.from_rotvec(_TURNS[:, None] * line).as_matrix()
+        moves[:, :3, 3] = middle - moves[:, :3, :3] @ middle
+        found = np.concatenate([found, moves])
+    return np.asarray(found @ map_from_camera)
 
 
 def lead_over_twin(its: Support, twin: Support, place_share: float = 0.0,
