@@ -193,6 +193,11 @@ def test_looks_from_one_view_count_once(rng):
     assert localizer.cameras.faults == []
     alone = [Views().with_look(look).odds().log_odds for one in found for look in one.cameras]
     assert len(alone) == 30 and max(alone) < CALIBRATION.camera.view + 0.1
+    views = views_of(9.0)
+    for number in range(3):
+        views = views.with_look(found[number].cameras[0]._replace(vector=np.full(ERRORS, number)))
+    assert views.counts.tolist()[1:] == [1, 1, 1, 3]
+    np.testing.assert_allclose(views.vectors[-1], 1.0, err_msg='their mean')
 
 
 @pytest.mark.parametrize('mended', ['camera_info', 'detector'])
