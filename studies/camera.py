@@ -57,8 +57,6 @@ CAMERAS: dict[str, tuple[wrong_sensors.Change, float]] = {
     'boxes + .15 widths': (wrong_sensors.shifted_boxes, 0.15)}
 
 
-
-
 def _rough(landmark_map: LandmarkMap, share: float, error_m: float, seed: int = 0) -> LandmarkMap:
     """Return a map with errors of all lengths (a share) and centres."""
     rng, count = np.random.default_rng(seed), len(landmark_map)

@@ -140,17 +140,32 @@ def test_on_a_rough_map_only_a_wrong_camera_is_called_wrong(change, level, is_wr
     assert any(result.cameras and not result.accepted for result in found) == is_wrong
 
 
-def test_views_that_contradict_each_other_are_weak_evidence(rng):
+def views_of(step_m, scatter=0.0, size=400.0):
+    """Return four views from the corners of a square, whose focal lengths scatter around .2."""
+    views, information = Views(), size * np.eye(ERRORS)
+    for number, focal in enumerate(0.2 + scatter * np.array([-1.0, 1.0, -1.0, 1.0])):
+        views = views.with_look(CameraLook(
+            '', True, make_transform(np.eye(3), step_m * np.array([number % 2, number // 2, 0])),
+            information, information[0] * focal, np.zeros((6, ERRORS))))
+    return views
+
+
+def test_views_that_contradict_each_other_are_weak_evidence():
     """The mean of the errors is the same; errors of the map scatter, those of a camera do not."""
-    def log_odds(scatter):
-        views, information = Views(), 400.0 * np.eye(ERRORS)
-        for number, focal in enumerate(0.2 + scatter * np.array([-1.0, 1.0, -1.0, 1.0])):
-            views = views.with_look(CameraLook(
-                '', True, make_transform(np.eye(3), np.array([number, 0.0, 0.0])), information,
-                information[0] * focal, np.zeros((6, ERRORS))))
-        return views.odds().log_odds
-    assert log_odds(0.0) > CALIBRATION.camera.sure > log_odds(0.25) > 0.0
-    assert log_odds(0.02) == pytest.approx(log_odds(0.0), abs=0.1), 'as boxes alone scatter'
+    log_odds = [views_of(1.0, scatter).odds().log_odds for scatter in (0.0, 0.02, 0.25)]
+    assert log_odds[0] > CALIBRATION.camera.sure > log_odds[2] > 0.0
+    assert log_odds[1] == pytest.approx(log_odds[0], abs=0.1), 'as boxes alone scatter'
+
+
+def test_a_camera_is_wrong_without_the_views_of_any_one_place():
+    """Objects that are seen from one place have the same errors of the map in all its views."""
+    apart, near = views_of(1.0), views_of(0.3)
+    assert apart.odds().log_odds == near.odds().log_odds > CALIBRATION.camera.sure
+    assert apart.odds().is_wrong and not near.odds().is_wrong
+    assert near.odds(CALIBRATION.camera.extent).is_wrong, 'boxes end at a line without looks'
+    far = CameraLook('', True, make_transform(np.eye(3), np.full(3, 5.0)), 1e-3 * np.eye(ERRORS),
+                     np.zeros(ERRORS), np.zeros((6, ERRORS)))
+    assert not near.with_look(far).odds().is_wrong
 
 
 def test_the_covariance_has_the_errors_of_a_camera_until_it_is_verified(rng):
@@ -174,8 +189,15 @@ def test_the_covariance_has_the_errors_of_a_camera_until_it_is_verified(rng):
 def test_looks_from_one_view_count_once(rng):
     localizer, pose = Localizer(RELOCALIZER), place(rng)
     looks = wrong_sensors.scaled_focal([query(rng, pose=pose) for _ in range(30)], 1.3)
-    localized(localizer, looks)
+    found = localized(localizer, looks)
     assert localizer.cameras.faults == []
+    alone = [Views().with_look(look).odds().log_odds for one in found for look in one.cameras]
+    assert len(alone) == 30 and max(alone) < CALIBRATION.camera.view + 0.1
+    views = views_of(9.0)
+    for number in range(3):
+        views = views.with_look(found[number].cameras[0]._replace(vector=np.full(ERRORS, number)))
+    assert views.counts.tolist()[1:] == [1, 1, 1, 3]
+    np.testing.assert_allclose(views.vectors[-1], 1.0, err_msg='their mean')
 
 
 @pytest.mark.parametrize('mended', ['camera_info', 'detector'])
@@ -239,6 +261,15 @@ def test_a_view_that_stays_the_same_has_no_border(rng):
 def test_nothing_is_known_of_a_new_camera():
     share, covariance, fault = CameraCheck().judge([], np.eye(6))
     assert (share, fault) == (1.0, '') and (covariance == np.eye(6)).all()
+    moves = np.zeros((6, ERRORS))
+    moves[0, 0] = 100.0  # the camera moves by 1 m if the focal length changes by 1 %
+    share, covariance, fault = CameraCheck().judge([CameraLook(
+        '', True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS), moves)], np.eye(6))
+    terms = CALIBRATION.camera
+    expected = np.diag([1.0 + terms.wrong * (100.0 * terms.wrong_focal) ** 2, *[1.0] * 5])
+    np.testing.assert_allclose(covariance, expected)
+    # a right camera, whose errors are in the covariance, remains
+    assert 1.0 - terms.wrong < share < 0.6 and not fault
 
 
 @pytest.mark.parametrize(('error', 'size', 'said'), [

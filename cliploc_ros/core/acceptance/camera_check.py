@@ -79,7 +79,7 @@ _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
 _WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
 _UNVERIFIED = math.log(_TERMS.unverified / (1.0 - _TERMS.unverified))
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
-# Rounds of weights and mean; more than four change no odds by .1.
+# Rounds of weights and mean. Chosen; twelve call the same right cameras wrong.
 _ROUNDS = 4
 # The largest coordinate of a recorded box [px]. A file with a larger one is damaged.
 _FAR = 1e9
@@ -232,6 +232,11 @@ class Views(NamedTuple):
         return Views(*(np.concatenate(both)[-int(_TERMS.most_views):]
                        for both in zip(self, other, strict=True)))
 
+    @property
+    def unweighted(self) -> float:
+        """Return the log odds of the camera from all looks, in which all views have one weight."""
+        return odds_of(self.informations.sum(axis=0), self.vectors.sum(axis=0)).log_odds
+
     def odds(self, extent: float = 0.0) -> CameraOdds:
         """Return the odds of the camera from all looks; for extent see odds_of.
 
@@ -319,7 +324,8 @@ class _Record:
         else:
             self.since = self.since.with_look(look)
             # by how much the looks since the verdict raise the odds of the same errors
-            gain = self.views.joined(self.since).odds().log_odds - self.by_looks.log_odds
+            # (with equal weights: looks at a repaired camera are outliers among the others)
+            gain = self.views.joined(self.since).unweighted - self.views.unweighted
             if gain > _TERMS.view:
                 self.views, self.since = self.views.joined(self.since), Views()
             elif (gain < -_TERMS.view and self.since.odds().log_odds < _TERMS.fits
