@@ -179,7 +179,7 @@ def test_the_covariance_has_the_errors_of_a_camera_until_it_is_verified(rng):
     localized(localizer, queries)
     after, = localized(localizer, [first])
     sizes = [np.linalg.eigvalsh(found.covariance).max() for found in (before, after)]
-    assert sizes[1] < 0.5 * sizes[0]
+    assert sizes[1] < 0.9 * sizes[0]
     # what verified cameras may still be off by
     share, covariance, _ = localizer.cameras.judge(after.cameras, np.eye(6))
     assert share > 0.99
@@ -266,7 +266,7 @@ def test_nothing_is_known_of_a_new_camera():
     share, covariance, fault = CameraCheck().judge([CameraLook(
         '', True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS), moves)], np.eye(6))
     terms = CALIBRATION.camera
-    expected = np.diag([1.0 + terms.wrong * (100.0 * terms.wrong_focal) ** 2, *[1.0] * 5])
+    expected = np.diag([1.0 + terms.unverified * (100.0 * terms.wrong_focal) ** 2, *[1.0] * 5])
     np.testing.assert_allclose(covariance, expected)
     # a right camera, whose errors are in the covariance, remains
     assert 1.0 - terms.wrong < share < 0.6 and not fault

@@ -248,7 +248,7 @@ class Views(NamedTuple):
         """
         prior, weights = np.diag(_WRONG ** -2.0), np.ones(len(self.poses))
         each = np.linalg.inv(self.informations + prior)
-        for _ in range(_ROUNDS):
+        for _ in range(_ROUNDS if len(weights) > 1 else 1):  # one view has nothing to contradict
             informations = weights[:, None, None] * self.informations
             vectors = weights[:, None] * self.vectors
             mean = np.linalg.solve(informations.sum(axis=0) + prior, vectors.sum(axis=0))

@@ -177,7 +177,7 @@ def _of_group(centers: NDArray[np.float64], inliers: float, misfit: float) -> fl
     object elsewhere in the room, tell groups apart.
     """
     terms = CALIBRATION.group
-    if pdist(centers).max(initial=0.0) > terms.extent_m:
+    if inliers >= terms.large or pdist(centers).max(initial=0.0) > terms.extent_m:
         return 0.0
     share = np.interp(inliers, (terms.small, terms.large), (1.0, 0.0))
     return float(share * (terms.unmapped

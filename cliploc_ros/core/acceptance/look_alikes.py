@@ -158,10 +158,10 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
     """Return a pose turned about an axis that most matched landmarks share, as poses (m, 4, 4).
 
     Landmarks on one axis determine a pose up to a turn about the axis, because the camera sees the
-    same from all around. So do things around a table: a turn takes a chair to another chair. The
-    axis is either vertical, through one of the landmarks or their mean, or a line fitted to all
-    of them. A turn about a vertical axis must take half of the landmarks near landmarks of their
-    class; the line must touch half of them.
+    same from all around. So do objects around a table: a turn takes a chair to another chair. The
+    axis is either vertical, through the mean of the landmarks or the landmark with the most others
+    above and below it, or a line fitted to all of them. A turn about a vertical axis must take
+    half of the landmarks near landmarks of their class; the line must touch half of them.
 
     Parameters
     ----------
@@ -174,8 +174,11 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
     centers, radii = landmark_map.centers[matched], landmark_map.semi_axes[matched].mean(axis=1)
     middle = centers.mean(axis=0)
     # the axis with the most landmarks that turns take near landmarks of their class
-    points = np.repeat([*centers, middle], len(_TURNS), axis=0)
-    moves = _upright_moves(np.tile(_TURNS, len(centers) + 1), points, points)
+    beside = np.linalg.norm((centers - centers[:, None])[..., :2], axis=2) <= radii
+    central = centers[np.lexsort([np.linalg.norm(centers - middle, axis=1),
+                                  -beside.sum(axis=1)])[0]]
+    points = np.repeat([central, middle], len(_TURNS), axis=0)
+    moves = _upright_moves(np.tile(_TURNS, 2), points, points)
     ends = np.einsum('nij,rj->nri', moves[:, :3, :3], centers) + moves[:, None, :3, 3]
     shares = landmark_map.of_class_near(ends, matched, _NEAR_M[-1])[1].mean(axis=1)
     best = int(np.argmax(shares.reshape(-1, len(_TURNS)).sum(axis=1))) * len(_TURNS)
