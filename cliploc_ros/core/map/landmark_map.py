@@ -34,7 +34,9 @@ from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
 from cliploc_ros.core.map.parameter_file import (
     NO_SET,
     MapSet,
+    WrittenMap,
     parse_parameters,
+    parse_written_map,
     read_text,
     set_of,
 )
@@ -360,6 +362,8 @@ class LandmarkMap:
         text = read_text(path)
         map_set = set_of(text)
         finish_set(Path(path), map_set.digest)
+        if (written := parse_written_map(text)) is not None and _is_valid(written):
+            return LandmarkMap(*written._replace(quats_xyzw=_unit(written.quats_xyzw)), map_set)
         tree = parse_parameters(text, path)
         found = tree[find_map_node(tree, path)]['ros__parameters']['map']
         return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set)
@@ -410,6 +414,20 @@ def find_map_node(tree: Mapping[str, Any], path: str | os.PathLike[str]) -> str:
 
 def _unit(quats_xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(quats_xyzw / np.linalg.norm(quats_xyzw, axis=1, keepdims=True))
+
+
+def _is_valid(written: WrittenMap) -> bool:
+    """Check whether from_mapping would accept a map with finite numbers and unique ids."""
+    low, high = _SEMI_AXIS_RANGE_M
+    norms = np.linalg.norm(written.quats_xyzw, axis=1)
+    texts = ((written.frame_id,), written.labels, written.class_ids)
+    return bool(
+        ((written.semi_axes >= low) & (written.semi_axes <= high)).all()
+        and np.abs(written.centers).max() <= _MAX_COORDINATE_M
+        and np.abs(norms - 1.0).max() <= _MAX_QUATERNION_NORM_ERROR
+        and not any('.' in landmark_id for landmark_id in written.landmark_ids)
+        and all(len(text) <= _MAX_TEXT_LENGTH and not text.isspace() and text
+                for column in texts for text in set(column)))
 
 
 def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
