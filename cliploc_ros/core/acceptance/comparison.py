@@ -123,6 +123,9 @@ class Comparison:
         #: (m, 4, 4): map_from_camera of each contender
         self.poses = np.array([contender.pose for contender in contenders]).reshape(-1, 4, 4)
         rows = np.arange(len(contenders))
+        # a small group weakens the leading pose of objects; it does not choose between poses
+        if contenders and contenders[0].recognized is None:
+            self._none += contenders[0].support.group
         #: (m,): probability of each contender; contenders that agree share one probability
         self.likely = self._confidences(rows, [contender.odds for contender in contenders])
         self.recognition = seen  #: Result of the search of keyframes

@@ -294,7 +294,7 @@ def utilities(supports: Sequence[Support], calibration: Calibration = CALIBRATIO
     return np.array([
         terms.score * pose.score + terms.misfit * pose.misfit + terms.likeness * pose.likeness
         + terms.rarity * pose.rarity + terms.unlabelled * pose.unlabelled
-        + terms.unexplained * pose.unexplained + terms.depth * pose.depth - pose.group
+        + terms.unexplained * pose.unexplained + terms.depth * pose.depth
         for pose in supports])
 
 

@@ -127,7 +127,7 @@ class KernelCache(NullCache):
                 Path(files._cache_path).mkdir(parents=True, exist_ok=True)
                 files.save((sig, data.codegen.magic_tuple()),
                            (hashlib.sha256(content).digest(), content))
-            except Exception as error:  # a full disk may also leave an index that pickle cannot read
+            except Exception as error:  # a full disk may leave an index that pickle cannot read
                 COUNTS['not kept'] += 1
                 if COUNTS['not kept'] == 1:
                     reason = error.strerror if isinstance(error, OSError) else repr(error)
