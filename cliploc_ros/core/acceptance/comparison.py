@@ -123,11 +123,12 @@ class Comparison:
         #: (m, 4, 4): map_from_camera of each contender
         self.poses = np.array([contender.pose for contender in contenders]).reshape(-1, 4, 4)
         rows = np.arange(len(contenders))
-        # a small group weakens the leading pose of objects; it does not choose between poses
-        if contenders and contenders[0].recognized is None:
-            self._none += contenders[0].support.group
+        # A small group weakens the leading pose of objects. It does not choose between poses, and
+        # takes nothing from points.
+        group = contenders[0].support.group if contenders and contenders[0].recognized is None \
+            else 0.0
         #: (m,): probability of each contender; contenders that agree share one probability
-        self.likely = self._confidences(rows, [contender.odds for contender in contenders])
+        self.likely = self._confidences(rows, [contender.odds - group for contender in contenders])
         self.recognition = seen  #: Result of the search of keyframes
         #: (m,): whether each contender agrees with the leading one
         self.leading = SAME_ANSWER.agreeing(self.poses[:1], self.poses).ravel()

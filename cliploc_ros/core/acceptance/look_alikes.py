@@ -173,7 +173,6 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
         return _NOWHERE
     centers, radii = landmark_map.centers[matched], landmark_map.semi_axes[matched].mean(axis=1)
     middle = centers.mean(axis=0)
-    # the axis with the most landmarks that turns take near landmarks of their class
     beside = np.linalg.norm((centers - centers[:, None])[..., :2], axis=2) <= radii
     central = centers[np.lexsort([np.linalg.norm(centers - middle, axis=1),
                                   -beside.sum(axis=1)])[0]]
@@ -181,6 +180,7 @@ def turned_about_axis(landmark_map: LandmarkMap, map_from_camera: NDArray[np.flo
     moves = _upright_moves(np.tile(_TURNS, 2), points, points)
     ends = np.einsum('nij,rj->nri', moves[:, :3, :3], centers) + moves[:, None, :3, 3]
     shares = landmark_map.of_class_near(ends, matched, _NEAR_M[-1])[1].mean(axis=1)
+    # the axis with the most landmarks that turns take near landmarks of their class
     best = int(np.argmax(shares.reshape(-1, len(_TURNS)).sum(axis=1))) * len(_TURNS)
     rows = np.arange(best, best + len(_TURNS))
     found = moves[rows[shares[rows] >= _TERMS.on_axis]]

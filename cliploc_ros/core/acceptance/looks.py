@@ -76,7 +76,7 @@ class Looks:
         return Looks(() if accepted else (*past, look)[-int(CALIBRATION.looks.most):], recognized)
 
     def earlier(self, observation: Observation, map_from_camera: NDArray[np.float64]
-                ) -> tuple['EarlierLook', ...]:
+                ) -> tuple[EarlierLook, ...]:
         """Return the earlier looks, given the pose (4, 4) of an observation.
 
         A look with another pose has confidence 0. The tolerance between two poses grows with the
