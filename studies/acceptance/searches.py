@@ -23,7 +23,7 @@ from cliploc_ros.offline.evaluation.methods import AUTO, Method
 from cliploc_ros.offline.evaluation.trials import run_trial
 from cliploc_ros.offline.posed_query import PosedQuery
 from studies.acceptance.places import SEED, AnyPlace, Place
-from studies.acceptance.troubles import FAMILIES, PRIORS, TROUBLES, of_rows
+from studies.acceptance.troubles import FAMILIES, PRIORS, TROUBLES, flickering
 from studies.reports import Answer, interval, judged
 
 #: More queries than any place has.
@@ -33,9 +33,6 @@ EARLY_LOOKS = 5
 #: Looks of a robot that does not move.
 LOOKS = 20
 _PERIOD_NS = 100_000_000
-# Differences between two runs of a detector on images of the same view. Chosen.
-_MISSED_SHARE = 0.2
-_SHIFT_SHARE = 0.02  # of the box's sides, standard deviation
 _CHANGES = TROUBLES | PRIORS | FAMILIES
 
 
@@ -156,16 +153,6 @@ def retry(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], options: Rel
                 replace(found.evidence, earlier=()), options))
             errors_m.append(judged(found, query.map_from_camera).get('error_m', inf))
         yield Retries(np.array(alone), np.array(accepted), np.array(errors_m))
-
-
-def flickering(observation: Observation, rng: np.random.Generator) -> Observation:
-    """Return an observation with some boxes missing and the others shifted."""
-    detections = observation.detections
-    rows = np.nonzero(rng.random(len(detections)) > _MISSED_SHARE)[0]
-    sides = np.tile(np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1)[:, 0], 2)
-    shifted = detections.bboxes_xyxy + _SHIFT_SHARE * sides * rng.normal(size=sides.shape)
-    return of_rows(replace(observation, detections=replace(detections, bboxes_xyxy=shifted)),
-                   rows)
 
 
 def retries_row(name: str, min_confidence: float, robots: Sequence[Retries]) -> list[str]:

@@ -32,6 +32,9 @@ _ELSEWHERE_M = np.array([1e3, 0.0, 0.0])
 # Least distance of a wrong region from the truth if the map is large enough [m], and number of
 # draws.
 _WRONG_M, _TRIES = 2.5, 50
+# Differences between two runs of a detector on images of the same view. Chosen.
+_MISSED_SHARE = 0.2
+_SHIFT_SHARE = 0.02  # of the box's sides, standard deviation
 # Probability of a given region; deviations of its x and y [m] and of its yaw [rad].
 _PROBABILITY = 0.9
 _REGION, _POSE = (1.0, 1.0, 10.0), (0.3, 0.3, np.radians(15.0))
@@ -226,6 +229,16 @@ def of_rows(observation: Observation, rows: NDArray[np.int64]) -> Observation:
         observation, detections=observation.detections.select(rows),
         depths=None if depths is None else depths[rows], similarities=None
         if similarities is None else np.ascontiguousarray(np.asarray(similarities)[rows]))
+
+
+def flickering(observation: Observation, rng: np.random.Generator) -> Observation:
+    """Return an observation with some boxes missing and the others shifted."""
+    detections = observation.detections
+    rows = np.nonzero(rng.random(len(detections)) > _MISSED_SHARE)[0]
+    sides = np.tile(np.diff(detections.bboxes_xyxy.reshape(-1, 2, 2), axis=1)[:, 0], 2)
+    shifted = detections.bboxes_xyxy + _SHIFT_SHARE * sides * rng.normal(size=sides.shape)
+    return of_rows(replace(observation, detections=replace(detections, bboxes_xyxy=shifted)),
+                   rows)
 
 
 def _with_columns(queries: Sequence[PosedQuery], columns: NDArray[np.int64]) -> list[PosedQuery]:

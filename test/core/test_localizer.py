@@ -27,7 +27,7 @@ from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.trials import make_queries, with_neighbours
-from studies.acceptance.searches import flickering
+from studies.acceptance.troubles import flickering
 
 ROOM = make_room()
 SEEN = see_room(ROOM)
