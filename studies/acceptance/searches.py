@@ -15,7 +15,6 @@ from cliploc_ros.core.acceptance.verdict import refusal
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
