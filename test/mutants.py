@@ -13,37 +13,34 @@ cannot be traced. ``record --plain`` therefore runs tests with uncompiled kernel
 and divide differently; it excludes tests that then fail or take too long. A fault in a kernel runs
 those tests with the kernel as plain Python.
 
-If a test that detects a fault also fails without it, the detection does not count and the test is
-excluded.
+Each fault has a pytest of its own, which loads this file as a plugin. If a test that detects a
+fault also fails without it, the detection does not count and the test is excluded.
 """
 
 import argparse
 import ast
 import copy
-import gc
-import multiprocessing
+import json
 import os
-import pickle
 import random
 import re
 import signal
+import subprocess
 import sys
 import tempfile
 import time
-import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache, partial
+from functools import cache
 from importlib.machinery import SourceFileLoader
-from itertools import pairwise
 from pathlib import Path
-from statistics import median
-from types import CodeType, FunctionType
+from types import CodeType
 from typing import Any, NamedTuple
 
+import coverage
 import pytest
-from _pytest.runner import runtestprotocol
 
 PROJECT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(PROJECT))  # not the copy in install/
@@ -60,56 +57,30 @@ _SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
 _QUIET = ('-q', '-x', '-p', 'no:cacheprovider', '-p', 'no:rerunfailures', '-p', 'no:xdist')
 # Calls whose arguments may be swapped, or for which a type checker would reject the swap.
 _ALIKE = re.compile(r'(^|\.)(max|min|maximum|minimum|hypot|logaddexp|isinstance|cast)$')
-_FORK = multiprocessing.get_context('fork')
 _LOGS = re.compile(r'(self\._?)?([\w.]+\.get_)?log(ger)?(\(\))?\.(debug|info|warning|error)\(')
 # Additional time of a test with a fault, and time of all tests of a fault [s].
 _PATIENCE_S, _MOST_S = 60.0, 20.0
-
-
-class Record(NamedTuple):
-    """The processor time of a test, and the lines that it ran."""
-
-    seconds: float  #: Processor time of this process [s]
-    lines: frozenset[tuple[str, int]]  #: File, relative to the project, and line
+# For the plugin: the fault as FILE:NUMBER, or '' for none; its kernels, plain or compiled.
+_FAULT, _KERNELS = 'MUTANT', 'MUTANT_KERNELS'
 
 
 class Mutant(NamedTuple):
     """A fault in a line."""
 
     file: str
-    line: int
     number: int  #: Number of the fault in its file
     what: str
-    lines: tuple[int, ...]  #: Lines of its statement; a test that runs one of them runs it
+    lines: range  #: Lines of its statement; a test that runs one of them runs it
     names: tuple[str, ...]  #: Names that the statement defines, if it runs on import
-    function: tuple[str, int] | None  #: Name and first line of the outermost function around it
     is_compiled: bool  #: Whether numba compiles it
 
-
-class Outcome(NamedTuple):
-    """The result of the tests for a fault."""
-
-    mutant: Mutant
-    tests: int  #: Number of tests that could detect it
-    killer: str = ''  #: The test that detected it, or 'time' if a test did not end
+    @property
+    def kernels(self) -> str:
+        """Return the kind of kernels that its tests run with."""
+        return 'plain' if self.is_compiled else 'compiled'
 
 
 # ---- faults -------------------------------------------------------------------------------------
-
-def mutants_of(file: str) -> list[Mutant]:
-    """Return all faults of a file of the project."""
-    tree = ast.parse((PROJECT / file).read_text())
-    return [site.as_mutant(file, number) for number, site in enumerate(_sites(tree))]
-
-
-def planted(mutant: Mutant) -> tuple[CodeType, str]:
-    """Return the code of a module with a fault, and its changed line."""
-    tree = ast.parse((PROJECT / mutant.file).read_text())
-    site = _sites(tree)[mutant.number]
-    site.put()
-    return (compile(ast.fix_missing_locations(tree), str(PROJECT / mutant.file), 'exec'),
-            ast.unparse(site.statement).splitlines()[0])
-
 
 class _Site(NamedTuple):
     """A node of a syntax tree, and its replacement by a fault."""
@@ -123,34 +94,37 @@ class _Site(NamedTuple):
     statement: ast.stmt
     function: ast.FunctionDef | None  #: The outermost one around it
 
-    def put(self) -> None:
-        """Plant the fault."""
-        new = ast.copy_location(self.new, self.node)
-        if self.row is None:
-            setattr(self.parent, self.field, new)
-        else:
-            getattr(self.parent, self.field)[self.row] = new
-
     def as_mutant(self, file: str, number: int) -> Mutant:
-        one = self.statement
+        one, around = self.statement, self.function
         body = getattr(one, 'body', None)  # for a compound statement only the head counts
         last = body[0].lineno - 1 if body else one.end_lineno or one.lineno
         names: tuple[str, ...] = ()
-        if self.function is None:
+        if around is None:
             names = (one.name,) if isinstance(one, ast.FunctionDef) else tuple(
                 node.id for node in ast.walk(one)
                 if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
-        decorators = self.function.decorator_list if self.function else []
         return Mutant(
-            file, self.node.lineno, number, self.what,
-            tuple(range(one.lineno, max(one.lineno, last) + 1)), names,
-            None if self.function is None else (self.function.name, min(
-                [self.function.lineno, *(each.lineno for each in decorators)])),
-            any(isinstance(each, ast.Name) and each.id == 'compiled' for each in decorators))
+            file, number, self.what, range(one.lineno, max(one.lineno, last) + 1), names,
+            around is not None and any(isinstance(each, ast.Name) and each.id == 'compiled'
+                                       for each in around.decorator_list))
 
 
-def _sites(tree: ast.Module) -> list[_Site]:
-    return list(_walk(tree, None, None))
+def _sites_of(file: str) -> tuple[ast.Module, list[_Site]]:
+    tree = ast.parse((PROJECT / file).read_text())
+    return tree, list(_walk(tree, None, None))
+
+
+def planted(mutant: tuple[str, int]) -> tuple[CodeType, str]:
+    """Return the code of a file with a fault, given by its number, and the changed line."""
+    tree, sites = _sites_of(mutant[0])
+    site = sites[mutant[1]]
+    new = ast.copy_location(site.new, site.node)
+    if site.row is None:
+        setattr(site.parent, site.field, new)
+    else:
+        getattr(site.parent, site.field)[site.row] = new
+    return (compile(ast.fix_missing_locations(tree), str(PROJECT / mutant[0]), 'exec'),
+            ast.unparse(site.statement).splitlines()[0])
 
 
 def _walk(parent: ast.AST, statement: ast.stmt | None, function: ast.FunctionDef | None
@@ -177,12 +151,21 @@ def _walk(parent: ast.AST, statement: ast.stmt | None, function: ast.FunctionDef
             yield from _walk(node, within, around)
 
 
-def _changes(node: ast.AST, parent: ast.AST, field: str) -> Iterator[tuple[str, ast.AST]]:
+def _changes(node: ast.AST, parent: ast.AST, field: str  # noqa: C901
+             ) -> Iterator[tuple[str, ast.AST]]:
     """Yield the faulty replacements of a node."""
     if field == 'test' and isinstance(parent, (ast.If, ast.While, ast.IfExp)):
         yield 'condition negated', ast.UnaryOp(ast.Not(), copy.deepcopy(node))  # type: ignore
-    yield from _changes_of_statement(node)
     match node:
+        case ast.Return(value=ast.expr() as value) if not (
+                isinstance(value, ast.Constant) and value.value is None):
+            yield 'None returned', ast.Return(ast.Constant(None))
+        case ast.Expr(value=ast.Call()) | ast.AugAssign():
+            yield 'statement left out', ast.Pass()
+        case ast.Continue():
+            yield 'break', ast.Break()
+        case ast.Break():
+            yield 'continue', ast.Continue()
         case ast.Compare(ops=[op]) if type(op) in _SWAPPED and field != 'test':
             yield 'comparison turned', _with(node, ops=[_SWAPPED[type(op)]()])
         case ast.BinOp(left=left, op=op, right=right):
@@ -203,23 +186,10 @@ def _changes(node: ast.AST, parent: ast.AST, field: str) -> Iterator[tuple[str, 
             yield f'{value} is {value + 1}', ast.Constant(value + 1)
         case ast.Constant(value=float() as value):
             yield f'{value} is {1.3 * value or 1.0:g}', ast.Constant(1.3 * value or 1.0)
-        case ast.Call(args=[first, second, *others], func=function) if not any(
+        case ast.Call(args=[first, second, *others], func=called) if not any(
                 isinstance(argument, ast.Starred) for argument in node.args) and not _ALIKE.search(
-                ast.unparse(function)):
+                ast.unparse(called)):
             yield 'arguments exchanged', _with(node, args=[second, first, *others])
-
-
-def _changes_of_statement(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
-    match node:
-        case ast.Return(value=ast.expr() as value) if not (
-                isinstance(value, ast.Constant) and value.value is None):
-            yield 'None returned', ast.Return(ast.Constant(None))
-        case ast.Expr(value=ast.Call()) | ast.AugAssign():
-            yield 'statement left out', ast.Pass()
-        case ast.Continue():
-            yield 'break', ast.Break()
-        case ast.Break():
-            yield 'continue', ast.Continue()
 
 
 def _with(node: ast.AST, **fields: Any) -> ast.AST:
@@ -234,70 +204,49 @@ def draw(folders: Sequence[str], count: int, seed: int) -> list[Mutant]:
     by_line = defaultdict(list)
     for folder in folders:
         for path in sorted((PROJECT / PACKAGE / folder).rglob('*.py')):
-            for mutant in mutants_of(str(path.relative_to(PROJECT))):
-                by_line[mutant.file, mutant.line].append(mutant)
+            file = str(path.relative_to(PROJECT))
+            for number, site in enumerate(_sites_of(file)[1]):
+                by_line[file, site.node.lineno].append(site.as_mutant(file, number))
     rng = random.Random(seed)
-    lines = rng.sample(sorted(by_line), min(count, len(by_line)))
-    return [rng.choice(by_line[line]) for line in lines]
+    return [rng.choice(by_line[line])
+            for line in rng.sample(sorted(by_line), min(count, len(by_line)))]
 
 
-# ---- the lines of tests -------------------------------------------------------------------------
+# ---- the plugin of pytest -----------------------------------------------------------------------
 
 class Recorder:
-    """A pytest plugin that records the lines of the package that each test runs.
+    """Records the time of each test, and the lines of the package that it runs.
 
-    Lines of a fixture that several tests share count for each of them.
+    Lines of a fixture that several tests share are a context of their own.
     """
 
-    def __init__(self, most_s: float) -> None:
-        self.records: dict[str, Record] = {}
-        self._most_s = most_s
-        self._lines: set[tuple[str, int]] = set()
-        self._of_fixtures: dict[str, set[tuple[str, int]]] = defaultdict(set)
-        self._failed = False
-        monitoring = sys.monitoring
-        monitoring.use_tool_id(monitoring.PROFILER_ID, 'mutants')
-        monitoring.register_callback(monitoring.PROFILER_ID, monitoring.events.LINE, self._run)
-        monitoring.set_events(monitoring.PROFILER_ID, monitoring.events.LINE)
-
-    def _run(self, code: CodeType, line: int) -> object:
-        if code.co_filename.startswith(f'{PROJECT}/{PACKAGE}/'):
-            self._lines.add((code.co_filename.removeprefix(f'{PROJECT}/'), line))
-        return sys.monitoring.DISABLE
+    def __init__(self, measured: coverage.Coverage, most_s: float) -> None:
+        self.tests: dict[str, tuple[float, list[str]]] = {}
+        self._measured, self._most_s, self._test, self._failed = measured, most_s, '', False
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
         """Record the lines of a shared fixture."""
-        if fixturedef.scope == 'function':
-            return (yield)
-        before, self._lines = self._lines, set()
-        sys.monitoring.restart_events()
+        if fixturedef.scope != 'function':
+            self._measured.switch_context(f'fixture {fixturedef.argname}')
         try:
             return (yield)
         finally:
-            self._of_fixtures[fixturedef.argname] |= self._lines
-            self._lines |= before
-            sys.monitoring.restart_events()
+            self._measured.switch_context(self._test)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: Any) -> Iterator[None]:
         """Record the lines of a test that passes."""
-        self._lines, self._failed, start = set(), False, time.process_time()
-        sys.monitoring.restart_events()
+        self._test, self._failed, start = item.nodeid, False, time.process_time()
+        self._measured.switch_context(item.nodeid)
         if self._most_s:
             signal.signal(signal.SIGVTALRM, _end_test)
             signal.setitimer(signal.ITIMER_VIRTUAL, self._most_s)
         result = yield
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
         if not self._failed:
-            shared = (self._of_fixtures.get(name, set()) for name in item.fixturenames)
-            self.records[item.nodeid] = Record(time.process_time() - start,
-                                               frozenset(self._lines.union(*shared)))
+            self.tests[item.nodeid] = time.process_time() - start, list(item.fixturenames)
         return result
-
-    def pytest_sessionfinish(self) -> None:
-        """Note no more lines."""
-        sys.monitoring.free_tool_id(sys.monitoring.PROFILER_ID)
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """Note a failure."""
@@ -308,6 +257,17 @@ def _end_test(*_: object) -> None:
     raise TimeoutError('the test takes too long')
 
 
+def _plant(fault: str) -> None:
+    """Load a module that is not imported yet with a fault, FILE:NUMBER."""
+    file, number = fault.split(':')
+    code, name = planted((file, int(number)))[0], file.removesuffix('.py').replace('/', '.')
+    get_code = SourceFileLoader.get_code
+
+    def get(self: SourceFileLoader, fullname: str) -> CodeType | None:
+        return code if fullname == name.removesuffix('.__init__') else get_code(self, fullname)
+    SourceFileLoader.get_code = get  # type: ignore[method-assign,assignment]
+
+
 def _plain_kernels() -> None:
     """Disable the compilation of kernels, before they are imported."""
     from cliploc_ros.core.kernels import compiled
@@ -315,26 +275,31 @@ def _plain_kernels() -> None:
     compiled.compiled = lambda function: function  # type: ignore[assignment]
 
 
-def record(arguments: argparse.Namespace) -> int:
+if os.environ.get(_FAULT):
+    _plant(os.environ[_FAULT])
+if os.environ.get(_KERNELS) == 'plain':
+    _plain_kernels()
+
+
+def record(arguments: argparse.Namespace) -> None:
     """Run tests, and add their lines to the records."""
+    kernels = 'plain' if arguments.plain else 'compiled'
+    RECORDS.mkdir(parents=True, exist_ok=True)
+    file = RECORDS / f'{kernels}.json'
+    tests = json.loads(file.read_text()) if file.exists() else {}
+    measured = coverage.Coverage(file.with_suffix('.coverage'), source=[str(PROJECT / PACKAGE)],
+                                 config_file=False)
+    if tests:
+        measured.load()
     if arguments.plain:
         _plain_kernels()
-    recorder = Recorder(arguments.plain)
-    code = pytest.main([*_QUIET[:1], *_QUIET[2:], *arguments.tests], [recorder])
-    kind = 'plain' if arguments.plain else 'compiled'
-    _write(kind, _read(kind) | recorder.records)
-    print(f'{len(recorder.records)} tests, {len(_read(kind))} in all, kernels {kind}')
-    return int(code) if not arguments.plain else 0
-
-
-def _read(kind: str) -> dict[str, Record]:
-    file = RECORDS / f'{kind}.pickle'
-    return pickle.loads(file.read_bytes()) if file.exists() else {}
-
-
-def _write(kind: str, value: object) -> None:
-    RECORDS.mkdir(parents=True, exist_ok=True)
-    (RECORDS / f'{kind}.pickle').write_bytes(pickle.dumps(value))
+    recorder = Recorder(measured, arguments.plain)
+    measured.start()
+    pytest.main([_QUIET[0], *_QUIET[2:], *arguments.tests], [recorder])
+    measured.stop()
+    measured.save()
+    file.write_text(json.dumps(tests | recorder.tests))
+    print(f'{len(recorder.tests)} tests, {len(tests | recorder.tests)} in all, kernels {kernels}')
 
 
 # ---- tests against faults -----------------------------------------------------------------------
@@ -342,244 +307,118 @@ def _write(kind: str, value: object) -> None:
 class Tests:
     """The recorded tests, by the lines that they run."""
 
-    def __init__(self, kind: str) -> None:
-        self.records = _read(kind)
-        self._of_line: dict[tuple[str, int], set[str]] = defaultdict(set)
-        for name, one in self.records.items():
-            for line in one.lines:
-                self._of_line[line].add(name)
+    def __init__(self, kernels: str) -> None:
+        file = RECORDS / f'{kernels}.json'
+        self._tests: dict[str, tuple[float, list[str]]] = json.loads(
+            file.read_text() if file.exists() else '{}')
+        self._lines = coverage.CoverageData(str(file.with_suffix('.coverage')))
+        self._lines.read()
+        self._by_file = cache(self._lines.contexts_by_lineno)
 
     def of(self, mutant: Mutant) -> list[str]:
-        """Return the tests that can detect a fault, within the time limit.
-
-        Files whose tests run the fewest lines come first, since they are the most specific.
-        """
-        lines = [(mutant.file, line) for line in mutant.lines]
+        """Return the tests that can detect a fault, fast ones first, within the time limit."""
+        lines = {mutant.file: set(mutant.lines)}
         if mutant.names:
             word = re.compile(rf'\b({"|".join(mutant.names)})\b')
-            lines = [(file, number) for file, text in _sources() for number, line in text
-                     if word.search(line)]
-        found = set[str]().union(*(self._of_line.get(line, set()) for line in lines))
-        by_file = defaultdict(list)
-        for name in found:
-            by_file[name.split('::')[0]].append(name)
-        files = sorted(by_file.values(), key=lambda names: median(
-            len(self.records[name].lines) for name in names))
-        chosen: list[str] = []
-        left = _MOST_S
-        for name in (name for names in files for name in sorted(names, key=self.seconds)):
+            lines = {file: {number for number, line in enumerate(text, 1) if word.search(line)}
+                     for file, text in _sources().items()}
+        found = {context for file, numbers in lines.items()
+                 for number, contexts in self._by_file(str(PROJECT / file)).items()
+                 if number in numbers for context in contexts}
+        fixtures = {context.removeprefix('fixture ') for context in found - self._tests.keys()}
+        names = sorted((name for name, (_, used) in self._tests.items()
+                        if name in found or fixtures & set(used)), key=self.seconds)
+        chosen, left = names[:1], _MOST_S
+        for name in names[1:]:
             left -= self.seconds(name) + 0.01
-            if left > 0.0 or not chosen:
+            if left > 0.0:
                 chosen.append(name)
         return chosen
 
     def seconds(self, name: str) -> float:
         """Return the time of a test."""
-        return self.records[name].seconds
+        return self._tests[name][0]
+
+    def killer(self, fault: str, names: Sequence[str], kernels: str) -> str:
+        """Return the first test that fails with a fault, 'time' or an exit code; '' if none."""
+        environment = os.environ | {
+            _FAULT: fault, _KERNELS: kernels, 'PYTHONPATH': os.pathsep.join(
+                [str(Path(__file__).parent), os.environ.get('PYTHONPATH', '')])}
+        with tempfile.TemporaryDirectory(prefix='mutant-', ignore_cleanup_errors=True) as folder:
+            process = subprocess.Popen(
+                [sys.executable, '-m', 'pytest', *_QUIET, '-p', 'mutants', '--basetemp',
+                 f'{folder}/tmp', *names], cwd=PROJECT, env=environment, text=True,
+                start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+            try:
+                output, _ = process.communicate(
+                    timeout=_PATIENCE_S + 4.0 * sum(map(self.seconds, names)))
+            except subprocess.TimeoutExpired:
+                return 'time'
+            finally:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        failed = re.search(r'^(?:FAILED|ERROR) (\S+\.py.*?)(?: - |$)', output, re.MULTILINE)
+        if process.returncode and not failed:
+            return f'exit code {process.returncode}'
+        return failed[1] if failed else ''
 
 
 @cache
-def _sources() -> list[tuple[str, list[tuple[int, str]]]]:
-    return [(str(path.relative_to(PROJECT)), list(enumerate(path.read_text().splitlines(), 1)))
-            for path in sorted((PROJECT / PACKAGE).rglob('*.py'))]
+def _sources() -> Mapping[str, list[str]]:
+    return {str(path.relative_to(PROJECT)): path.read_text().splitlines()
+            for path in sorted((PROJECT / PACKAGE).rglob('*.py'))}
 
 
 class Judge:
-    """Tries faults, each in a child of this process.
+    """Tries faults."""
 
-    Faults in functions are tried with tests that are already collected: as a pytest plugin, this
-    replaces the loop over the tests. A fault in a line that runs on import needs a new pytest.
-    """
-
-    def __init__(self, mutants: Sequence[Mutant], tests: Tests, workers: int) -> None:
-        self.outcomes: list[Outcome] = []
-        self._parts = [mutants[number::workers] for number in range(workers)]
-        self._tests = tests
+    def __init__(self) -> None:
+        self._tests = {kernels: Tests(kernels) for kernels in ('compiled', 'plain')}
         self._is_sound: dict[str, bool] = {}
-        self._items: dict[str, Any] = {}
-        self._functions: dict[tuple[str, str, int], list[FunctionType]] = defaultdict(list)
 
-    def pytest_runtestloop(self, session: Any) -> bool:
-        """Run tests against faults instead of running them once."""
-        self._items = {item.nodeid: item for item in session.items}
-        for one in gc.get_objects():
-            if isinstance(one, FunctionType):
-                code = one.__code__
-                self._functions[code.co_filename, code.co_name, code.co_firstlineno].append(one)
-        gc.freeze()  # child processes share unmodified memory
-        self.run()
-        return True
-
-    def run(self) -> None:
-        """Try all faults, distributed over the workers."""
-        started = [_start(partial(self._outcomes, part)) for part in self._parts]
-        for process in started:
-            self.outcomes += _finish(*process)
-
-    def _outcomes(self, mutants: Sequence[Mutant]) -> list[Outcome]:
-        return [self._outcome(mutant) for mutant in mutants]
-
-    def _outcome(self, mutant: Mutant) -> Outcome:
-        names = [name for name in self._tests.of(mutant)
-                 if self._is_sound.get(name, True) and (not self._items or name in self._items)]
+    def outcome(self, mutant: Mutant) -> tuple[Mutant, int, str]:
+        """Return a fault, the number of tests that could detect it, and the one that did."""
+        tests = self._tests[mutant.kernels]
+        names = [name for name in tests.of(mutant) if self._is_sound.get(name, True)]
         while names:
-            killer = self._killer(mutant, names)
-            if killer in self._tests.records and killer not in self._is_sound:
-                self._is_sound[killer] = not self._killer(None, [killer])
+            killer = tests.killer(f'{mutant.file}:{mutant.number}', names, mutant.kernels)
+            if killer in names and killer not in self._is_sound:
+                self._is_sound[killer] = not tests.killer('', [killer], mutant.kernels)
             if self._is_sound.get(killer, True):
-                return Outcome(mutant, len(names), killer)
+                return mutant, len(names), killer
             names.remove(killer)
-        return Outcome(mutant, 0)
-
-    def _killer(self, mutant: Mutant | None, names: list[str]) -> str:
-        """Return the first test that fails, 'time', an exit code, or ''."""
-        allowed = _PATIENCE_S + 4.0 * sum(map(self._tests.seconds, names))
-        with tempfile.TemporaryDirectory(prefix='mutant-', ignore_cleanup_errors=True) as folder:
-            return str(_finish(*_start(
-                lambda: self._try(mutant, names, Path(folder) / 'tmp')), allowed))
-
-    def _try(self, mutant: Mutant | None, names: list[str], folder: Path) -> str:
-        """Run tests in this child process; return the first that fails."""
-        for stream in (1, 2):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-        if not self._items:
-            if mutant is not None:
-                _plant_at_import(mutant)
-            failures = _Failures()
-            code = int(pytest.main([*_QUIET, '--basetemp', str(folder), *names], [failures]))
-            return failures.first or (f'exit code {code}' if code else '')
-        if mutant is not None:
-            self._plant(mutant)
-        items = [self._items[name] for name in names]
-        items[0].config._tmp_path_factory._basetemp = folder
-        folder.mkdir()
-        for item, following in pairwise([*items, None]):
-            if any(one.failed for one in runtestprotocol(item, log=False, nextitem=following)):
-                return str(item.nodeid)
-        return ''
-
-    def _plant(self, mutant: Mutant) -> None:
-        """Replace the code of a function by the code with a fault."""
-        assert mutant.function is not None
-        faulty = next(code for code in _codes_of(planted(mutant)[0])
-                      if (code.co_name, code.co_firstlineno) == mutant.function)
-        for function in self._functions[str(PROJECT / mutant.file), *mutant.function]:
-            function.__code__ = faulty
+        return mutant, 0, ''
 
 
-def _start(work: Callable[[], object]) -> tuple[Any, Any]:
-    """Start work in a child with its process group; return it and the pipe of its result."""
-    here, there = _FORK.Pipe(duplex=False)
-
-    def run() -> None:
-        os.setpgid(0, 0)
-        there.send(work())
-
-    child = _FORK.Process(target=run)
-    child.start()
-    there.close()
-    return child, here
-
-
-def _finish(child: Any, here: Any, limit_s: float | None = None) -> Any:
-    """Return the result of a child, 'time' or an exit code; end its processes."""
-    try:
-        result = here.recv() if here.poll(limit_s) else 'time'
-    except EOFError:
-        child.join()
-        result = f'exit code {child.exitcode}'
-    with suppress(ProcessLookupError):
-        os.killpg(child.pid, signal.SIGKILL)
-    child.join()
-    return result
-
-
-class _Failures:
-    """A pytest plugin that stores the first test that fails."""
-
-    first = ''
-
-    def pytest_runtest_logreport(self, report: Any) -> None:
-        self.first = self.first or (report.nodeid if report.failed else '')
-
-    pytest_collectreport = pytest_runtest_logreport
-
-
-def _plant_at_import(mutant: Mutant) -> None:
-    """Load a module that is not imported yet with a fault."""
-    code, name = planted(mutant)[0], mutant.file.removesuffix('.py').removesuffix('/__init__')
-    get_code = SourceFileLoader.get_code
-
-    def get(self: SourceFileLoader, fullname: str) -> CodeType | None:
-        return code if fullname == name.replace('/', '.') else get_code(self, fullname)
-    SourceFileLoader.get_code = get  # type: ignore[method-assign,assignment]
-
-
-def _codes_of(code: CodeType) -> Iterator[CodeType]:
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _codes_of(constant)
-
-
-def judge(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
-    """Return the outcome of each fault. Kernels are judged in a separate process."""
-    kernels = [mutant for mutant in mutants if mutant.is_compiled]
-    outcomes = list(_finish(*_start(lambda: _judge_kernels(kernels, workers))))
-    import hypothesis, numba, scipy.optimize, scipy.spatial, scipy.stats, yaml  # noqa: E401,F401,I001
-
-    tests, others = Tests('compiled'), [mutant for mutant in mutants if not mutant.is_compiled]
-    at_import = Judge([other for other in others if other.function is None], tests, workers)
-    at_import.run()
-    return outcomes + at_import.outcomes + _judge_functions(
-        [other for other in others if other.function is not None], tests, workers)
-
-
-def _judge_kernels(mutants: Sequence[Mutant], workers: int) -> list[Outcome]:
-    _plain_kernels()
-    return _judge_functions(mutants, Tests('plain'), workers)
-
-
-def _judge_functions(mutants: Sequence[Mutant], tests: Tests, workers: int) -> list[Outcome]:
-    judge, files = Judge(mutants, tests, workers), {
-        name.split('::')[0] for mutant in mutants for name in tests.of(mutant)}
-    if files:
-        pytest.main([*_QUIET, '-s', *sorted(files)], [judge])
-    return judge.outcomes + [Outcome(mutant, 0) for mutant in mutants if not files]
-
-
-# ---- the report ---------------------------------------------------------------------------------
-
-def report(outcomes: Sequence[Outcome]) -> str:
+def report(outcomes: Sequence[tuple[Mutant, int, str]]) -> str:
     """Return a table by folder, and the faults that no test detected."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
-    for outcome in outcomes:
-        folder = str(Path(outcome.mutant.file).parent.relative_to(PACKAGE))
+    for mutant, tests, killer in outcomes:
+        folder = str(Path(mutant.file).parent.relative_to(PACKAGE))
         for row in {folder, f'{folder.split("/")[0]}, all', 'all',
-                    'kernels' if outcome.mutant.is_compiled else 'Python'}:
-            counts[row]['killed' if outcome.killer else
-                        'survived' if outcome.tests else 'not run'] += 1
+                    'kernels' if mutant.is_compiled else 'Python'}:
+            counts[row]['killed' if killer else 'survived' if tests else 'not run'] += 1
     text = f'{"folder":28}{"killed":>8}{"survived":>10}{"not run":>9}{"share":>7}\n'
     for row, its in sorted(counts.items()):
         text += (f'{row:28}{its["killed"]:8}{its["survived"]:10}{its["not run"]:9}'
                  f'{its["killed"] / its.total():7.2f}\n')
     return text + '\nno test noticed (tests that run the line):\n' + ''.join(
-        f'{outcome.mutant.file}:{outcome.mutant.line}: {outcome.mutant.what} ({outcome.tests}): '
-        f'{planted(outcome.mutant)[1]}\n' for outcome in sorted(outcomes) if not outcome.killer)
+        f'{mutant.file}:{mutant.lines[0]}: {mutant.what} ({tests}): {planted(mutant[:2])[1]}\n'
+        for mutant, tests, killer in sorted(outcomes, key=lambda outcome: outcome[0][:2])
+        if not killer)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Plant faults, and print the table."""
-    mutants = draw(arguments.folders, arguments.count, arguments.seed)
-    if arguments.only:
-        mutants = [one for one in mutants if arguments.only in f'{one.file}:{one.line}']
+    mutants = [one for one in draw(arguments.folders, arguments.count, arguments.seed)
+               if arguments.only in f'{one.file}:{one.lines[0]}']
     start = time.monotonic()
-    outcomes = judge(mutants, arguments.workers)
-    _write('outcomes', outcomes)
-    text = report(outcomes) + f'\n{len(outcomes)} faults in {time.monotonic() - start:.0f} s'
+    with ThreadPoolExecutor(arguments.workers) as pool:
+        text = report(list(pool.map(Judge().outcome, mutants)))
+    text += f'\n{len(mutants)} faults in {time.monotonic() - start:.0f} s'
     (RECORDS / 'report.txt').write_text(text)
     print(text)
-    return 0
 
 
 def main() -> int:
@@ -601,8 +440,7 @@ def main() -> int:
     part.add_argument('--only', default='', help='only faults in FILE or FILE:LINE')
     part.set_defaults(run=run)
     arguments = parser.parse_args()
-    warnings.filterwarnings('ignore', '.*use of fork', DeprecationWarning)
-    return run_command(lambda: int(arguments.run(arguments)))
+    return run_command(lambda: arguments.run(arguments) or 0)
 
 
 if __name__ == '__main__':
