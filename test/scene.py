@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
-from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
+from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT
 from cliploc_ros.core.keyframes.layer import (
     KeyframeLayer,
     layer_path,
@@ -93,7 +93,7 @@ def make_layer(room: LandmarkMap, keyframes=6, points=40) -> KeyframeLayer:
         np.tile(np.eye(4), (keyframes, 1, 1)), np.arange(0, total + 1, points),
         rng.integers(0, 10_000, (total, 2)).astype(np.uint16),
         rng.normal(size=(total, 3)).astype(np.float32), descriptors,
-        nearest_words(unit_rows(descriptors), unit_rows(vocabulary)).astype(np.uint16),
+        nearest_words(SIFT.units(descriptors), SIFT.units(vocabulary)).astype(np.uint16),
         vocabulary)
 
 

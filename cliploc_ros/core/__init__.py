@@ -4,7 +4,7 @@
 
 Imports point downwards only, in this order (test/test_layout.py checks it):
 
-localizer, succession, relocalizer, warm_up, detector_check
+localizer, succession, relocalizer, detector_check
     Successive frames of a moving camera; localization of given frames.
 watch
     Evidence that a localizer's pose is right, added up look by look.

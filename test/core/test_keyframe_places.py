@@ -16,10 +16,9 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.features import (
     DIMENSIONS,
+    SIFT,
     Features,
     extract,
-    match,
-    unit_rows,
 )
 from cliploc_ros.core.keyframes.layer import (
     layer_path,
@@ -440,7 +439,7 @@ def test_features_are_found_in_any_image():
     assert 100 < len(features) <= 300
     assert (np.diff(features.strengths) <= 0).all()
     small = extract(texture[:400, :500], 300)
-    pairs, _ = match(unit_rows(small.descriptors), unit_rows(features.descriptors))
+    pairs, _ = SIFT.match(SIFT.units(small.descriptors), SIFT.units(features.descriptors))
     shifts = features.pixels[pairs[:, 1]] - small.pixels[pairs[:, 0]]
     assert len(pairs) > 50
     assert np.mean(np.abs(shifts).max(axis=1) < 0.5) > 0.9

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.depth_image import DepthImage, points_in_color
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.keyframes.features import SIFT, FeatureKind
+from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
 from cliploc_ros.core.keyframes.layer import (
     FROM_DEPTH,
     PIXEL_SCALE,
@@ -336,4 +336,4 @@ def learn_words(descriptors: NDArray[np.uint8], kind: FeatureKind = SIFT) -> NDA
         found, starts = np.unique(words[order], return_index=True)
         sums = np.add.reduceat(learned[order], starts, axis=0)
         means[found] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
-    return kind.compact(means)
+    return compact(means, kind.zero, kind.scale)
