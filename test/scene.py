@@ -89,7 +89,7 @@ def make_layer(room: LandmarkMap, keyframes=6, points=40) -> KeyframeLayer:
     descriptors = rng.integers(0, 120, (total, DIMENSIONS)).astype(np.uint8)
     vocabulary = learn_words(descriptors)
     return KeyframeLayer(
-        room.frame_id, room.landmark_ids, room.centers.astype(np.float32), CAMERA,
+        room.frame_id, room.landmark_ids, room.centers.astype(np.float32), (CAMERA,),
         np.tile(np.eye(4), (keyframes, 1, 1)), np.arange(0, total + 1, points),
         rng.integers(0, 10_000, (total, 2)).astype(np.uint16),
         rng.normal(size=(total, 3)).astype(np.float32), descriptors,

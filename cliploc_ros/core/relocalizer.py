@@ -37,7 +37,8 @@ from cliploc_ros.core.map.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import NEVER, Deadline, RelocalizerOptions
-from cliploc_ros.core.search.frame_search import SearchedFrame, check_k, coverage_of, search_frame
+from cliploc_ros.core.search.frame_search import SearchedFrame, coverage_of, search_frame
+from cliploc_ros.errors import OptionsError
 
 # Shares of the budget at which the search and the refinement end. Acceptance uses the remaining
 # time.
@@ -205,8 +206,9 @@ class Relocalizer:
     """
 
     def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
-        if options.needs_similarities:
-            check_k(options.k, len(landmark_map))
+        if options.needs_similarities and options.k > (count := len(landmark_map)) > 0:
+            raise OptionsError(f'k = {options.k}, but the map has {count} landmarks: set k to '
+                               f'{count} or less')
         self.landmark_map = landmark_map
         landmark_map.prepare()
         self.options = options

@@ -55,7 +55,7 @@ def rewrite(path, header=None, **changes):
 def test_a_layer_comes_back_as_it_was(file):
     assert file.name == 'room.keyframes.npz'
     before, after = make_layer(ROOM), load_layer_of_map(file, ROOM)
-    assert after.camera == before.camera
+    assert after.cameras == before.cameras
     assert after.landmark_ids == before.landmark_ids
     for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words',
                  'vocabulary'):
@@ -240,13 +240,9 @@ def test_malformed_files_are_named(file, changes, message):
         load_layer_of_map(file, ROOM)
 
 
-def test_a_missing_or_compressed_file_and_a_failed_write_are_named(file, tmp_path):
+def test_a_missing_file_and_a_failed_write_are_named(file, tmp_path):
     with pytest.raises(MapError, match='no such file'):
         load_layer_of_map(tmp_path / 'none.npz', ROOM)
-    with np.load(file) as content:
-        np.savez_compressed(file, **{name: content[name] for name in content.files})
-    with pytest.raises(MapError, match='compressed'):
-        load_layer_of_map(file, ROOM)
     with pytest.raises(MapError, match='cannot be written'):
         save_layer(tmp_path / 'missing' / 'room.npz', make_layer(ROOM))
 

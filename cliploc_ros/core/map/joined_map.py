@@ -108,7 +108,7 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
     whole = reduce(LandmarkMap.with_more, [
         replace(each, centers=each.centers + shift, landmark_ids=tuple(
             f'{each.frame_id}/{name}' for name in each.landmark_ids)) for each, _, shift in parts])
-    return JoinedMap(*(getattr(whole, field.name) for field in fields(LandmarkMap)),
+    return JoinedMap(**{field.name: getattr(whole, field.name) for field in fields(LandmarkMap)},
                      parts=tuple(parts))
 
 

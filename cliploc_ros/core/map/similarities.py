@@ -148,11 +148,7 @@ def nearest_landmarks(similarities: Similarities, k: int
     found, values = _nearest_columns(((start, crops @ labels.unique[start:start + _BLOCK].T)
                                       for start in range(0, len(labels.unique), _BLOCK)),
                                      len(crops), min(k, len(labels.unique)))
-    if len(labels.unique) < len(labels.of_landmarks):
-        return _expanded(labels, found, values, k)
-    landmarks = labels.landmarks[found]
-    order = np.lexsort((landmarks, -values), axis=1)[:, :k]  # ties in the order of landmarks
-    return np.take_along_axis(landmarks, order, axis=1), np.take_along_axis(values, order, axis=1)
+    return _expanded(labels, found, values, k)
 
 
 def _nearest_columns(blocks: Iterator[tuple[int, NDArray[np.float32]]], count: int, k: int

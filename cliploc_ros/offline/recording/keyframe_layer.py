@@ -205,11 +205,11 @@ def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
     pixels = np.concatenate([
         image.bearings[rows] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         for image, rows, camera in zip(images, kept, cameras, strict=True)])
-    camera, *others = dict.fromkeys(cameras)
+    different = tuple(dict.fromkeys(cameras))
     vocabulary = learn_words(descriptors, kind)
     return KeyframeLayer(
         landmark_map.frame_id, landmark_map.landmark_ids,
-        landmark_map.centers.astype(np.float32), camera,
+        landmark_map.centers.astype(np.float32), different,
         np.array([image.map_from_camera for image in images]),
         np.cumsum([0, *map(len, kept)]),
         np.clip(np.round(pixels * PIXEL_SCALE), 0, 65535).astype(np.uint16),
@@ -217,8 +217,8 @@ def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
                        ).astype(np.float32),
         descriptors, nearest_words(kind.units(descriptors), kind.units(vocabulary)
                                    ).astype(np.uint16), vocabulary, deviation_per_metre,
-        other_cameras=tuple(others), camera_rows=None if not others else np.array(
-            [[camera, *others].index(own) for own in cameras]), kind=kind)
+        camera_rows=None if len(different) == 1 else np.array(
+            [different.index(own) for own in cameras]), kind=kind)
 
 
 def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = SIFT
