@@ -5,10 +5,10 @@
 import cv2
 import numpy as np
 import pytest
-from reference import bearings_of, nearest
+from reference import bearings_of, nearest, solve_p3p
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.minimal_solvers import solve_p3p, two_point
+from cliploc_ros.core.geometry.minimal_solvers import two_point
 
 
 def random_problem(rng):

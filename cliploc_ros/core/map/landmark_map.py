@@ -164,28 +164,6 @@ class ClassIndex:
                                 self.landmarks[self.starts[classes[detections]] + within]])
 
 
-def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
-               neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the object number of each landmark (L,); duplicates share a number.
-
-    Landmarks of one class are duplicates if their centres are close relative to their sizes. Books
-    side by side are not duplicates.
-
-    Parameters
-    ----------
-    centers, shapes : ndarray (L, 3), (L, 6)
-        See cliploc_ros.core.geometry.ellipsoid.
-    neighbours : ndarray (p, 2) of int
-        Pairs of nearby landmarks of one class.
-    """
-    first, second = neighbours.T
-    inside = normalized_lengths(centers[second] - centers[first],
-                                (shapes[first] + shapes[second])[:, _UPPER]) < STANDS_IN
-    links = coo_matrix((np.ones(int(inside.sum())), (first[inside], second[inside])),
-                       (len(centers), len(centers)))
-    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
-
-
 @dataclass(frozen=True)
 class LandmarkMap:
     """L landmarks in one map frame. L is 0 for a map of keyframes alone."""
@@ -304,7 +282,11 @@ class LandmarkMap:
 
     @cached_property
     def objects(self) -> NDArray[np.int64]:
-        """Return the object number of each landmark (L,); duplicates share a number."""
+        """Return the object number of each landmark (L,); duplicates share a number.
+
+        Landmarks of one class are duplicates if their centres are close relative to their sizes.
+        Books side by side are not duplicates.
+        """
         rows = np.arange(len(self))
         ranks = [*range(2, min(_COMPARED + 1, len(self)) + 1)]
         if not ranks:
@@ -312,8 +294,13 @@ class LandmarkMap:
         near = self._tree_of_classes.query(self._with_class(self.centers, rows), ranks,
                                            distance_upper_bound=_NEAR_M)[1]
         first, column = np.nonzero(near < len(self))
-        return objects_of(self.centers, self.shapes,
-                          np.column_stack([first, near[first, column]]))
+        second = near[first, column]
+        inside = normalized_lengths(
+            self.centers[second] - self.centers[first],
+            (self.shapes[first] + self.shapes[second])[:, _UPPER]) < STANDS_IN
+        links = coo_matrix((np.ones(int(inside.sum())), (first[inside], second[inside])),
+                           (len(self), len(self)))
+        return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
     @cached_property
     def _tree_of_classes(self) -> cKDTree:
