@@ -68,13 +68,6 @@ def test_an_edited_map_keeps_its_layer(file):
     assert len(load_layer_of_map(file, moved)) == KEYFRAMES
 
 
-def test_the_most_similar_keyframe_has_the_same_words():
-    layer = make_layer(ROOM)
-    for keyframe in range(KEYFRAMES):
-        similarities = layer.similarities(layer.unit_descriptors(keyframe))
-        assert similarities.argmax() == keyframe
-
-
 @pytest.fixture
 def corridor():
     """Return twenty keyframes 10 m apart, each with forty points in the middle of the image."""
@@ -205,15 +198,6 @@ def test_keyframes_know_what_is_inside_of_the_image(corridor):
     aside[0, 3] -= 1.9
     assert localizer.coverage(middle, CAMERA) > 0.0
     assert localizer.coverage(aside, CAMERA) == 0.0
-
-
-def test_a_selected_keyframe_is_as_it_was(corridor):
-    one = corridor.select(np.arange(20) == 7)
-    assert one.offsets.tolist() == [0, POINTS]
-    np.testing.assert_array_equal(one.map_from_camera, corridor.map_from_camera[[7]])
-    for name in ('pixels', 'points', 'descriptors', 'words'):
-        np.testing.assert_array_equal(getattr(one, name),
-                                      getattr(corridor, name)[7 * POINTS:8 * POINTS])
 
 
 @pytest.mark.parametrize(('other', 'message'), [

@@ -13,16 +13,13 @@ from scipy.stats import chi2
 
 from cliploc_ros.core.fit.covariance import EXACT, normalized_square, refined_covariance
 from cliploc_ros.core.fit.refinement import (
-    LEAST_DEVIATION,
     LEAST_SHARE,
-    RELATIVE_DEVIATION,
-    edge_deviation,
     jacobian_of,
     move,
     refine_rig,
     residuals_of,
 )
-from cliploc_ros.core.fit.verification import make_rig, scores_of, verify_rig
+from cliploc_ros.core.fit.verification import make_rig, verify_rig
 from cliploc_ros.core.geometry.transforms import (
     SAME_PLACE,
     invert_transform,
@@ -190,23 +187,6 @@ def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
     assert found.ious.min() > 0.6
 
 
-def test_the_best_at_each_place_are_chosen(room, walk, rng):
-    rig = rig_of(room, walk)
-    near = [nearby(walk[-1], rng, 0.02, 0.3) for _ in range(6)]
-    far = walk[-1].copy()
-    far[2, 3] -= 1.0
-    poses = [*near[:3], far, *near[3:]]
-    rotations, translations = (np.array(part) for part in zip(*map(split, poses), strict=True))
-    scores = scores_of(rig, rotations, translations)
-    order = np.argsort(-scores, kind='stable')
-    rows = order[SAME_PLACE.distinct(np.array(poses)[order], 5)]
-    assert len(rows) == 2
-    assert rows[1] == 3
-    assert scores[rows[0]] == scores.max() > scores[3]
-    rows = order[SAME_PLACE.distinct(np.array(poses)[order], 1)]
-    np.testing.assert_array_equal(rows, [int(np.argmax(scores))])
-
-
 ROOM = make_room()
 BY_CLASS = RelocalizerOptions(matching='class')
 
@@ -319,14 +299,6 @@ def test_odometry_is_a_walk_through_the_frames_in_order_of_time():
     middle = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 3, 2])[1]
     end = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 2, 9])[1]
     assert np.trace(middle[:3, :3]) < np.trace(end[:3, :3])
-
-
-def test_an_edge_is_as_uncertain_as_box_and_landmark():
-    box, center = np.array([0.1, 0.0, 0.2, 0.1]), np.array([0.0, 0.0, 4.0])
-    own = RELATIVE_DEVIATION * 0.3 + LEAST_DEVIATION
-    assert edge_deviation(box, center, 0.0, np.eye(3), np.zeros(3)) == pytest.approx(own)
-    seen = edge_deviation(box, center, 0.2, np.eye(3), np.zeros(3))
-    assert seen == pytest.approx(np.hypot(own, 0.05))
 
 
 def test_a_map_states_what_its_landmarks_share():
