@@ -24,11 +24,6 @@ def read_only_disk(folder) -> list[str]:
     return _tried([*_MOUNT, 'ro', str(folder)])
 
 
-def own_numbers() -> list[str]:
-    """Return the prefix of a command that runs it as the first process of a container."""
-    return _tried(['unshare', '--map-root-user', '--pid', '--fork'])
-
-
 def _tried(command: list[str]) -> list[str]:
     tried = subprocess.run([*command, 'true'], capture_output=True, text=True, check=False)
     if tried.returncode:
