@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Environments for single processes: a small or read-only disk, a process namespace."""
+"""Environments for single processes: a small or read-only disk."""
 
 import subprocess
 

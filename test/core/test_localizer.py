@@ -264,14 +264,9 @@ def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
 
     first = localize(0)
     assert first.source == 'both'
-    given = session.covariance_for_filter(first)
-    np.testing.assert_array_equal(given, fine)
-    again = session.covariance_for_filter(localize(1))
-    assert (np.diag(again) > 100.0 * np.diag(fine)).all(), 'nothing new'
-    objects = localize(2, by_keyframes=False)
-    assert (np.diag(given) < np.diag(objects.covariance)).all()
-    rough = session.covariance_for_filter(objects)
-    assert (np.diag(rough) > 100.0 * np.diag(objects.covariance)).all(), 'objects tell less'
+    np.testing.assert_array_equal(session.covariance_for_filter(first), fine)
+    rough = localize(2, by_keyframes=False).covariance
+    assert (np.diag(fine) < np.diag(rough)).all(), 'objects tell less'
     alone = localize(3, 1, NOTHING)
     assert alone.source == 'keyframes'
     np.testing.assert_array_equal(session.covariance_for_filter(alone), fine)
