@@ -98,8 +98,9 @@ class CropSimilarities:
     @cached_property
     def spread(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return mean and standard deviation (n,) of each crop, see sampled_spread."""
-        step = _sample_step(self)
-        return _spread(self.crops @ self.labels.unique[self.labels.of_landmarks[::step]].T)
+        sample = self.labels.of_landmarks[::-(-self.shape[1] // _LABELS_SAMPLED)]
+        alike = self.crops @ self.labels.unique[sample].T
+        return alike.mean(axis=1), alike.std(axis=1)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return the similarities (n, L)."""
@@ -233,12 +234,5 @@ def sampled_spread(similarities: Similarities, crops: NDArray[np.int64]
     if isinstance(similarities, CropSimilarities):
         means, deviations = similarities.spread
         return means[crops], deviations[crops]
-    return _spread(similarities[crops, ::_sample_step(similarities)])
-
-
-def _sample_step(similarities: Similarities) -> int:
-    return -(-similarities.shape[1] // _LABELS_SAMPLED)
-
-
-def _spread(sample: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return sample.mean(axis=1), sample.std(axis=1)
+    alike = similarities[crops, ::-(-similarities.shape[1] // _LABELS_SAMPLED)]
+    return alike.mean(axis=1), alike.std(axis=1)
