@@ -32,16 +32,21 @@ MAP_FROM_CAMERA = transform_from_pose(np.array([0.3, -0.2, -0.5]),
                                       np.array([0.02, -0.05, 0.03, 0.99794]))
 
 
+def unit_rows(rows):
+    """Return the rows (n, d), each divided by its length."""
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
 def make_room() -> LandmarkMap:
     """Return twelve objects of three classes, scattered in front of the camera."""
     rng, count = np.random.default_rng(7), 12
-    quats = rng.normal(size=(count, 4))
+    quats = unit_rows(rng.normal(size=(count, 4)))
     return LandmarkMap(
         'map', tuple(f'thing_{i}' for i in range(count)),
         tuple(f'thing number {i}' for i in range(count)),
         tuple('abc'[i % 3] for i in range(count)),
         np.c_[rng.uniform(-2, 2, (count, 2)), rng.uniform(3, 6, count)],
-        rng.uniform(0.05, 0.3, (count, 3)), quats / np.linalg.norm(quats, axis=1, keepdims=True))
+        rng.uniform(0.05, 0.3, (count, 3)), quats)
 
 
 def doubled_room(offset) -> LandmarkMap:

@@ -109,11 +109,6 @@ def pair_iou(scene: Scene, detection: int, outline: NDArray[np.float64]) -> floa
     return ellipse_iou(*scene.box_ellipses[detection], *outline)
 
 
-def bearings_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the bearings (n, 3), of unit length, of points in the camera's frame."""
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
 def nearest(rotations: NDArray[np.float64], translations: NDArray[np.float64],
             rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> float:
     """Return the distance from a pose to the nearest of other poses, as the largest difference."""

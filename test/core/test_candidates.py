@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from reference import candidate_mask, same_class, verify
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, unit_rows
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
@@ -73,11 +73,6 @@ def test_landmarks_of_several_classes_agree_with_their_mask(landmarks, others, d
     assert (index.of_landmarks == index.classes_of(landmarks)).all()
 
 
-def units(rng, count, size=16):
-    rows = rng.standard_normal((count, size), dtype=np.float32)
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
-
-
 def sorted_whole(similarities, k):
     order = np.argsort(-similarities, axis=1, kind='stable')[:, :k]
     return order, np.take_along_axis(similarities, order, axis=1)
@@ -97,8 +92,10 @@ def test_nearest_are_those_of_a_whole_sort(rng, landmarks):
 def test_a_shared_label_counts_for_each_landmark(labels, landmarks, seed, data):
     rng = np.random.default_rng(seed)
     used, of_landmarks = np.unique(rng.integers(0, labels, landmarks), return_inverse=True)
-    embeddings = LabelEmbeddings(units(rng, len(used)), of_landmarks)
-    similarities = CropSimilarities(units(rng, 4), embeddings)
+    embeddings = LabelEmbeddings(unit_rows(rng.standard_normal(
+        (len(used), 16), dtype=np.float32)), of_landmarks)
+    similarities = CropSimilarities(unit_rows(rng.standard_normal(
+        (4, 16), dtype=np.float32)), embeddings)
     k = data.draw(st.integers(1, landmarks))
     found, values = nearest_landmarks(similarities, k)
     assert similarities.shape == (4, landmarks)
@@ -114,10 +111,6 @@ def test_what_is_not_finite_is_refused():
         nearest_landmarks(similarities, 3)
 
 
-def _unit_rows(rows):
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
-
-
 def make_world(count, seed=0, classes=12):
     """Return a map around a camera at its origin, and the camera's observation of it."""
     rng = np.random.default_rng(seed)
@@ -125,7 +118,7 @@ def make_world(count, seed=0, classes=12):
     names = tuple(f'class {number}' for number in rng.integers(0, classes, count))
     landmark_map = LandmarkMap('map', tuple(map(str, range(count))), names, names, centers,
                                rng.uniform(0.1, 0.4, (count, 3)),
-                               _unit_rows(np.random.default_rng(seed).normal(size=(count, 4))))
+                               unit_rows(np.random.default_rng(seed).normal(size=(count, 4))))
     boxes = ellipse_bboxes(project_ellipsoids(np.eye(4), centers, landmark_map.shapes))
     seen = np.nonzero((np.abs(boxes) < 0.6).all(axis=1))[0][:10]
     pixels = 500 * (boxes[seen] + rng.normal(0, 0.004, (len(seen), 4))) + [320, 240, 320, 240]
@@ -320,18 +313,13 @@ def test_a_class_that_a_landmark_is_only_taken_for_is_not_expected():
 COUNT, SIZE = 50, 64
 
 
-def unit_rows(rng, rows) -> np.ndarray:
-    rows = np.asarray(rows) if np.ndim(rows) else rng.normal(size=(rows, SIZE))
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
-
-
 @pytest.fixture
 def world(rng):
     """Return labels, images and crops of one space, with labels and images apart as in CLIP."""
-    objects, gap = unit_rows(rng, COUNT), unit_rows(rng, 2)
-    labels = unit_rows(rng, gap[0] + 0.25 * objects)
-    means = unit_rows(rng, gap[1] + objects)
-    crops = unit_rows(rng, gap[1] + objects + 0.06 * rng.normal(size=objects.shape))
+    objects, gap = (unit_rows(rng.normal(size=(count, SIZE))) for count in (COUNT, 2))
+    labels, means, crops = (unit_rows(rows).astype(np.float32) for rows in (
+        gap[0] + 0.25 * objects, gap[1] + objects,
+        gap[1] + objects + 0.06 * rng.normal(size=objects.shape)))
     images = LandmarkEmbeddings('key', tuple(map(str, range(COUNT))), means.astype(np.float16),
                                 np.zeros((0, SIZE), np.float16), np.zeros(COUNT + 1, np.int64))
     return LabelEmbeddings.of(labels), images, crops

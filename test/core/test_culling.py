@@ -6,6 +6,7 @@
 import numpy as np
 import pytest
 from reference import sample_pose, verify
+from scene import unit_rows
 
 from cliploc_ros.core.geometry.ellipsoid import (
     Poses,
@@ -34,9 +35,8 @@ def make_storey(count, seed=0, classes=40, by_class=True) -> Scene:
     """Return a map with a landmark per four square metres, and up to twelve boxes in a frame."""
     rng, side = np.random.default_rng(seed), np.sqrt(4.0 * count)
     centers = np.c_[rng.uniform(0, side, (count, 2)), rng.uniform(0, 2, count)]
-    quats = rng.normal(size=(count, 4))
-    shapes = shape_matrices(rng.uniform(0.05, 0.4, (count, 3)),
-                            quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    quats = unit_rows(rng.normal(size=(count, 4)))
+    shapes = shape_matrices(rng.uniform(0.05, 0.4, (count, 3)), quats)
     class_ids = rng.integers(0, classes, count)
     camera = make_transform(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
                             np.array([0.4 * side, 0.5 * side, 1.2]))

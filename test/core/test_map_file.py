@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import yaml
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, unit_rows
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.joined_map import MAX_MAPS, join_maps, parts_of, place_of
@@ -243,18 +243,17 @@ def test_names_that_no_file_can_have(name):
         LandmarkMap.from_file(name)
 
 
-def unit_rows(count, seed):
-    rows = np.random.default_rng(seed).normal(size=(count, 8))
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float16)
+def looks(count, seed):
+    return unit_rows(np.random.default_rng(seed).normal(size=(count, 8))).astype(np.float16)
 
 
 @pytest.fixture
 def embeddings():
     """Return three landmarks: with two medoids, with none and unknown, and with one."""
-    means = unit_rows(3, 0)
+    means = looks(3, 0)
     means[1] = 0.0
     return LandmarkEmbeddings('tiny:gelu:1234', ('mug_1', 'mug_2', 'book_1'), means,
-                              unit_rows(3, 1), np.array([0, 2, 2, 3]))
+                              looks(3, 1), np.array([0, 2, 2, 3]))
 
 
 def arrays_of(embeddings):
@@ -285,7 +284,7 @@ def test_a_map_finds_the_file_next_to_it(tmp_path, embeddings):
 
 
 WRONG = {
-    'wrong rows': ('means', unit_rows(2, 0), r'means has shape \(2, 8\)'),
+    'wrong rows': ('means', looks(2, 0), r'means has shape \(2, 8\)'),
     'repeated id': ('landmark_ids', np.array(['a', 'b', 'a']), 'repeats an id'),
     'NaN': ('means', np.full((3, 8), np.nan), 'unit length in row 0'),
     'end': ('medoid_offsets', np.array([0, 1, 2, 2]), 'medoid_offsets ranges from 0 to 2'),

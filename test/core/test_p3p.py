@@ -5,7 +5,8 @@
 import cv2
 import numpy as np
 import pytest
-from reference import bearings_of, nearest, solve_p3p
+from reference import nearest, solve_p3p
+from scene import unit_rows
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.minimal_solvers import two_point
@@ -36,14 +37,14 @@ def test_recovers_random_poses_and_finds_solutions_only_none_twice(count, rng):
     worst, several = 0.0, 0
     for number in range(10_000):
         seen, points, rotation, translation = random_problem(rng, count)
-        up_in_map, bearings = bearings_of(rng.normal(size=(1, 3)))[0], bearings_of(seen)
+        up_in_map, bearings = unit_rows(rng.normal(size=(1, 3)))[0], unit_rows(seen)
         rotations, translations = solve(bearings, points, rotation @ up_in_map, up_in_map)
         worst = max(worst, nearest(rotations, translations, rotation, translation))
         several += len(rotations) > 1
         for index, found in enumerate(rotations if number < 2_000 else ()):
             assert np.abs(found @ found.T - np.eye(3)).max() < 1e-8
             assert np.linalg.det(found) > 0
-            again = bearings_of(points @ found.T + translations[index])
+            again = unit_rows(points @ found.T + translations[index])
             assert np.abs(again - bearings).max() < 1e-7
             assert nearest(rotations[:index], translations[:index], found,
                            translations[index]) > 1e-9
@@ -57,14 +58,14 @@ def test_finds_what_opencv_finds(rng):
     found = 0
     for _ in range(2_000):
         seen, points, _, _ = random_problem(rng)
-        bearings = bearings_of(seen)
+        bearings = unit_rows(seen)
         rotations, translations = solve_p3p(bearings, points)
         image = np.ascontiguousarray((seen[:, :2] / seen[:, 2:])[:, None])
         _, vectors, theirs = cv2.solveP3P(np.ascontiguousarray(points[:, None]), image,
                                           np.eye(3), None, cv2.SOLVEPNP_AP3P)
         for vector, translation in zip(vectors, theirs, strict=True):
             rotation = cv2.Rodrigues(vector)[0]
-            again = bearings_of(points @ rotation.T + translation.ravel())
+            again = unit_rows(points @ rotation.T + translation.ravel())
             if np.abs(again - bearings).max() > 1e-6:
                 continue  # not a solution: OpenCV's own rounding near a double root
             found += 1
@@ -83,6 +84,6 @@ def test_finds_what_opencv_finds(rng):
     np.full((2, 3), np.nan),
 ])
 def test_degenerate_points_have_no_pose(points):
-    bearings = bearings_of(np.array([[0.0, 0, 1], [0.2, 0.1, 1], [0.4, 0.2, 1]]))[:len(points)]
+    bearings = unit_rows(np.array([[0.0, 0, 1], [0.2, 0.1, 1], [0.4, 0.2, 1]]))[:len(points)]
     assert len(solve(bearings, points, np.array([0.0, -1.0, 0.0]),
                      np.array([0.0, 0.0, 1.0]))[0]) == 0
