@@ -114,6 +114,7 @@ def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, mi
 @pytest.mark.parametrize('has_empty', [False, True])
 def test_one_keyframe_and_one_without_points_are_searched(corridor, has_empty, fast):
     layer, pose = corridor.select(np.arange(20) == 18), corridor.map_from_camera[18]
+    np.testing.assert_array_equal(layer.words, corridor.words[18 * POINTS:19 * POINTS])
     if has_empty:  # another keyframe with the same view, but without points
         layer = replace(layer, map_from_camera=np.array([pose, pose]), offsets=np.array(
             [0, 0, POINTS]))

@@ -110,6 +110,10 @@ def test_every_compatible_triple_comes_once_and_in_order(rng, size):
     assert len(found) > 50
 
 
+def pose_of(leaders, row):
+    return invert_transform(make_transform(leaders.rotations[row], leaders.translations[row]))
+
+
 def test_it_ends_where_the_exhaustive_search_ends(room):
     scene = scene_of(room)
     whole, gated = Leaders.none_yet(), Leaders.none_yet()
@@ -120,8 +124,7 @@ def test_it_ends_where_the_exhaustive_search_ends(room):
     print(f'\n{progress.tried} of {all_tried.tried} samples tried')
     best = [leaders.ranked()[0] for leaders in (whole, gated)]
     assert gated.scores[best[1]] == pytest.approx(whole.scores[best[0]], rel=1e-6)
-    pose = invert_transform(make_transform(gated.rotations[best[1]], gated.translations[best[1]]))
-    assert pose_error(pose, MAP_FROM_CAMERA)[0] < 1e-2
+    assert pose_error(pose_of(gated, best[1]), MAP_FROM_CAMERA)[0] < 1e-2
 
 
 def test_the_first_candidates_are_done_before_the_next(room):
@@ -152,15 +155,19 @@ def scene():
 
 
 def test_it_chooses_and_scores_as_the_reference(scene, room, rng):
-    (candidates, constraint, targets, memory, poses, overlaps), compared = set_up(scene), 0
-    samples = draw_ransac(scene.pairs, 2_000, rng)
+    candidates, constraint, targets, memory, poses, overlaps = set_up(scene)
+    samples, compared, dropped = draw_ransac(scene.pairs, 2_000, rng), 0, 0
     for number, sample in enumerate(samples):
-        which = make_hypothesis(candidates, constraint, memory, poses, samples, number, 0.0)
         expected, total = sample_pose(scene, sample)
+        # a least overlap drops what overlaps less
+        best = make_hypothesis(candidates, constraint, memory, poses, samples, number, 1.0)
+        assert (best >= 0) == (total >= 1.0)
+        which = make_hypothesis(candidates, constraint, memory, poses, samples, number, 0.0)
         assert (which >= 0) == (expected is not None)
         if expected is None:
             continue
-        compared += 1
+        assert best in (-1, which)
+        compared, dropped = compared + 1, dropped + (best < 0)
         assert total >= 0.0
         assert (poses.rotations[which] == expected[0]).all()
         assert (poses.translations[which] == expected[1]).all()
@@ -171,20 +178,7 @@ def test_it_chooses_and_scores_as_the_reference(scene, room, rng):
         for floor in (-1.0, 0.5 * plain, plain - 1e-6, plain + 1e-6, plain + 1.0):
             found = verify_beyond(targets, poses, which, overlaps, floor)
             assert found == pytest.approx(max(plain, floor), abs=1e-9)
-    assert compared > 500
-
-
-def test_a_least_overlap_drops_what_overlaps_less(scene, rng):
-    (candidates, constraint, _, memory, poses, _), dropped = set_up(scene), 0
-    samples = draw_ransac(scene.pairs, 500, rng)
-    for number, sample in enumerate(samples):
-        which = make_hypothesis(candidates, constraint, memory, poses, samples, number, 1.0)
-        expected, total = sample_pose(scene, sample)
-        assert (which >= 0) == (total >= 1.0)
-        if which >= 0:
-            assert (poses.rotations[which] == expected[0]).all()
-        dropped += expected is not None and which < 0
-    assert dropped > 20
+    assert compared > 500 and dropped > 80
 
 
 sizes = st.floats(0.05, 20.0)
@@ -215,8 +209,7 @@ def test_a_constraint_rules_poses_out(scene, constraint, remains):
         assert progress.coverage == 1.0
         near = False
         for row in leaders.ranked():
-            pose = invert_transform(make_transform(leaders.rotations[row],
-                                                   leaders.translations[row]))
+            pose = pose_of(leaders, row)
             height = pose[:3, 3] @ UP_IN_MAP
             assert constraint.min_height <= height <= constraint.max_height
             tilt = (pose[:3, :3] @ np.array(constraint.up_in_camera)) @ UP_IN_MAP
@@ -229,8 +222,7 @@ def test_pairs_and_a_vertical_find_the_pose(scene):
     leaders = Leaders.none_yet()
     steps = list(search_progressively(scene, compatible_pairs(scene), leaders, upright(), size=2))
     best = leaders.ranked()[0]
-    pose = invert_transform(make_transform(leaders.rotations[best], leaders.translations[best]))
-    assert pose_error(pose, MAP_FROM_CAMERA)[0] < 0.2
+    assert pose_error(pose_of(leaders, best), MAP_FROM_CAMERA)[0] < 0.2
     assert leaders.samples[best, 2] == -1
     assert (scene.pairs[leaders.samples[best, 0]] != scene.pairs[leaders.samples[best, 1]]).all()
     assert steps[-1].tried == np.tril(compatible_pairs(scene)).sum()
