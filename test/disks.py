@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Environments for single processes: a small or read-only disk, a process namespace."""
+"""Environments for single processes: a small or read-only disk."""
 
 import subprocess
 
@@ -22,11 +22,6 @@ def small_disk(folder) -> list[str]:
 def read_only_disk(folder) -> list[str]:
     """Return the prefix of a command that runs it with an empty read-only disk on a folder."""
     return _tried([*_MOUNT, 'ro', str(folder)])
-
-
-def own_numbers() -> list[str]:
-    """Return the prefix of a command that runs it as the first process of a container."""
-    return _tried(['unshare', '--map-root-user', '--pid', '--fork'])
 
 
 def _tried(command: list[str]) -> list[str]:

@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
-from cliploc_ros.core.keyframes.features import DIMENSIONS, unit_rows
+from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT
 from cliploc_ros.core.keyframes.layer import (
     KeyframeLayer,
     layer_path,
@@ -32,16 +32,21 @@ MAP_FROM_CAMERA = transform_from_pose(np.array([0.3, -0.2, -0.5]),
                                       np.array([0.02, -0.05, 0.03, 0.99794]))
 
 
+def unit_rows(rows):
+    """Return the rows (n, d), each divided by its length."""
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
 def make_room() -> LandmarkMap:
     """Return twelve objects of three classes, scattered in front of the camera."""
     rng, count = np.random.default_rng(7), 12
-    quats = rng.normal(size=(count, 4))
+    quats = unit_rows(rng.normal(size=(count, 4)))
     return LandmarkMap(
         'map', tuple(f'thing_{i}' for i in range(count)),
         tuple(f'thing number {i}' for i in range(count)),
         tuple('abc'[i % 3] for i in range(count)),
         np.c_[rng.uniform(-2, 2, (count, 2)), rng.uniform(3, 6, count)],
-        rng.uniform(0.05, 0.3, (count, 3)), quats / np.linalg.norm(quats, axis=1, keepdims=True))
+        rng.uniform(0.05, 0.3, (count, 3)), quats)
 
 
 def doubled_room(offset) -> LandmarkMap:
@@ -89,11 +94,11 @@ def make_layer(room: LandmarkMap, keyframes=6, points=40) -> KeyframeLayer:
     descriptors = rng.integers(0, 120, (total, DIMENSIONS)).astype(np.uint8)
     vocabulary = learn_words(descriptors)
     return KeyframeLayer(
-        room.frame_id, room.landmark_ids, room.centers.astype(np.float32), CAMERA,
+        room.frame_id, room.landmark_ids, room.centers.astype(np.float32), (CAMERA,),
         np.tile(np.eye(4), (keyframes, 1, 1)), np.arange(0, total + 1, points),
         rng.integers(0, 10_000, (total, 2)).astype(np.uint16),
         rng.normal(size=(total, 3)).astype(np.float32), descriptors,
-        nearest_words(unit_rows(descriptors), unit_rows(vocabulary)).astype(np.uint16),
+        nearest_words(SIFT.units(descriptors), SIFT.units(vocabulary)).astype(np.uint16),
         vocabulary)
 
 

@@ -22,7 +22,7 @@ def made_map(number):
     row = np.zeros((1, 8), dtype=np.float16)
     row[0, number % 8] = 1.0
     layer = KeyframeLayer(
-        'map', ROOM.landmark_ids, landmark_map.centers.astype(np.float32), CAMERA,
+        'map', ROOM.landmark_ids, landmark_map.centers.astype(np.float32), (CAMERA,),
         np.tile(np.eye(4), (1, 1, 1)), np.array([0, 5]), np.zeros((5, 2), np.uint16),
         np.full((5, 3), number, dtype=np.float32), np.zeros((5, 128), np.uint8),
         np.zeros(5, np.uint16), np.ones((1, 128), np.uint8))

@@ -4,14 +4,14 @@
 
 Imports point downwards only, in this order (test/test_layout.py checks it):
 
-localizer, succession, relocalizer, warm_up, detector_check
+localizer, relocalizer, detector_check
     Successive frames of a moving camera; localization of given frames.
 watch
     Evidence that a localizer's pose is right, added up look by look.
 acceptance
     Confidence, and the decision to accept or refuse.
 fit
-    Verification, refinement, several frames, covariance.
+    Verification, refinement, several frames, covariance, and covariances of successive answers.
 keyframes
     Poses from local features that match images taken during mapping.
 search

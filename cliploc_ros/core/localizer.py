@@ -25,6 +25,7 @@ from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.core.fit.succession import FilterState, succeed
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import SAME_VIEW, pose_error
 from cliploc_ros.core.keyframes.localization import (
@@ -40,7 +41,6 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Case, Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, TimeBudget
 from cliploc_ros.core.search.frame_search import SearchedFrame
-from cliploc_ros.core.succession import FilterState, succeed
 from cliploc_ros.units import NS_PER_S
 
 # These are time limits and therefore not in calibration.yaml. The confidence that a pose from a

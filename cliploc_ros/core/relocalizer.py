@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The entry point of the method: Relocalizer.relocalize(observations) -> Relocalization."""
 
+import logging
 import math
 import time
 from collections.abc import Sequence
@@ -25,16 +26,19 @@ from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Match, find_with_rivals
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.point_pose import refine
 from cliploc_ros.core.map.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import NEVER, Deadline, RelocalizerOptions
-from cliploc_ros.core.search.frame_search import SearchedFrame, check_k, coverage_of, search_frame
-from cliploc_ros.core.warm_up import call_every_kernel
+from cliploc_ros.core.search.frame_search import SearchedFrame, coverage_of, search_frame
+from cliploc_ros.errors import OptionsError
 
 # Shares of the budget at which the search and the refinement end. Acceptance uses the remaining
 # time.
@@ -202,15 +206,17 @@ class Relocalizer:
     """
 
     def __init__(self, landmark_map: LandmarkMap, options: RelocalizerOptions) -> None:
-        if options.needs_similarities:
-            check_k(options.k, len(landmark_map))
+        if options.needs_similarities and options.k > (count := len(landmark_map)) > 0:
+            raise OptionsError(f'k = {options.k}, but the map has {count} landmarks: set k to '
+                               f'{count} or less')
         self.landmark_map = landmark_map
         landmark_map.prepare()
         self.options = options
 
-    def warm_up(self) -> None:
+    @staticmethod
+    def warm_up() -> None:
         """Compile the kernels, or read them from disk, before the first request."""
-        warm_up(call_every_kernel)
+        warm_up(_call_every_kernel)
 
     def relocalize(self, observations: Sequence[Observation],
                    recognizer: ImageRecognizer | None = None) -> Relocalization:
@@ -356,3 +362,27 @@ def _nothing_found(landmark_map: LandmarkMap, frames: Sequence[SearchedFrame]
         reason = (f'{detections} detections give fewer than {frames[-1].sample_size} distinct '
                   'correspondence candidates')
     return kind, f'{reason}; turn the camera to more objects'
+
+
+def _call_every_kernel() -> None:
+    """Call every kernel that a localization needs: localize with eight boxes of a small map."""
+    names = tuple('abcdefgh')
+    centers = np.random.default_rng(0).uniform((-1.0, -1.0, 4.0), (1.0, 1.0, 6.0), (8, 3))
+    landmark_map = LandmarkMap('map', names, names, names, centers, np.full((8, 3), 0.2),
+                               np.tile([0.0, 0.0, 0.0, 1.0], (8, 1)))
+    camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
+    boxes = camera.bboxes_in_pixels(ellipse_bboxes(project_ellipsoids(
+        np.eye(4), centers, landmark_map.shapes)))
+    frame = Observation(camera, Detections(boxes, names, np.ones(8)), np.eye(8, dtype=np.float32),
+                        odom_from_camera=np.eye(4), depths=centers[:, 2])
+    for algorithm in ('bf', 'ransac', 'auto'):
+        relocalizer = Relocalizer(landmark_map, RelocalizerOptions(k=1, algorithm=algorithm))
+        relocalizer.search(frame)
+    relocalizer.relocalize([frame, replace(frame, up_in_camera=np.array([0.0, -1.0, 0.0]))])
+    points = np.indices((3, 3, 2)).reshape(3, -1).T + np.array([0.0, 0.0, 3.0])
+    refine(points, points[:, :2] / points[:, 2:], np.eye(4))
+
+
+if __name__ == '__main__':
+    logging.basicConfig(level=logging.INFO, format='%(message)s')
+    Relocalizer.warm_up()

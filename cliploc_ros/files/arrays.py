@@ -11,7 +11,6 @@ import math
 import os
 import zipfile
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -116,7 +115,6 @@ class Schema:
     not_empty: Mapping[str, str] = field(default_factory=dict)
     #: Arrays of other kinds of files, and hints for the message if a file has them instead
     others: Mapping[str, str] = field(default_factory=dict)
-    is_stored: bool = False  #: Whether compressed arrays are refused
 
     def read(self, path: Path) -> dict[str, NDArray[Any]]:
         """Read and validate the arrays of a file; missing optional arrays are omitted.
@@ -183,26 +181,16 @@ class Schema:
 
     def _arrays(self, path: Path) -> dict[str, NDArray[Any]]:
         try:
-            file = open_file(path)
-        except OSError as error:
-            raise ArrayError(f'cannot be read: {error.strerror}') from error
-        with file:
-            try:
-                archive = zipfile.ZipFile(file)
-            except Exception as error:  # zipfile may raise any exception for a damaged file
-                with suppress(OSError):
-                    file.seek(0)
-                    if file.read(6) == b'\x93NUMPY':
-                        raise ArrayError('is a single array, not an npz file of named arrays'
-                                         ) from error
-                raise ArrayError(f'is not a complete npz file ({error})') from error
-            with archive:
-                try:
-                    for member in archive.infolist():
-                        archive.open(member).close()  # a damaged name would hide an array
-                except Exception as error:  # see above
-                    raise ArrayError(f'is damaged ({error})') from error
+            with open_file(path) as file, zipfile.ZipFile(file) as archive:
+                for member in archive.infolist():
+                    archive.open(member).close()  # a damaged name would hide an array
                 return self._arrays_of(file, archive)
+        except ArrayError:
+            raise
+        except OSError as error:
+            raise ArrayError(f'cannot be read: {error.strerror or error}') from error
+        except Exception as error:  # zipfile may raise any exception for a damaged file
+            raise ArrayError(f'is not a complete npz file ({error})') from error
 
     def _arrays_of(self, file: BinaryIO, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
         members = {member.filename.removesuffix('.npy'): member for member in archive.infolist()
@@ -221,8 +209,6 @@ class Schema:
                              'its size on disk')
         arrays = {}
         for name, member in wanted.items():
-            if self.is_stored and member.compress_type != zipfile.ZIP_STORED:
-                raise ArrayError(f'array {name} is compressed')
             try:
                 arrays[name] = _array(archive, member)
             except Exception as error:  # NumPy and zipfile may raise any exception, see above

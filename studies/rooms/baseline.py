@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.keyframes.features import match
+from cliploc_ros.core.keyframes.features import SIFT
 from cliploc_ros.offline.datasets.frames import PosedImage
 
 Floats = NDArray[np.float64]
@@ -47,7 +47,7 @@ class SiftMap:
         for first, second in combinations(range(len(seen)), 2):
             if poses[first, :3, 2] @ poses[second, :3, 2] < np.cos(np.radians(_MOST_DEG)):
                 continue
-            pairs, _ = match(self._descriptors[first], self._descriptors[second])
+            pairs, _ = SIFT.match(self._descriptors[first], self._descriptors[second])
             near = _is_epipolar(rays[first][pairs[:, 0]], rays[second][pairs[:, 1]],
                                 invert_transform(poses[second]) @ poses[first])
             matches.append(pairs[near] + (starts[first], starts[second]))
@@ -62,7 +62,7 @@ class SiftMap:
         found = set[tuple[int, float, float, float]]()
         for theirs, points in zip(self._descriptors, self._points, strict=True):
             known = np.nonzero(np.isfinite(points[:, 0]))[0]
-            pairs, _ = match(descriptors, theirs)
+            pairs, _ = SIFT.match(descriptors, theirs)
             pairs = pairs[np.isin(pairs[:, 1], known)]
             found |= {(feature, *points[point]) for feature, point in pairs.tolist()}
         if len(found) < _LEAST_INLIERS:

@@ -13,7 +13,7 @@ from scene import CAMERA, MAP_FROM_CAMERA, boxes_of
 from cliploc_ros.core.fit.verification import Verified, make_rig, verify_rig
 from cliploc_ros.core.geometry.ellipse import ellipse_iou
 from cliploc_ros.core.geometry.ellipsoid import project_ellipsoids
-from cliploc_ros.core.geometry.minimal_solvers import solve_p3p
+from cliploc_ros.core.geometry.minimal_solvers import MAX_SOLUTIONS, p3p
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.search.frame_search import Candidates
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Scene, make_scene
@@ -46,6 +46,15 @@ def scene_of(room, map_from_camera=MAP_FROM_CAMERA, rows=slice(None), noise_px=0
     potential = same_class(room.class_ids, room.class_ids)[rows]
     return make_scene(CAMERA.normalize_bboxes(boxes), room.centers, room.shapes, potential,
                       np.argwhere(potential), 0.2)
+
+
+def solve_p3p(bearings: NDArray[np.float64], points: NDArray[np.float64]
+              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rotations (s, 3, 3) and translations (s, 3) of p3p, s = 0 to 4."""
+    rotations, translations = np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3))
+    count = p3p(np.ascontiguousarray(bearings), np.ascontiguousarray(points), rotations,
+                translations)
+    return rotations[:count], translations[:count]
 
 
 def sample_pose(scene: Scene, sample: NDArray[np.int64]) -> tuple[Pose | None, float]:
@@ -98,11 +107,6 @@ def pair_iou(scene: Scene, detection: int, outline: NDArray[np.float64]) -> floa
     if np.isnan(outline[0]):
         return np.nan
     return ellipse_iou(*scene.box_ellipses[detection], *outline)
-
-
-def bearings_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the bearings (n, 3), of unit length, of points in the camera's frame."""
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
 def nearest(rotations: NDArray[np.float64], translations: NDArray[np.float64],

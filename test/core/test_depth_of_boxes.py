@@ -84,14 +84,6 @@ def test_right_depth_makes_poses_better_and_surer():
     assert np.median(deviations, axis=0)[1] < 0.95 * np.median(deviations, axis=0)[0]
 
 
-def test_depth_is_evidence(rng):
-    rows = np.array([0, 4, 8, 10])
-    found = RELOCALIZER.relocalize([look(rng, rows)])
-    assert found.depth.is_passed
-    assert found.hypotheses[0].support.depth > 1.0
-    assert found.depth.ratio == pytest.approx(1.0, abs=0.1)
-
-
 @pytest.mark.parametrize('change', [
     pytest.param(lambda depths, rng: 1000.0 * depths, id='millimetres'),
     pytest.param(lambda depths, rng: 1.6 * depths, id='scale'),

@@ -22,17 +22,10 @@ from cliploc_ros.core.geometry.ellipsoid import (
 from cliploc_ros.core.geometry.minimal_solvers import largest_cubic_root
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
-    make_transform,
     move_covariance,
-    pose_error,
     quaternion_from_transform,
-    rotation_angle_deg,
     transform_from_pose,
 )
-from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import CameraError
 from cliploc_ros.offline.datasets.intrinsics import PRESETS, read_camera
 
@@ -43,6 +36,8 @@ LENSES = {
     'rational': ('rational_polynomial', (1.0, 0.2, 0.001, -0.0005, 0.01, 1.3, 0.5, 0.05)),
     'fisheye': ('equidistant', (-0.02, 0.01, -0.005, 0.001)),
 }
+
+SOUND = {'width': 640, 'height': 480, 'fx': 525.0, 'fy': 525.0, 'cx': 320.0, 'cy': 240.0}
 
 
 def camera(lens, focal=400.0):
@@ -64,6 +59,14 @@ def test_plumb_bob_equals_its_equation():
     expected = (400 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + 318.6,
                 401 * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + 255.3)
     assert camera('freiburg1').project_normalized(np.array([[x, y]]))[0] == pytest.approx(expected)
+
+
+def test_a_fisheye_equals_its_equation():
+    point, coefficients = np.array([0.9, -0.5]), LENSES['fisheye'][1]
+    angle = np.arctan(np.linalg.norm(point))
+    radius = angle * (1 + sum(k * angle**(2 * n) for n, k in enumerate(coefficients, start=1)))
+    expected = point / np.linalg.norm(point) * radius * (400, 401) + (318.6, 255.3)
+    assert camera('fisheye').project_normalized(point[None])[0] == pytest.approx(expected)
 
 
 def test_beyond_the_fold_of_a_lens_is_nan():
@@ -90,9 +93,8 @@ def test_boxes_of_the_plane_come_back_as_pixels():
     ({'distortion_model': 'plumb_bob', 'distortion': (float('inf'),)}, 'not finite'),
 ])
 def test_impossible_cameras_are_refused(changes, message):
-    sound = {'width': 640, 'height': 480, 'fx': 500.0, 'fy': 500.0, 'cx': 320.0, 'cy': 240.0}
     with pytest.raises(CameraError, match=message):
-        Camera(**(sound | changes))
+        Camera(**(SOUND | changes))
 
 
 def test_a_frustum_ends_at_the_borders_of_the_image():
@@ -101,18 +103,12 @@ def test_a_frustum_ends_at_the_borders_of_the_image():
     np.testing.assert_allclose(np.abs(base), np.tile([1.6, 1.6, 2.0], (4, 1)))
 
 
-SOUND = {'width': 640, 'height': 480, 'fx': 525.0, 'fy': 525.0, 'cx': 320.0, 'cy': 240.0}
 FISHEYE = {'distortion_model': 'equidistant', 'distortion': (-0.02, 0.01, -0.005, 0.001)}
 BARREL = {'distortion_model': 'plumb_bob', 'distortion': (-0.35, 0.12, 0.001, -0.001, 0.0)}
 
 
-def judged(changes):
-    """Return 'refused', 'doubted' or 'sound'."""
-    faults = camera_faults(Camera(**(SOUND | changes)))
-    return 'sound' if not faults else 'refused' if faults[0].is_certain else 'doubted'
-
-
-@pytest.mark.parametrize('changes', [
+# Valid cameras: 10 % off the middle, fx and fy 3 % apart, portrait, thermal, fisheyes.
+SOUND_CHANGES = [
     {}, {'distortion_model': 'plumb_bob', 'distortion': (0.0,) * 5}, BARREL,
     {'distortion_model': 'rational_polynomial',
      'distortion': (1.0, 0.2, 0.001, -0.0005, 0.01, 1.3, 0.5, 0.05)},
@@ -120,13 +116,11 @@ def judged(changes):
     {'width': 360, 'height': 640, 'cx': 180.0, 'cy': 320.0, 'fx': 500.0, 'fy': 500.0},
     {'width': 80, 'height': 60, 'cx': 40.0, 'cy': 30.0, 'fx': 75.0, 'fy': 75.0},
     {'fx': 300.0, 'fy': 300.0}, {'fx': 5000.0, 'fy': 5000.0},
-    {'fx': 244.5, 'fy': 244.5, **FISHEYE}, {'fx': 180.0, 'fy': 180.0, **FISHEYE}])
-def test_valid_odd_cameras_are_sound(changes):
-    """Valid cameras: 10 % off the middle, fx and fy 3 % apart, portrait, thermal, fisheyes."""
-    assert judged(changes) == 'sound'
+    {'fx': 244.5, 'fy': 244.5, **FISHEYE}, {'fx': 180.0, 'fy': 180.0, **FISHEYE}]
 
 
 @pytest.mark.parametrize(('changes', 'verdict'), [
+    *((changes, 'sound') for changes in SOUND_CHANGES),
     ({'fx': 1050.0, 'fy': 1050.0, 'cx': 640.0, 'cy': 480.0}, 'refused'),  # of twice the size
     ({'fx': 262.5, 'fy': 262.5, 'cx': 160.0, 'cy': 120.0}, 'refused'),  # of half the size
     ({'fx': 1050.0, 'fy': 788.0, 'cx': 640.0, 'cy': 360.0}, 'refused'),  # of 1280x720
@@ -141,7 +135,8 @@ def test_valid_odd_cameras_are_sound(changes):
     ({'distortion_model': 'plumb_bob', 'distortion': (-6.0, 0.0, 0.0, 0.0)}, 'refused'),
     ({'distortion_model': 'plumb_bob', 'distortion': (-1.0, 0.0, 0.0, 0.0)}, 'doubted')])
 def test_cameras_that_no_image_has(changes, verdict):
-    assert judged(changes) == verdict
+    faults = camera_faults(Camera(**(SOUND | changes)))
+    assert verdict == ('sound' if not faults else 'refused' if faults[0].is_certain else 'doubted')
 
 
 def test_recorded_cameras_are_sound(shared_data):
@@ -221,11 +216,6 @@ def test_largest_cubic_root(roots):
 axes = st.floats(0.01, 0.6)
 
 
-def box_iou(a, b):
-    overlap = np.prod(np.maximum(0.0, np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])))
-    return overlap / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - overlap)
-
-
 @given(st.tuples(axes, axes, axes), st.tuples(*[st.floats(-1, 1)] * 4),
        st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(1.0, 8.0)))
 def test_outline_touches_dense_surface_samples(semi_axes, quaternion, center):
@@ -251,13 +241,6 @@ def test_not_wholly_in_front_has_no_outline(depth):
     assert np.isnan(project_ellipsoids(np.eye(4), np.array([[0.0, 0.0, depth]]), shapes)).all()
 
 
-def test_sphere_ahead_is_a_known_circle():
-    shapes = shape_matrices(np.full((1, 3), 0.6), np.array([[0.0, 0.0, 0.0, 1.0]]))
-    outline = project_ellipsoids(np.eye(4), np.array([[0.0, 0.0, 1.0]]), shapes)[0]
-    # the tangent cone of a sphere of radius 0.6 at distance 1: tan = 0.6 / 0.8
-    assert outline == pytest.approx([0.0, 0.0, 0.75**2, 0.0, 0.75**2])
-
-
 def test_outlines_equal_those_of_another_program(shared_data):
     recorded = json.loads((shared_data / 'projection/ellipsoid_projections.json').read_text())
     ids = list(recorded['landmarks'])
@@ -268,7 +251,7 @@ def test_outlines_equal_those_of_another_program(shared_data):
     shapes = shape_matrices(
         np.array([landmark['radii'] for landmark in landmarks]),
         np.array([np.roll(landmark['quat_wxyz'], -1) for landmark in landmarks]))
-    worst_px, worst_iou, count = 0.0, 0.0, 0
+    worst_px, count = 0.0, 0
     for frame in recorded['frames']:
         camera_from_map = invert_transform(np.array(frame['map_from_camera']))
         outlines = ellipses_in_pixels(project_ellipsoids(camera_from_map, centers, shapes),
@@ -276,15 +259,11 @@ def test_outlines_equal_those_of_another_program(shared_data):
         boxes = ellipse_bboxes(outlines)
         for box in frame['boxes']:
             projected = boxes[ids.index(str(box['landmark']))]
-            detected = np.array(box['detected_bbox_xyxy'])
-            theirs = np.array(box['projected_bbox_xyxy'])
-            worst_px = max(worst_px, np.abs(projected - theirs).max())
-            worst_iou = max(worst_iou, abs(box_iou(theirs, detected) - box['iou']))
+            worst_px = max(worst_px, np.abs(projected - box['projected_bbox_xyxy']).max())
             count += 1
-    print(f'\n{count} boxes: at most {worst_px:.4f} px and {worst_iou:.1e} IoU off')
+    print(f'\n{count} boxes: at most {worst_px:.4f} px off')
     assert count == 1900
     assert worst_px < 0.05
-    assert worst_iou < 1e-6
 
 
 numbers = st.floats(-3.0, 3.0)
@@ -295,22 +274,10 @@ transforms = st.builds(
 
 
 @given(transforms)
-def test_inverse(a_from_b):
-    assert a_from_b @ invert_transform(a_from_b) == pytest.approx(np.eye(4), abs=1e-12)
-
-
-@given(transforms)
 def test_quaternion_and_back(a_from_b):
     quat_xyzw = quaternion_from_transform(a_from_b)
     assert quat_xyzw[3] >= 0
     assert transform_from_pose(a_from_b[:3, 3], quat_xyzw) == pytest.approx(a_from_b, abs=1e-9)
-
-
-def test_a_quarter_turn_about_z():
-    turn = transform_from_pose(np.array([1.0, 2.0, 3.0]), np.array([0, 0, 0.5**0.5, 0.5**0.5]))
-    assert turn @ (1.0, 0.0, 0.0, 1.0) == pytest.approx([1.0, 3.0, 3.0, 1.0])
-    assert rotation_angle_deg(turn[:3, :3]) == pytest.approx(90.0)
-    assert pose_error(turn, np.eye(4)) == pytest.approx((14**0.5, 90.0))
 
 
 def test_moving_a_covariance_by_a_lever(rng):
@@ -321,75 +288,6 @@ def test_moving_a_covariance_by_a_lever(rng):
     moved = samples.copy()
     moved[:, :3] += np.cross(samples[:, 3:], lever)
     assert move_covariance(spread, lever) == pytest.approx(np.cov(moved.T), abs=3e-4)
-
-
-SIZE = np.array([640, 480])
-REQUESTS = 10
-
-
-@pytest.fixture(scope='module')
-def room():
-    """Return twenty-four upright objects of ten classes in a room of 6 x 5 m."""
-    rng, count = np.random.default_rng(1), 24
-    quats = Rotation.from_euler('z', rng.uniform(0, 360, (count, 1)), degrees=True).as_quat()
-    return LandmarkMap(
-        'map', tuple(f'thing {i}' for i in range(count)),
-        tuple(f'label {i}' for i in range(count)),
-        tuple('abcdefghij'[i % 10] for i in range(count)),
-        rng.uniform((0, 0, 0.2), (6, 5, 1.8), (count, 3)), rng.uniform(0.06, 0.35, (count, 3)),
-        quats)
-
-
-def surfaces(room):
-    """Return points (L, 2000, 3) on the ellipsoids, on a spiral over each."""
-    steps = np.arange(2000)
-    z = 1.0 - (2 * steps + 1) / 2000
-    turn = steps * np.pi * (3 - np.sqrt(5))
-    sphere = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
-    return np.array([Rotation.from_quat(quat).apply(sphere * axes) + center for center, axes, quat
-                     in zip(room.centers, room.semi_axes, room.quats_xyzw, strict=True)])
-
-
-def fisheye_pixels(points, focal_px, d):
-    """OpenCV's equation: the radius is a polynomial of the angle to the axis."""
-    across = np.linalg.norm(points[..., :2], axis=-1)
-    angle = np.arctan2(across, points[..., 2])
-    radius = angle * (1 + sum(one * angle**(2 * n) for n, one in enumerate(d, start=1)))
-    return focal_px * points[..., :2] * (radius / across)[..., None] + SIZE / 2
-
-
-def looks(room, focal_px, d, rng):
-    """Yield requests from random places: a pose, and the boxes of visible objects."""
-    points = surfaces(room)
-    for _ in range(REQUESTS):
-        axes = Rotation.from_euler('ZXZ', rng.normal((0, -90, 0), (120, 8, 4)), degrees=True)
-        pose = make_transform(axes.as_matrix(), rng.uniform((1, 1, 0.5), (5, 4, 1.2)))
-        inside = (points - pose[:3, 3]) @ pose[:3, :3]
-        pixels = fisheye_pixels(inside, focal_px, d)
-        boxes = np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1)
-        cut = np.clip(boxes, 0, np.tile(SIZE, 2))
-        shown = (cut[:, 2:] - cut[:, :2]).prod(axis=1) > 0.7 * (boxes[:, 2:] - boxes[:, :2]).prod(
-            axis=1)
-        rows = np.nonzero(shown & (np.linalg.norm(inside, axis=2).min(axis=1) > 0.2)
-                          & ((cut[:, 2:] - cut[:, :2]).min(axis=1) > 8))[0]
-        noisy = np.clip(cut[rows] + rng.normal(0, 1, (len(rows), 4)), 0, np.tile(SIZE, 2))
-        yield pose, Detections(noisy, tuple(room.class_ids[row] for row in rows),
-                               np.full(len(rows), 0.8))
-
-
-@pytest.mark.parametrize(('wide_deg', 'd'), [
-    (120.0, (0.0,) * 4), (190.0, (0.0,) * 4), (150.0, (-0.02, 0.01, -0.005, 0.001))])
-def test_poses_of_a_fisheye_are_right(room, wide_deg, d):
-    """With a pinhole model, 10 of 10 images of an ideal fisheye were accepted .2 to .5 m off."""
-    focal_px = SIZE[0] / np.radians(wide_deg)
-    camera = Camera(*SIZE.tolist(), focal_px, focal_px, *(SIZE / 2), 'equidistant', d)
-    relocalizer = Relocalizer(room, RelocalizerOptions(matching='class'))
-    found = [(relocalizer.relocalize([Observation(camera, detections)]), pose)
-             for pose, detections in looks(room, focal_px, d, np.random.default_rng(2))]
-    accepted = [pose_error(one.map_from_camera, pose) for one, pose in found if one.accepted]
-    assert len(accepted) >= 8
-    assert max(distance_m for distance_m, _ in accepted) < 0.12
-    assert max(angle_deg for _, angle_deg in accepted) < 3.0
 
 
 def test_pixels_of_a_fisheye_are_rays_up_to_88_degrees_and_none_behind():

@@ -4,9 +4,8 @@
 
 import numpy as np
 import pytest
-from reference import candidate_mask, same_class, sample_pose, verify
+from reference import candidate_mask, same_class, sample_pose, solve_p3p, verify
 
-from cliploc_ros.core.geometry.minimal_solvers import solve_p3p
 from cliploc_ros.core.search.frame_search import (
     balanced_order,
     nearest_candidates,

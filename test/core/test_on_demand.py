@@ -106,11 +106,6 @@ def test_no_crop_is_class_matching_and_all_crops_are_hybrid(embedded):
     assert found.confidence == pytest.approx(whole.confidence)
 
 
-def test_classes_that_suffice_take_no_crop():
-    seen, found = localize(OPTIONS)
-    assert found.accepted and len(seen.compared) == 0
-
-
 def test_an_early_stop_is_surer_than_the_last_one():
     """A pose that is accepted by class, but with doubt, is compared with all crops."""
     sure = localize(OPTIONS)[1].confidence

@@ -134,19 +134,10 @@ def test_all_that_is_known_comes_back(tmp_path):
     assert empty.run is None and empty.images == () and len(empty.newest.detections) == 0
 
 
-@pytest.mark.parametrize(('name', 'change'), [
+@pytest.mark.parametrize(('name', 'value'), [
     ('about', lambda about: about[:-3]), ('about', lambda about: about[:0]),
     ('images', lambda images: images[:-9]), ('images', lambda images: 0 * images),
-    ('image_offsets', lambda offsets: offsets[:1]), ('crop_offsets', lambda offsets: offsets[1:])])
-def test_a_broken_case_is_named(name, change, tmp_path):
-    arrays = dict(case_arrays(Case((query(),), {})))
-    arrays[name] = change(arrays[name])
-    np.savez(tmp_path / 'case.npz', **arrays)
-    with pytest.raises(DatasetError, match=r'case\.npz'):
-        read_case(tmp_path / 'case.npz')
-
-
-@pytest.mark.parametrize(('name', 'value'), [
+    ('image_offsets', lambda offsets: offsets[:1]), ('crop_offsets', lambda offsets: offsets[1:]),
     ('odom_from_camera', [[0.0] * 4] * 4), ('odom_from_camera', [[1e308]]),
     ('odom_from_camera', {}),
     ('class_ids', []), ('class_ids', [[]]), ('scores', 'x'), ('bboxes_xyxy', [[1e308] * 4]),
@@ -162,9 +153,12 @@ def test_a_case_with_a_wrong_value_is_named(name, value, tmp_path):
                 node[key] = value
             elif isinstance(inner, dict | list):
                 put(inner)
-    about = json.loads(arrays['about'].tobytes())
-    put(about)
-    arrays['about'] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
+    if callable(value):
+        arrays[name] = value(arrays[name])
+    else:
+        about = json.loads(arrays['about'].tobytes())
+        put(about)
+        arrays['about'] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
     np.savez(tmp_path / 'case.npz', **arrays)
     with pytest.raises(DatasetError, match=r'case\.npz'):
         read_case(tmp_path / 'case.npz')

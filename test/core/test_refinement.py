@@ -13,16 +13,13 @@ from scipy.stats import chi2
 
 from cliploc_ros.core.fit.covariance import EXACT, normalized_square, refined_covariance
 from cliploc_ros.core.fit.refinement import (
-    LEAST_DEVIATION,
     LEAST_SHARE,
-    RELATIVE_DEVIATION,
-    edge_deviation,
     jacobian_of,
     move,
     refine_rig,
     residuals_of,
 )
-from cliploc_ros.core.fit.verification import make_rig, scores_of, verify_rig
+from cliploc_ros.core.fit.verification import make_rig, verify_rig
 from cliploc_ros.core.geometry.transforms import (
     SAME_PLACE,
     invert_transform,
@@ -64,30 +61,22 @@ def error_of(rotation, translation):
     return pose_error(invert_transform(pose), MAP_FROM_CAMERA)
 
 
-def test_a_perfect_view_leads_to_the_truth(room, rng):
-    scene = scene_of(room)
+def test_a_perfect_view_leads_to_the_truth_and_a_noisy_one_near_it(room, rng):
+    scene, errors_m = scene_of(room), []
     perfect = verify(scene, *shaken(rng, 0.0, 0.0)).score
     for _ in range(50):
+        noisy, start = scene_of(room, noise_px=3.0, rng=rng), shaken(rng, 0.15, 3.0)
+        found = refine(noisy, *start, VERTICAL_UNKNOWN)
+        assert found.score >= LEAST_SHARE * verify(noisy, *start).score
+        assert found.score == verify(noisy, found.rotation, found.translation).score
+        errors_m.append(error_of(found.rotation, found.translation)[0])
         found = refine(scene, *shaken(rng, 0.08, 1.5), VERTICAL_UNKNOWN)
         assert error_of(found.rotation, found.translation)[0] < 1e-4
         assert found.score == pytest.approx(perfect, abs=1e-2)
         assert (np.linalg.eigvalsh(found.information) > 0).all()
         np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
-
-
-def test_it_is_nearer_the_truth_than_before_and_hardly_ever_scores_less(room, rng):
-    before, after = [], []
-    for _ in range(200):
-        scene, start = scene_of(room, noise_px=3.0, rng=rng), shaken(rng, 0.15, 3.0)
-        before.append(error_of(*start)[0])
-        found = refine(scene, *start, VERTICAL_UNKNOWN)
-        assert found.score >= LEAST_SHARE * verify(scene, *start).score
-        assert found.score == verify(scene, found.rotation, found.translation).score
-        after.append(error_of(found.rotation, found.translation)[0])
-    print(f'\nshaken by {np.median(before):.2f} m, boxes by 3 px: '
-          f'{np.median(after):.3f} m off afterwards (median)')
     # errors of three pixels leave this error, whatever the start
-    assert np.median(after) < 0.45 * np.median(before)
+    assert np.median(errors_m) < 0.45 * 0.15
 
 
 def test_nothing_to_go_by_changes_nothing(room):
@@ -188,23 +177,6 @@ def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
     np.testing.assert_array_equal(
         found.landmarks, place * len(room) + np.array([0, 1, 2, 3, 5, 4, 7, 6]))
     assert found.ious.min() > 0.6
-
-
-def test_the_best_at_each_place_are_chosen(room, walk, rng):
-    rig = rig_of(room, walk)
-    near = [nearby(walk[-1], rng, 0.02, 0.3) for _ in range(6)]
-    far = walk[-1].copy()
-    far[2, 3] -= 1.0
-    poses = [*near[:3], far, *near[3:]]
-    rotations, translations = (np.array(part) for part in zip(*map(split, poses), strict=True))
-    scores = scores_of(rig, rotations, translations)
-    order = np.argsort(-scores, kind='stable')
-    rows = order[SAME_PLACE.distinct(np.array(poses)[order], 5)]
-    assert len(rows) == 2
-    assert rows[1] == 3
-    assert scores[rows[0]] == scores.max() > scores[3]
-    rows = order[SAME_PLACE.distinct(np.array(poses)[order], 1)]
-    np.testing.assert_array_equal(rows, [int(np.argmax(scores))])
 
 
 ROOM = make_room()
@@ -319,14 +291,6 @@ def test_odometry_is_a_walk_through_the_frames_in_order_of_time():
     middle = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 3, 2])[1]
     end = fitted([*way[:3], way[1]], ROOM.centers, 0.0, stamps=[0, 1, 2, 9])[1]
     assert np.trace(middle[:3, :3]) < np.trace(end[:3, :3])
-
-
-def test_an_edge_is_as_uncertain_as_box_and_landmark():
-    box, center = np.array([0.1, 0.0, 0.2, 0.1]), np.array([0.0, 0.0, 4.0])
-    own = RELATIVE_DEVIATION * 0.3 + LEAST_DEVIATION
-    assert edge_deviation(box, center, 0.0, np.eye(3), np.zeros(3)) == pytest.approx(own)
-    seen = edge_deviation(box, center, 0.2, np.eye(3), np.zeros(3))
-    assert seen == pytest.approx(np.hypot(own, 0.05))
 
 
 def test_a_map_states_what_its_landmarks_share():

@@ -94,7 +94,8 @@ def test_k_larger_than_the_map_is_refused(room):
     {'matching': 'magic'}, {'algorithm': 'luck'},
     {'algorithm': 'b-prosac', 'matching': 'class'}, {'k': 0}, {'iterations': 0},
     {'iou_threshold': 1.5}, {'iou_threshold': float('nan')}, {'time_budget_s': -1.0},
-    {'min_inliers': 2}, {'min_confidence': -1.0}])
+    {'min_inliers': 2}, {'min_confidence': -1.0}, *({'height_range_m': heights} for heights in (
+        (2.0, 1.0), (1.0, 1.0), (float('nan'), 2.0), (1.0,)))])
 def test_impossible_options_are_named(change):
     with pytest.raises(OptionsError, match=next(iter(change))):
         RelocalizerOptions(**change)

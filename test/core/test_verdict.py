@@ -35,6 +35,7 @@ from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, re
 from cliploc_ros.core.calibration import CALIBRATION, FILE
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import Match
+from cliploc_ros.core.fit.succession import succeed
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform, pose_difference
 from cliploc_ros.core.keyframes.places import RecognizedPlace
@@ -43,7 +44,6 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import make_scene
-from cliploc_ros.core.succession import succeed
 from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.trials import make_queries
 from studies.acceptance.troubles import exchange_landmarks

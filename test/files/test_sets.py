@@ -8,16 +8,12 @@ import os
 import random
 import signal
 import stat
-import subprocess
-import sys
 import time
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from disks import own_numbers
 from whole_sets import ROOM, made_map, write_set
 
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
@@ -25,11 +21,11 @@ from cliploc_ros.core.map.landmark_embeddings import (
     embeddings_path,
     load_embeddings_of_map,
     load_landmark_embeddings,
-    save_landmark_embeddings,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import set_digest, write_map
 from cliploc_ros.errors import DatasetError, MapError, OptionsError
+from cliploc_ros.files.storage import replace_file
 from cliploc_ros.offline.datasets.map_recording import (
     MapRecording,
     load_recording,
@@ -38,7 +34,6 @@ from cliploc_ros.offline.datasets.map_recording import (
 from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
 from cliploc_ros.offline.studio.document import Document
 
-PROJECT = Path(__file__).resolve().parents[2]
 
 def read(path):
     """Return the number in each file of a map."""
@@ -64,9 +59,9 @@ def write_again_and_again(path, first, begun):
 
 
 def test_a_kill_leaves_one_whole_set(path):
-    """The writes of build_map are killed at 150 random times."""
+    """The writes of build_map are killed at 60 random times."""
     draw, seen, fork = random.Random(0), set(), multiprocessing.get_context('fork')
-    for kill in range(150):
+    for kill in range(60):
         begun = fork.Event()
         writer = fork.Process(target=write_again_and_again,
                               args=(path, 1000 * kill + 1, begun), daemon=True)
@@ -78,7 +73,7 @@ def test_a_kill_leaves_one_whole_set(path):
         number, agree = read(path)
         assert agree == {True}
         seen.add(number)
-    print(f'150 kills, {len(seen)} sets')
+    print(f'60 kills, {len(seen)} sets')
     assert len(seen) > 10, 'the kills happen during writes'
 
 
@@ -141,7 +136,7 @@ def test_a_set_that_cannot_be_written_changes_nothing(path):
 def test_two_writers_at_once_leave_one_whole_set(path):
     """As with build_map in two terminals: the last one wins with all of its files."""
     fork = multiprocessing.get_context('fork')
-    for turn in range(20):
+    for turn in range(8):
         writers = [fork.Process(target=lambda numbers: [write_set(path, tag) for tag in numbers],
                                 args=(range(first, first + 10),))
                    for first in (100 * turn, 100 * turn + 10)]
@@ -201,40 +196,13 @@ def test_sets_of_keyframes_alone_are_told_apart(path):
         load_layer_of_map(layer_path(place), LandmarkMap.from_file(place))
 
 
-SHARED = """
-import sys
-from pathlib import Path
-sys.path[:0] = {paths!r}
-import numpy as np
-from cliploc_ros.core.map.landmark_embeddings import *
-rows = np.zeros((400, 64), np.float16)
-rows[:, int(sys.argv[2])] = 1.0
-made = LandmarkEmbeddings(sys.argv[2], tuple(map(str, range(400))), rows,
-                          np.empty((0, 64), np.float16), np.zeros(401, np.int64))
-import os
-print(os.getpid(), flush=True)
-for _ in range(300):
-    save_landmark_embeddings(sys.argv[1], made)
-"""
-
-
-def test_two_processes_of_one_number_share_a_folder(tmp_path):
-    """Writers as in two containers: no torn file, no refused write, no leftovers."""
-    path = tmp_path / 'a.embeddings.npz'
-    code = SHARED.format(paths=[str(PROJECT)])
-    writers = [subprocess.Popen([*own_numbers(), sys.executable, '-c', code,
-                                 str(path), str(number)], stdout=subprocess.PIPE, text=True)
-               for number in range(2)]
-    assert len({writer.stdout.readline() for writer in writers}) == 1, 'all have the same number'
-    reads = 0
-    while any(writer.poll() is None for writer in writers):
-        if path.exists():
-            found = load_landmark_embeddings(path)
-            assert found.means[0, int(found.encoder_key)] == 1.0
-            reads += 1
-    assert reads > 50
-    assert [writer.wait() for writer in writers] == [0, 0]
-    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+def test_processes_of_one_number_share_a_folder(tmp_path):
+    """As in two containers: the name of an unfinished file has no number of a process."""
+    with replace_file(tmp_path / 'a') as one, replace_file(tmp_path / 'a') as other:
+        one.write_text('one')
+        other.write_text('other')
+    assert (tmp_path / 'a').read_text() == 'one'
+    assert [entry.name for entry in tmp_path.iterdir()] == ['a']
 
 
 def test_a_file_whose_names_have_no_ending_misses_its_arrays(path):
@@ -249,15 +217,6 @@ def test_a_file_whose_names_have_no_ending_misses_its_arrays(path):
         load_landmark_embeddings(place)
     with pytest.raises(MapError, match='not a complete npz file'):
         load_landmark_embeddings('/proc/self/mem')
-
-
-def test_a_set_without_end_is_not_printed(path):
-    landmark_map, place = LandmarkMap.from_file(path), embeddings_path(path)
-    save_landmark_embeddings(place, replace(load_landmark_embeddings(place),
-                                            set_digest='a' * 1_000_000))
-    with pytest.raises(MapError, match=r'is of the set a{12}, but its') as error:
-        load_embeddings_of_map(path, landmark_map.landmark_ids, landmark_map.map_set)
-    assert len(str(error.value)) < 500
 
 
 def test_a_writer_that_keeps_the_others_out_is_named(tmp_path, monkeypatch):

@@ -8,7 +8,6 @@ import yaml
 from garbage import CASES, number
 from hypothesis import given
 from hypothesis import strategies as st
-from scene import make_room, write_map
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
@@ -30,12 +29,6 @@ landmark_map = st.one_of(tree, st.fixed_dictionaries(
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp('maps')
-
-
-@pytest.fixture(scope='module')
-def sound(folder):
-    write_map(make_room(), folder / 'sound.yaml')
-    return (folder / 'sound.yaml').read_bytes()
 
 
 def read(folder, content):
@@ -61,12 +54,3 @@ def test_trees(folder, content):
     read(folder, yaml.safe_dump(nodes, allow_unicode=True).encode('utf-8', 'surrogatepass'))
 
 
-@given(st.data())
-@CASES
-def test_damage(folder, sound, data):
-    """Draw a valid file with a replaced part."""
-    start = data.draw(st.integers(0, len(sound)))
-    end = data.draw(st.integers(start, min(len(sound), start + 200)))
-    patch = data.draw(st.one_of(st.binary(max_size=20), st.text(
-        alphabet='-:[]{}&*!|>%@`#,?\'" \n\t0.eE+~abc', max_size=20).map(str.encode)))
-    read(folder, sound[:start] + patch + sound[end:])

@@ -147,7 +147,7 @@ def test_features_of_different_kinds_are_not_compared(layer_file, room, image_rg
     kinds = feature_kinds(str(cache_dir))
     layer = load_layer_of_map(layer_file, room, kinds)
     with pytest.raises(MapError, match='xfeat-64-uint8: extract them with the kind of the layer'):
-        KeyframeLocalizer(layer).localize_features(query_features(image_rgb), layer.camera)
+        KeyframeLocalizer(layer).localize_features(query_features(image_rgb), layer.cameras[0])
     with pytest.raises(MapError, match=f'expected {SIFT.name}; make the layer again'):
         load_layer_of_map(layer_file, room)
     mixed = tmp_path / 'mixed.npz'

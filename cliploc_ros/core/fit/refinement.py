@@ -313,12 +313,9 @@ def one_to_one(rig, found, rotation, translation):
             best = _best_detection(found, detection, frames[frame], frames[frame + 1])
             if landmark < 0 or best < 0:
                 continue
-            for column in range(4):
-                pairs[count, column] = scene.box_ellipses[best, column]
-            for column in range(3):
-                pairs[count, 4 + column] = scene.centers[landmark, column]
-            for column in range(6):
-                pairs[count, 7 + column] = scene.shapes[landmark, column]
+            pairs[count, :4] = scene.box_ellipses[best]
+            pairs[count, 4:7] = scene.centers[landmark]
+            pairs[count, 7:13] = scene.shapes[landmark]
             pairs[count, 13] = edge_deviation(scene.box_ellipses[best], scene.centers[landmark],
                                               rig.sigmas[landmark], own_rotation, own_translation)
             pairs[count, 14], pairs[count, 15] = centre_depth(
@@ -375,10 +372,8 @@ def linearize_rig(inliers, rotation, translation, residuals):
                 lever[axis] += (rotation[row, axis] * translation[row]
                                 - own_rotation[row, axis] * own_translation[row])
         _move_to_reference(lever, own_information, own_gradient)
-        for i in range(6):
-            gradient[i] += own_gradient[i]
-            for j in range(6):
-                information[i, j] += own_information[i, j]
+        gradient += own_gradient
+        information += own_information
     return information, gradient
 
 

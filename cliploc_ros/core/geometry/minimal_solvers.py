@@ -24,7 +24,6 @@ with Known Vertical Direction", ACCV 2010).
 from math import acos, copysign, cos, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import ZERO, compiled
 
@@ -70,34 +69,22 @@ def largest_cubic_root(c2: float, c1: float, c0: float) -> float:
     return root
 
 
-def solve_p3p(bearings: NDArray[np.float64], points: NDArray[np.float64]
-              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the poses at which three points have the given bearings.
+@compiled
+def p3p(bearings, points, rotations, translations):
+    """Write the poses at which three points have the given bearings.
 
     Parameters
     ----------
-    bearings : ndarray (3, 3)
-        Unit vectors in the camera's optical frame, one per row.
-    points : ndarray (3, 3)
-        The points in the map frame [m], one per row.
+    bearings, points : ndarray (3, 3)
+        Unit vectors in the camera's optical frame, and points in the map frame [m], one per row.
+    rotations, translations : ndarray (4, 3, 3), (4, 3)
+        Rotations and translations of camera_from_map [m]. All points lie in front of the camera.
 
     Returns
     -------
-    rotations : ndarray (s, 3, 3)
-        Rotations of ``camera_from_map`` for the s = 0 to 4 solutions.
-    translations : ndarray (s, 3)
-        Translations of ``camera_from_map`` [m]. All points lie in front of the camera.
+    int
+        Number of poses, 0 to 4.
     """
-    rotations = np.empty((MAX_SOLUTIONS, 3, 3))
-    translations = np.empty((MAX_SOLUTIONS, 3))
-    count = p3p(np.ascontiguousarray(bearings, dtype=np.float64),
-                np.ascontiguousarray(points, dtype=np.float64), rotations, translations)
-    return rotations[:count], translations[:count]
-
-
-@compiled
-def p3p(bearings, points, rotations, translations):
-    """Write up to four poses into the two arrays; return their number (see solve_p3p)."""
     m12, m13, m23 = _cosine(bearings, 0, 1), _cosine(bearings, 0, 2), _cosine(bearings, 1, 2)
     a12, a13, a23 = (_squared_distance(points, 0, 1), _squared_distance(points, 0, 2),
                      _squared_distance(points, 1, 2))

@@ -63,18 +63,37 @@ class FeatureKind:
     query_px: int = 400
     query_most: int = 600
 
-    def compact(self, units: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Convert unit vectors (n, d) to descriptors (n, d)."""
-        return compact(units, self.zero, self.scale)
-
     def units(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Convert descriptors (n, d) to unit vectors (n, d)."""
-        return unit_rows(descriptors, self.zero)
+        rows = descriptors.astype(np.float32) - self.zero
+        rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
+        return rows
 
     def match(self, ours: NDArray[np.float32], theirs: NDArray[np.float32]
               ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Match the unit descriptors of two images, see the function match."""
-        return match(ours, theirs, self.ratio)
+        """Match the unit descriptors of two images: mutual nearest neighbours with a ratio test.
+
+        Returns
+        -------
+        pairs : ndarray (k, 2) of int
+            Rows of ours and theirs.
+        shares : ndarray (k,)
+            Squared distance of each pair, divided by that to the second-nearest row of theirs.
+        """
+        if len(ours) == 0 or len(theirs) < 2:
+            return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.float32)
+        cosines = ours @ theirs.T
+        best = cosines.argmax(axis=1)
+        first = cosines[np.arange(len(ours)), best]
+        rows = np.nonzero(first >= cosines.max(axis=0)[best])[0]
+        others = cosines[rows]
+        others[np.arange(len(rows)), best[rows]] = -1.0
+        # squared distances of unit vectors are 2 - 2 cos
+        nearest, second = (np.maximum(1.0 - cosine, 0.0) + _SAME for cosine in (
+            first[rows], others.max(axis=1, initial=-1.0)))
+        shares = nearest / second
+        rows, shares = rows[shares < self.ratio**2], shares[shares < self.ratio**2]
+        return np.stack([rows, best[rows]], axis=1), shares
 
 
 #: Factories of feature kinds by name; calling one may load or download a model.
@@ -117,37 +136,3 @@ def compact(units: NDArray[np.float32], zero: int = 0, scale: float = _SCALE
             ) -> NDArray[np.uint8]:
     """Convert unit vectors (n, d) to descriptors (n, d), see FeatureKind."""
     return np.clip(np.round(scale * units) + zero, 0, 255).astype(np.uint8)
-
-
-def unit_rows(descriptors: NDArray[np.uint8], zero: int = 0) -> NDArray[np.float32]:
-    """Convert descriptors (n, d) to unit vectors (n, d); the byte `zero` stands for 0."""
-    rows = descriptors.astype(np.float32) - zero
-    rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
-    return rows
-
-
-def match(ours: NDArray[np.float32], theirs: NDArray[np.float32], ratio: float = _RATIO
-          ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Match the unit descriptors of two images: mutual nearest neighbours with a ratio test.
-
-    Returns
-    -------
-    pairs : ndarray (k, 2) of int
-        Rows of ours and theirs.
-    shares : ndarray (k,)
-        Squared distance of each pair, divided by that to the second-nearest row of theirs.
-    """
-    if len(ours) == 0 or len(theirs) < 2:
-        return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.float32)
-    cosines = ours @ theirs.T
-    best = cosines.argmax(axis=1)
-    first = cosines[np.arange(len(ours)), best]
-    rows = np.nonzero(first >= cosines.max(axis=0)[best])[0]
-    others = cosines[rows]
-    others[np.arange(len(rows)), best[rows]] = -1.0
-    # squared distances of unit vectors are 2 - 2 cos
-    nearest, second = (np.maximum(1.0 - cosine, 0.0) + _SAME for cosine in (
-        first[rows], others.max(axis=1, initial=-1.0)))
-    shares = nearest / second
-    rows, shares = rows[shares < ratio**2], shares[shares < ratio**2]
-    return np.stack([rows, best[rows]], axis=1), shares

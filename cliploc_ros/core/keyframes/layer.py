@@ -6,8 +6,7 @@ Images are compared by the visual words of their features (Sivic and Zisserman, 
 2003): the descriptors of a layer are clustered, each cluster is a word, and the similarity of two
 images is that of their word histograms. Words that occur in many keyframes have less weight.
 
-The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Its arrays are stored uncompressed
-and are read completely.
+The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Its arrays are read completely.
 """
 
 import hashlib
@@ -57,7 +56,7 @@ class KeyframeLayer:
     #: Landmarks of the map when the layer was made; they identify the map
     landmark_ids: tuple[str, ...]
     landmark_centers: NDArray[np.float32]  #: (L, 3): their centres at that time [m]
-    camera: Camera  #: Camera of the undistorted images; the first of several cameras
+    cameras: tuple[Camera, ...]  #: Cameras of the undistorted images
     map_from_camera: NDArray[np.float64]  #: (K, 4, 4)
     #: (K + 1,): keyframe k has the points [offsets[k], offsets[k + 1])
     offsets: NDArray[np.int64]
@@ -74,7 +73,6 @@ class KeyframeLayer:
     images: NDArray[np.uint8] | None = None
     #: (K + 1,): keyframe k has the bytes [image_offsets[k], image_offsets[k + 1])
     image_offsets: NDArray[np.int64] | None = None
-    other_cameras: tuple[Camera, ...] = ()  #: Further cameras of a robot with several cameras
     #: (K,): camera of each keyframe, 0 for the first; None: the first camera took all keyframes
     camera_rows: NDArray[np.int64] | None = None
     kind: FeatureKind = SIFT  #: Kind of the descriptors
@@ -101,16 +99,15 @@ class KeyframeLayer:
 
     def camera_of(self, keyframe: int) -> Camera:
         """Return the camera that took a keyframe."""
-        row = 0 if self.camera_rows is None else int(self.camera_rows[keyframe])
-        return (self.camera, *self.other_cameras)[row]
+        return self.cameras[0 if self.camera_rows is None else int(self.camera_rows[keyframe])]
 
     def camera_note(self, camera: Camera) -> str:
         """Return a warning if a camera differs from all cameras of the keyframes; empty if not."""
-        theirs, own = np.array([camera.fx, camera.fy]) / camera.width, self.camera
-        for known in (own, *self.other_cameras):
-            ours = np.array([known.fx, known.fy]) / known.width
-            if np.abs(theirs / ours - 1.0).max() <= _SAME_FOCAL:
-                return ''
+        theirs, *ours = (np.array([each.fx, each.fy]) / each.width
+                         for each in (camera, *self.cameras))
+        own = self.cameras[0]
+        if np.abs(theirs / np.array(ours) - 1.0).max(axis=1).min() <= _SAME_FOCAL:
+            return ''
         return (f'the camera differs from that of the keyframes: fx {camera.fx:.1f} at width '
                 f'{camera.width} px, theirs {own.fx:.1f} at {own.width} px; check camera_info')
 
@@ -200,7 +197,7 @@ _SCHEMA = Schema('file of keyframes', {
     # missing if there is a single camera; the header contains the cameras
     'camera_rows': Field('int64', ('K',), is_optional=True),
 }, MapError, 'make the layer again with build_map --keyframe-layer, or remove the file',
-    {'K': 'keyframes', 'W': 'keyframes'}, is_stored=True)
+    {'K': 'keyframes', 'W': 'keyframes'})
 
 
 def layer_path(map_path: str | os.PathLike[str]) -> Path:
@@ -218,13 +215,11 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
 
     Raises MapError if the file cannot be written.
     """
+    first, *others = ({name: getattr(camera, name) for name in _CAMERA}
+                      for camera in layer.cameras)
     header = {'version': VERSION, 'descriptors': layer.kind.name, 'frame_id': layer.frame_id,
-              'deviation_per_metre': layer.deviation_per_metre,
-              'camera': _numbers_of(layer.camera)}
-    if layer.set_digest:
-        header['set'] = layer.set_digest
-    if layer.other_cameras:
-        header['other_cameras'] = list(map(_numbers_of, layer.other_cameras))
+              'deviation_per_metre': layer.deviation_per_metre, 'camera': first,
+              'other_cameras': others, 'set': layer.set_digest}
     names = [name for name in _SCHEMA.fields
              if name != 'header' and getattr(layer, name) is not None]
     arrays: dict[str, NDArray[Any]] = {'header': np.array(json.dumps(header))} | {
@@ -233,10 +228,6 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
         name: array.astype(np.str_) if _SCHEMA.fields[name].type == 'text'
         else array.astype(_SCHEMA.fields[name].type, copy=False)
         for name, array in arrays.items()})
-
-
-def _numbers_of(camera: Camera) -> dict[str, float]:
-    return {name: getattr(camera, name) for name in _CAMERA}
 
 
 def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds = ONLY_SIFT
@@ -278,24 +269,24 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
     if name not in kinds:
         raise ArrayError(f'has descriptors of kind {name!r}, expected {" or ".join(kinds)}')
     try:
-        camera, *others = (Camera(*(numbers[name] for name in _CAMERA))
-                           for numbers in (header['camera'], *header.get('other_cameras', ())))
+        cameras = tuple(Camera(*(numbers[name] for name in _CAMERA))
+                        for numbers in (header['camera'], *header.get('other_cameras', ())))
         deviation = float(header['deviation_per_metre'])
     except (CameraError, KeyError, TypeError, ValueError) as error:
         raise ArrayError(f'has no valid camera or deviation in its header ({error})') from error
     if not 0.0 <= deviation <= _MOST_DEVIATION:
         raise ArrayError(f'deviation_per_metre is {deviation}, expected 0 to {_MOST_DEVIATION}')
     rows = arrays.get('camera_rows', np.zeros(1, dtype=np.int64))
-    if not ((rows >= 0) & (rows <= len(others))).all():
-        raise ArrayError(f'array camera_rows has an entry outside the {1 + len(others)} cameras')
+    if not ((rows >= 0) & (rows < len(cameras))).all():
+        raise ArrayError(f'array camera_rows has an entry outside the {len(cameras)} cameras')
     kind, dimensions = kinds[name](), arrays['descriptors'].shape[1]
     if dimensions != kind.dimensions:
         raise ArrayError(f'has descriptors of {dimensions} dimensions, expected '
                          f'{kind.dimensions} for kind {name}')
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
-                         arrays.pop('landmark_centers'), camera, **arrays,
-                         deviation_per_metre=deviation, other_cameras=tuple(others), kind=kind,
+                         arrays.pop('landmark_centers'), cameras, **arrays,
+                         deviation_per_metre=deviation, kind=kind,
                          set_digest=str(header.get('set', '')))
 
 

@@ -8,15 +8,13 @@ look-alikes and confidence then treat places on different maps like distant plac
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from itertools import chain
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError
 
@@ -107,17 +105,11 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
             shift[1] = maps[0].centers[:, 1].min() - low[1]
         parts.append(MapPart(each, first, shift))
         first, begin = first + len(each), float(high[0] + shift[0]) + gap
-    details = [each.details or (LandmarkDetails(),) * len(each)
-               for each in maps] if any(each.details for each in maps) else []
-    return JoinedMap(
-        maps[0].frame_id,
-        tuple(f'{each.frame_id}/{name}' for each in maps for name in each.landmark_ids),
-        tuple(label for each in maps for label in each.labels),
-        tuple(name for each in maps for name in each.class_ids),
-        np.concatenate([part.landmark_map.centers + part.shift for part in parts]),
-        np.concatenate([each.semi_axes for each in maps]),
-        np.concatenate([each.quats_xyzw for each in maps]),
-        tuple(chain.from_iterable(details)), parts=tuple(parts))
+    whole = reduce(LandmarkMap.with_more, [
+        replace(each, centers=each.centers + shift, landmark_ids=tuple(
+            f'{each.frame_id}/{name}' for name in each.landmark_ids)) for each, _, shift in parts])
+    return JoinedMap(**{field.name: getattr(whole, field.name) for field in fields(LandmarkMap)},
+                     parts=tuple(parts))
 
 
 def parts_of(landmark_map: LandmarkMap) -> tuple[MapPart, ...]:

@@ -12,6 +12,7 @@ from cliploc_ros.errors import MapError
 
 #: Minimum share of a landmark's boxes for a class to yield candidates. Chosen.
 LEAST_CLASS_SHARE = 0.1
+_MAX_TEXT_LENGTH = 1000
 #: Labels that describe one landmark, with their weights.
 WeightedLabels = tuple[tuple[str, float], ...]
 
@@ -111,7 +112,7 @@ def read_details(tree: Mapping[str, Any], where: str) -> LandmarkDetails:
                 raise MapError(f'{here}: must map class names to weights, not {value!r}')
             values[name] = _weighted(list(value.items()), here)
         else:
-            values[name] = _text(value, here)
+            values[name] = checked_text(value, here)
     if 'support' in values:
         values['support'] = int(values['support'])
     return LandmarkDetails(**values)
@@ -131,15 +132,19 @@ def _label_rows(value: Any, where: str) -> list[tuple[Any, Any]]:
 def _weighted(rows: list[tuple[Any, Any]], where: str) -> tuple[tuple[str, float], ...]:
     if not rows:
         raise MapError(f'{where}: is empty; omit the field')
-    pairs = tuple((_text(text, where), _number(weight, where)) for text, weight in rows)
+    pairs = tuple((checked_text(text, where), _number(weight, where)) for text, weight in rows)
     if any(weight <= 0.0 for _, weight in pairs):
         raise MapError(f'{where}: weights must be above 0')
     return pairs
 
 
-def _text(value: Any, where: str) -> str:
+def checked_text(value: Any, where: str) -> str:
+    """Return a text; MapError: it is something else, empty, or too long."""
     if not isinstance(value, str) or not value.strip():
-        raise MapError(f'{where}: must be non-empty text, not {value!r}')
+        raise MapError(f'{where}: must be non-empty text (quote numbers and yes/no), '
+                       f'not {value!r}')
+    if len(value) > _MAX_TEXT_LENGTH:
+        raise MapError(f'{where}: longer than {_MAX_TEXT_LENGTH} characters')
     return value
 
 

@@ -27,6 +27,7 @@ from cliploc_ros.core.map.landmark_details import (
     OPTIONAL_FIELDS,
     LandmarkDetails,
     WeightedLabels,
+    checked_text,
     join_details,
     read_details,
 )
@@ -34,7 +35,6 @@ from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
 from cliploc_ros.core.map.parameter_file import (
     NO_SET,
     MapSet,
-    WrittenMap,
     parse_parameters,
     parse_written_map,
     read_text,
@@ -49,7 +49,6 @@ _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
 #: handmade maps. Landmarks of build_map have .012 (median, TUM fr3), simulated landmarks .005 to
 #: .04. On the TUM map, which has no position_sigma, 0 to .03 localize equally well.
 DEFAULT_SIGMA_M = 0.02
-_MAX_TEXT_LENGTH = 1000
 # Squares and fourth powers of lengths in this range neither underflow nor overflow.
 _SEMI_AXIS_RANGE_M = (1e-4, 1e4)
 _MAX_COORDINATE_M = 1e7
@@ -165,28 +164,6 @@ class ClassIndex:
                                 self.landmarks[self.starts[classes[detections]] + within]])
 
 
-def objects_of(centers: NDArray[np.float64], shapes: NDArray[np.float64],
-               neighbours: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the object number of each landmark (L,); duplicates share a number.
-
-    Landmarks of one class are duplicates if their centres are close relative to their sizes. Books
-    side by side are not duplicates.
-
-    Parameters
-    ----------
-    centers, shapes : ndarray (L, 3), (L, 6)
-        See cliploc_ros.core.geometry.ellipsoid.
-    neighbours : ndarray (p, 2) of int
-        Pairs of nearby landmarks of one class.
-    """
-    first, second = neighbours.T
-    inside = normalized_lengths(centers[second] - centers[first],
-                                (shapes[first] + shapes[second])[:, _UPPER]) < STANDS_IN
-    links = coo_matrix((np.ones(int(inside.sum())), (first[inside], second[inside])),
-                       (len(centers), len(centers)))
-    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
-
-
 @dataclass(frozen=True)
 class LandmarkMap:
     """L landmarks in one map frame. L is 0 for a map of keyframes alone."""
@@ -227,8 +204,8 @@ class LandmarkMap:
             self.frame_id, self.landmark_ids + other.landmark_ids, self.labels + other.labels,
             self.class_ids + other.class_ids, np.concatenate([self.centers, other.centers]),
             np.concatenate([self.semi_axes, other.semi_axes]),
-            np.concatenate([self.quats_xyzw, other.quats_xyzw]), details(self) + details(other),
-            map_set=self.map_set)
+            np.concatenate([self.quats_xyzw, other.quats_xyzw]),
+            details(self) + details(other) if self.details or other.details else (), self.map_set)
 
     def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
         """Return the map with the labels and classes of parts added to their whole landmarks.
@@ -305,7 +282,11 @@ class LandmarkMap:
 
     @cached_property
     def objects(self) -> NDArray[np.int64]:
-        """Return the object number of each landmark (L,); duplicates share a number."""
+        """Return the object number of each landmark (L,); duplicates share a number.
+
+        Landmarks of one class are duplicates if their centres are close relative to their sizes.
+        Books side by side are not duplicates.
+        """
         rows = np.arange(len(self))
         ranks = [*range(2, min(_COMPARED + 1, len(self)) + 1)]
         if not ranks:
@@ -313,8 +294,13 @@ class LandmarkMap:
         near = self._tree_of_classes.query(self._with_class(self.centers, rows), ranks,
                                            distance_upper_bound=_NEAR_M)[1]
         first, column = np.nonzero(near < len(self))
-        return objects_of(self.centers, self.shapes,
-                          np.column_stack([first, near[first, column]]))
+        second = near[first, column]
+        inside = normalized_lengths(
+            self.centers[second] - self.centers[first],
+            (self.shapes[first] + self.shapes[second])[:, _UPPER]) < STANDS_IN
+        links = coo_matrix((np.ones(int(inside.sum())), (first[inside], second[inside])),
+                           (len(self), len(self)))
+        return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
     @cached_property
     def _tree_of_classes(self) -> cKDTree:
@@ -362,10 +348,10 @@ class LandmarkMap:
         text = read_text(path)
         map_set = set_of(text)
         finish_set(Path(path), map_set.digest)
-        if (written := parse_written_map(text)) is not None and _is_valid(written):
-            return LandmarkMap(*written._replace(quats_xyzw=_unit(written.quats_xyzw)), map_set)
-        tree = parse_parameters(text, path)
-        found = tree[find_map_node(tree, path)]['ros__parameters']['map']
+        found: Any = parse_written_map(text)
+        if found is None:
+            tree = parse_parameters(text, path)
+            found = tree[find_map_node(tree, path)]['ros__parameters']['map']
         return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set)
 
     @staticmethod
@@ -385,7 +371,7 @@ class LandmarkMap:
             correct.
         """
         _check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map')
-        frame_id = _text(tree['frame_id'], f'{source}: map: frame_id')
+        frame_id = checked_text(tree['frame_id'], f'{source}: map: frame_id')
         landmarks = tree['landmarks']
         if not isinstance(landmarks, Mapping):
             raise MapError(f'{source}: map: landmarks: the map is empty; write {{}} for a map of '
@@ -416,20 +402,6 @@ def _unit(quats_xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(quats_xyzw / np.linalg.norm(quats_xyzw, axis=1, keepdims=True))
 
 
-def _is_valid(written: WrittenMap) -> bool:
-    """Check whether from_mapping would accept a map with finite numbers and unique ids."""
-    low, high = _SEMI_AXIS_RANGE_M
-    norms = np.linalg.norm(written.quats_xyzw, axis=1)
-    texts = ((written.frame_id,), written.labels, written.class_ids)
-    return bool(
-        ((written.semi_axes >= low) & (written.semi_axes <= high)).all()
-        and np.abs(written.centers).max() <= _MAX_COORDINATE_M
-        and np.abs(norms - 1.0).max() <= _MAX_QUATERNION_NORM_ERROR
-        and not any('.' in landmark_id for landmark_id in written.landmark_ids)
-        and all(len(text) <= _MAX_TEXT_LENGTH and not text.isspace() and text
-                for column in texts for text in set(column)))
-
-
 def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
     """Validate a landmark; return its fields in the order of _FIELDS, and its details."""
     where = f"{source}: landmark '{landmark_id}'"
@@ -452,8 +424,9 @@ def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
     if abs(math.hypot(*quat_xyzw) - 1.0) > _MAX_QUATERNION_NORM_ERROR:
         raise MapError(f'{where}: orientation: the quaternion {quat_xyzw} has norm '
                        f'{math.hypot(*quat_xyzw):.3g}, expected 1')
-    return (_text(label, f'{where}: label'), _text(fields['class_id'], f'{where}: class_id'),
-            center, semi_axes, quat_xyzw, details)
+    return (checked_text(label, f'{where}: label'),
+            checked_text(fields['class_id'], f'{where}: class_id'), center, semi_axes, quat_xyzw,
+            details)
 
 
 def _check_keys(tree: Any, expected: tuple[str, ...], where: str,
@@ -468,15 +441,6 @@ def _check_keys(tree: Any, expected: tuple[str, ...], where: str,
     missing = [key for key in expected if key not in tree]
     if missing:
         raise MapError(f'{where}: missing field: {", ".join(missing)}')
-
-
-def _text(value: Any, where: str) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise MapError(f'{where}: must be non-empty text (quote numbers and yes/no), '
-                       f'not {value!r}')
-    if len(value) > _MAX_TEXT_LENGTH:
-        raise MapError(f'{where}: longer than {_MAX_TEXT_LENGTH} characters')
-    return value
 
 
 def _numbers(value: Any, count: int, where: str) -> tuple[float, ...]:

@@ -118,10 +118,9 @@ def _detail_lines(details: LandmarkDetails) -> Iterator[str]:
         yield f'{_INDENT}class_weights:'
         for name, weight in details.class_weights:
             yield f'{_INDENT}  {quoted(name)}: {_weight(weight):.4f}'
-    if details.support is not None:
-        yield f'{_INDENT}support: {details.support}'
-    for name, digits in (('position_sigma', 4), ('shared_sigma', 4), ('shared_sigma_deg', 3),
-                         ('seen_ratio', 3), ('baseline_deg', 1), ('last_seen', 3)):
+    for name, digits in (('support', 0), ('position_sigma', 4), ('shared_sigma', 4),
+                         ('shared_sigma_deg', 3), ('seen_ratio', 3), ('baseline_deg', 1),
+                         ('last_seen', 3)):
         if (value := getattr(details, name)) is not None:
             yield f'{_INDENT}{name}: {value:.{digits}f}'
     if details.source is not None:

@@ -15,15 +15,11 @@ returns None. The parser then reads the file and reports errors.
 import json
 import os
 import re
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 
-from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import read_file
 
@@ -53,8 +49,6 @@ _HEAD = re.compile(
     r'      landmarks:\n')
 _SET = re.compile(r'(?:#.*\n)*?# set ([0-9a-f]{12}) ([0-9a-f]{12})\n')
 _INDENT = ' ' * 10
-# Number of groups of _LANDMARK before the details.
-_PLAIN = 6
 
 
 def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -164,21 +158,22 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
 
 
 def _row(count: int) -> str:
-    return rf'\[({_SIGNED}{rf", {_SIGNED}" * (count - 1)})\]'
+    return rf'\[{_SIGNED}{rf", {_SIGNED}" * (count - 1)}\]'
 
 
+# The landmark of write_map. The groups are JSON, except for class_weights, which is lines of it.
 _LANDMARK = re.compile(''.join([
-    rf'        ({_KEY}):\n', rf'{_INDENT}label: ({_TEXT})\n', rf'{_INDENT}class_id: ({_TEXT})\n',
-    rf'{_INDENT}center: {_row(3)}\n', rf'{_INDENT}semi_axes: {_row(3)}\n',
-    rf'{_INDENT}orientation: {_row(4)}\n',
-    rf'(?:{_INDENT}labels:\n{_INDENT}  text: \[({_TEXT}(?:, {_TEXT})*+)\]\n',
-    rf'{_INDENT}  weight: \[({_FLOAT}(?:, {_FLOAT})*+)\]\n)?+',
-    rf'(?:{_INDENT}class_weights:\n((?:{_INDENT}  {_KEY}: {_FLOAT}\n)++))?+',
-    rf'(?:{_INDENT}support: ((?:0|[1-9]\d{{0,14}}))\n)?+',
-    *(rf'(?:{_INDENT}{name}: ({_FLOAT})\n)?+'
-      for name in ('position_sigma', 'shared_sigma', 'shared_sigma_deg', 'seen_ratio',
-                   'baseline_deg', 'last_seen')),
-    rf'(?:{_INDENT}source: ({_TEXT})\n)?+']))
+    rf'        (?P<id>{_KEY}):\n', *(
+        rf'{_INDENT}{name}: (?P<{name}>{value})\n' for name, value in (
+            ('label', _TEXT), ('class_id', _TEXT), ('center', _row(3)), ('semi_axes', _row(3)),
+            ('orientation', _row(4)))),
+    rf'(?:{_INDENT}labels:\n{_INDENT}  text: (?P<text>\[{_TEXT}(?:, {_TEXT})*+\])\n',
+    rf'{_INDENT}  weight: (?P<weight>\[{_FLOAT}(?:, {_FLOAT})*+\])\n)?+',
+    rf'(?:{_INDENT}class_weights:\n(?P<class_weights>(?:{_INDENT}  {_KEY}: {_FLOAT}\n)++))?+', *(
+        rf'(?:{_INDENT}{name}: (?P<{name}>{value})\n)?+' for name, value in (
+            ('support', r'(?:0|[1-9]\d{0,14})'), ('position_sigma', _FLOAT),
+            ('shared_sigma', _FLOAT), ('shared_sigma_deg', _FLOAT), ('seen_ratio', _FLOAT),
+            ('baseline_deg', _FLOAT), ('last_seen', _FLOAT), ('source', _TEXT)))]))
 
 
 class MapSet(NamedTuple):
@@ -204,77 +199,22 @@ def set_of(text: str) -> MapSet:
     return MapSet(found[1], found[2]) if found else NO_SET
 
 
-class WrittenMap(NamedTuple):
-    """The fields of LandmarkMap in the same order, not yet validated."""
-
-    frame_id: str
-    landmark_ids: tuple[str, ...]
-    labels: tuple[str, ...]
-    class_ids: tuple[str, ...]
-    centers: NDArray[np.float64]
-    semi_axes: NDArray[np.float64]
-    quats_xyzw: NDArray[np.float64]
-    details: tuple[LandmarkDetails, ...]
-
-
-def parse_written_map(text: str) -> WrittenMap | None:
-    """Read a map from text in the layout of write_map; return None for any other layout.
-
-    The result has unique ids, finite numbers, and weights above 0.
-    """
+def parse_written_map(text: str) -> dict[str, Any] | None:
+    """Read the `map` of a text in the layout of write_map as parse_parameters does; else None."""
     head = _HEAD.match(text)
     if head is None:
         return None
-    rows, end = [], head.end()
+    landmarks, end = dict[str, Any](), head.end()
     while (found := _LANDMARK.match(text, end)) is not None:
-        rows.append(found.groups())
-        end = found.end()
-    if end != len(text) or not rows:
-        return None
-    columns = list(zip(*rows, strict=True))
-    ids, labels, class_ids = (tuple(_values(column)) for column in columns[:3])
-    details = _details(columns[_PLAIN:], len(rows))
-    if len(set(ids)) < len(ids) or details is None:
-        return None
-    centers, semi_axes, quats_xyzw = (
-        np.array(_values(column), dtype=np.float64).reshape(len(rows), -1)
-        for column in columns[3:_PLAIN])
-    return WrittenMap(json.loads(head[1]), ids, labels, class_ids, centers, semi_axes, quats_xyzw,
-                      details)
-
-
-def _values(texts: Iterable[str]) -> list[Any]:
-    """Return the values of JSON texts as one list."""
-    return list(json.loads(f'[{",".join(texts)}]'))
-
-
-def _details(columns: list[tuple[Any, ...]], count: int) -> tuple[LandmarkDetails, ...] | None:
-    """Return the optional fields of each landmark, () if there are none; None if invalid."""
-    if not any(map(any, columns)):
-        return ()
-    texts, weights, classes, *numbers, sources = columns
-    phrases, label_weights = _values(_lists(texts)), _values(_lists(weights))
-    shares = _values('null' if kind is None else f'{{{kind[:-1]}}}'.replace('\n', ',')
-                     for kind in classes)
-    names = _values(source or 'null' for source in sources)
-    if (any(phrase and len(phrase) != len(its)
-            for phrase, its in zip(phrases, label_weights, strict=True))
-            # a repeated class
-            or any(kind and len(its) < kind.count('\n')
-                   for kind, its in zip(classes, shares, strict=True))):
-        return None
-    labels, likely = ([pairs and tuple(pairs) for pairs in column] for column in (
-        [phrase and zip(phrase, its, strict=True)
-         for phrase, its in zip(phrases, label_weights, strict=True)],
-        [share and share.items() for share in shares]))
-    if not (all(text.strip() and weight > 0.0 for column in (labels, likely)
-                for pairs in column if pairs for text, weight in pairs)
-            and all(name is None or name.strip() for name in names)):
-        return None
-    support, *others = ([None if number is None else kind(number) for number in column]
-                        for kind, column in zip((int, *[float] * 6), numbers, strict=True))
-    return tuple(map(LandmarkDetails, labels, likely, *others[:3], support, *others[3:], names))
-
-
-def _lists(texts: Iterable[str | None]) -> Iterable[str]:
-    return ('null' if text is None else f'[{text}]' for text in texts)
+        end, values = found.end(), found.groupdict()
+        shares = values['class_weights'] or ''
+        values['class_weights'] = shares and f'{{{shares[:-1]}}}'.replace('\n', ',')
+        fields = json.loads('{' + ','.join(f'"{name}":{value}' for name, value in values.items()
+                                           if value) + '}')
+        landmark_id = fields.pop('id')
+        if landmark_id in landmarks or len(fields.get('class_weights', ())) < shares.count('\n'):
+            return None  # a repeated key
+        if 'text' in fields:
+            fields['labels'] = {name: fields.pop(name) for name in ('text', 'weight')}
+        landmarks[landmark_id] = fields
+    return {'frame_id': json.loads(head[1]), 'landmarks': landmarks} if end == len(text) else None

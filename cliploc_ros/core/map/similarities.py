@@ -98,8 +98,9 @@ class CropSimilarities:
     @cached_property
     def spread(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return mean and standard deviation (n,) of each crop, see sampled_spread."""
-        step = _sample_step(self)
-        return _spread(self.crops @ self.labels.unique[self.labels.of_landmarks[::step]].T)
+        sample = self.labels.of_landmarks[::-(-self.shape[1] // _LABELS_SAMPLED)]
+        alike = self.crops @ self.labels.unique[sample].T
+        return alike.mean(axis=1), alike.std(axis=1)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return the similarities (n, L)."""
@@ -148,11 +149,7 @@ def nearest_landmarks(similarities: Similarities, k: int
     found, values = _nearest_columns(((start, crops @ labels.unique[start:start + _BLOCK].T)
                                       for start in range(0, len(labels.unique), _BLOCK)),
                                      len(crops), min(k, len(labels.unique)))
-    if len(labels.unique) < len(labels.of_landmarks):
-        return _expanded(labels, found, values, k)
-    landmarks = labels.landmarks[found]
-    order = np.lexsort((landmarks, -values), axis=1)[:, :k]  # ties in the order of landmarks
-    return np.take_along_axis(landmarks, order, axis=1), np.take_along_axis(values, order, axis=1)
+    return _expanded(labels, found, values, k)
 
 
 def _nearest_columns(blocks: Iterator[tuple[int, NDArray[np.float32]]], count: int, k: int
@@ -237,12 +234,5 @@ def sampled_spread(similarities: Similarities, crops: NDArray[np.int64]
     if isinstance(similarities, CropSimilarities):
         means, deviations = similarities.spread
         return means[crops], deviations[crops]
-    return _spread(similarities[crops, ::_sample_step(similarities)])
-
-
-def _sample_step(similarities: Similarities) -> int:
-    return -(-similarities.shape[1] // _LABELS_SAMPLED)
-
-
-def _spread(sample: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return sample.mean(axis=1), sample.std(axis=1)
+    alike = similarities[crops, ::-(-similarities.shape[1] // _LABELS_SAMPLED)]
+    return alike.mean(axis=1), alike.std(axis=1)

@@ -104,21 +104,12 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int |
     return Candidates(pairs[:, 0], pairs[:, 1], zeros.astype(np.int64), zeros)
 
 
-def check_k(k: int, landmark_count: int) -> None:
-    """Raise OptionsError if k exceeds the number of landmarks, unless the map has none."""
-    if landmark_count and not 1 <= k <= landmark_count:
-        raise OptionsError(f'k = {k}, but the map has {landmark_count} landmarks: '
-                           f'set k to {landmark_count} or less')
-
-
 def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
 
-    Raises OptionsError if the map has fewer than k landmarks.
+    The map has at least k landmarks.
     """
-    detection_count, landmark_count = similarities.shape
-    check_k(k, landmark_count)
-    k = min(k, landmark_count)
+    detection_count, _ = similarities.shape
     landmarks, values = nearest_landmarks(similarities, k)
     return Candidates(np.repeat(np.arange(detection_count), k), landmarks.ravel(),
                       np.tile(np.arange(k), detection_count), values.ravel().astype(np.float64))

@@ -71,37 +71,29 @@ def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
     return 1 + np.concatenate([[0], np.cumsum(steps)])
 
 
-def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
-                ) -> NDArray[np.int64]:
+def draw_ransac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator,
+                growth: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
     """Draw samples (iterations, 3) of candidates uniformly; rows of -1 are skipped.
 
     Parameters
     ----------
     pairs : ndarray (c, 2)
         Detection and landmark of each candidate.
+    growth : ndarray (c - 2,), optional
+        See prosac_growth; by default, all candidates are sampled from the first iteration on.
     """
     samples = np.full((iterations, SAMPLE_SIZE), -1, dtype=np.int64)
     if len(pairs) >= SAMPLE_SIZE:
-        # sample from all candidates from the first iteration on
-        growth = np.zeros(len(pairs) - SAMPLE_SIZE + 1, dtype=np.int64)
-        _draw(np.ascontiguousarray(pairs), growth, rng, samples)
+        _draw(np.ascontiguousarray(pairs), np.zeros(len(pairs) - SAMPLE_SIZE + 1, dtype=np.int64)
+              if growth is None else growth, rng, samples)
     return samples
 
 
 def draw_prosac(pairs: NDArray[np.int64], iterations: int, rng: np.random.Generator
                 ) -> NDArray[np.int64]:
-    """Draw samples (iterations, 3) in the order of PROSAC; rows of -1 are skipped.
-
-    Parameters
-    ----------
-    pairs : ndarray (c, 2)
-        Detection and landmark of each candidate, in order of preference.
-    """
-    samples = np.full((iterations, SAMPLE_SIZE), -1, dtype=np.int64)
-    if len(pairs) >= SAMPLE_SIZE:
-        growth = prosac_growth(len(pairs), iterations)
-        _draw(np.ascontiguousarray(pairs), growth, rng, samples)
-    return samples
+    """Draw samples in the order of PROSAC, of candidates in order of preference: draw_ransac."""
+    return draw_ransac(pairs, iterations, rng, prosac_growth(max(SAMPLE_SIZE, len(pairs)),
+                                                             iterations))
 
 
 @compiled

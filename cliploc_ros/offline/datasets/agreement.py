@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.transforms import (
     rotation_angle_deg,
     transform_from_pose,
 )
-from cliploc_ros.core.keyframes.features import extract, match, unit_rows
+from cliploc_ros.core.keyframes.features import SIFT, extract
 from cliploc_ros.errors import DatasetError
 
 _Pose = NDArray[np.float64]
@@ -159,8 +159,8 @@ def _match(pair: tuple[View, View], upright: bool
     """Match two images; return their cameras, and the matched pixels (n, 2) of each."""
     looks = [view.look(upright) for view in pair]
     features = [extract(image, _FEATURES, _LONGEST_PX) for image, _ in looks]
-    ours, theirs = (unit_rows(feature.descriptors) for feature in features)
-    rows, _ = match(ours, theirs)
+    ours, theirs = (SIFT.units(feature.descriptors) for feature in features)
+    rows, _ = SIFT.match(ours, theirs)
     return ([camera for _, camera in looks],
             [feature.pixels[rows[:, side]] for side, feature in enumerate(features)])
 

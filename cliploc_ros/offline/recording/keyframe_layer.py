@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.depth_image import DepthImage, points_in_color
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.keyframes.features import SIFT, FeatureKind
+from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
 from cliploc_ros.core.keyframes.layer import (
     FROM_DEPTH,
     PIXEL_SCALE,
@@ -205,11 +205,11 @@ def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
     pixels = np.concatenate([
         image.bearings[rows] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         for image, rows, camera in zip(images, kept, cameras, strict=True)])
-    camera, *others = dict.fromkeys(cameras)
+    different = tuple(dict.fromkeys(cameras))
     vocabulary = learn_words(descriptors, kind)
     return KeyframeLayer(
         landmark_map.frame_id, landmark_map.landmark_ids,
-        landmark_map.centers.astype(np.float32), camera,
+        landmark_map.centers.astype(np.float32), different,
         np.array([image.map_from_camera for image in images]),
         np.cumsum([0, *map(len, kept)]),
         np.clip(np.round(pixels * PIXEL_SCALE), 0, 65535).astype(np.uint16),
@@ -217,8 +217,8 @@ def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
                        ).astype(np.float32),
         descriptors, nearest_words(kind.units(descriptors), kind.units(vocabulary)
                                    ).astype(np.uint16), vocabulary, deviation_per_metre,
-        other_cameras=tuple(others), camera_rows=None if not others else np.array(
-            [[camera, *others].index(own) for own in cameras]), kind=kind)
+        camera_rows=None if len(different) == 1 else np.array(
+            [different.index(own) for own in cameras]), kind=kind)
 
 
 def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = SIFT
@@ -336,4 +336,4 @@ def learn_words(descriptors: NDArray[np.uint8], kind: FeatureKind = SIFT) -> NDA
         found, starts = np.unique(words[order], return_index=True)
         sums = np.add.reduceat(learned[order], starts, axis=0)
         means[found] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
-    return kind.compact(means)
+    return compact(means, kind.zero, kind.scale)
