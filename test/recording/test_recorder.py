@@ -69,7 +69,7 @@ def recorded(walk):
     assert done.returncode == 0, done.stderr
     assert 'no pose: 1 of 16' in done.stdout
     file, = walk.parent.glob('tum.cliploc-*.npz')
-    assert not list(walk.parent.glob('.*.unfinished'))
+    assert len(list(walk.parent.glob('.tum.cliploc-*.outputs'))) == 1
     return file
 
 
@@ -117,10 +117,9 @@ def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen):
     options = RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx'), device='cpu'), None)
     with pytest.raises(DatasetError, match='ends here'):
         record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
-    left = tmp_path / '.seen.npz.unfinished'
-    assert left.exists() == bool(seen)
-    assert (str(left) in caplog.text) == bool(seen)
-    assert len(list(tmp_path.iterdir())) == bool(seen)
+    left = list(tmp_path.iterdir())
+    assert len(left) == bool(seen)
+    assert all(str(path) in caplog.text for path in left)
 
 
 @pytest.mark.full
@@ -130,28 +129,29 @@ def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
                         tmp_path / 'map.yaml')
     process = subprocess.Popen([sys.executable, '-m', 'cliploc_ros.cli.build_map', *command],
                                cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    journal = tmp_path / '.resumed.npz.unfinished'
     deadline = time.monotonic() + TIMEOUT_S
-    while not (journal.exists() and journal.stat().st_size > 15_000):
+    while not any(path.stat().st_size > 15_000 for path in tmp_path.glob('.*.outputs')):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.005)
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not file.exists()
-    with journal.open('ab') as damaged:
-        damaged.write(b'{"run": 1}\n{"other": 1}\n[]\n\x00\x10')
+    outputs, = tmp_path.glob('.*.outputs')
+    with outputs.open('ab') as damaged:
+        damaged.write(b'{"run": 1}\n"other"\n[]\n\x00\x10')
     assert main(command) == 0
     assert_equal(load_recorded(file), load_recorded(recorded))
-    assert not journal.exists()
 
 
-def test_other_options_record_again_and_depth_is_stored(walk, recorded, tmp_path, capsys):
+def test_other_options_use_the_boxes_again_and_depth_is_stored(walk, tmp_path, caplog):
     file = tmp_path / 'depth.npz'
     command = ('--rgbd', walk, *NETWORKS, '--no-clip', *ALL, '--record-to', file, '--out',
                tmp_path / 'map.yaml')
     assert main(arguments(*command, '--depth-unit', '1')) == 1
+    outputs, = tmp_path.glob('.*.outputs')
     code = main(arguments(*command, '--keyframes', '1', '180'))
     assert code in (0, 1)  # few keyframes may give no map
+    assert f'boxes of 1 images of earlier runs: {outputs}' in caplog.text
     content = load_recorded(file).detections
     assert 2 <= len(content) < 15
     assert content.embeddings is None

@@ -40,6 +40,7 @@ class SeenFrame:
     map_from_camera: NDArray[np.float64]  #: (4, 4)
     #: (6,): width, height, fx, fy, cx, cy of the undistorted image [px]
     camera_numbers: NDArray[np.float64]
+    bboxes_in_image: NDArray[np.float64]  #: (n, 4): in the image as it is, distorted [px]
     bboxes_xyxy: NDArray[np.float64]  #: (n, 4): undistorted [px]
     open_edges: NDArray[np.bool_]  #: (n, 4): see PosedDetections
     is_distorted: bool  #: Whether open edges cannot be computed from the undistorted boxes
@@ -137,8 +138,8 @@ class RunNetworks:
             depths, spreads = depths_of_boxes(frame.depth, camera, sound.bboxes_xyxy)
         return SeenFrame(
             raw.place, raw.camera, raw.stamp_ns, frame.map_from_camera,
-            np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), bboxes[rows],
-            open_edges[rows], not camera.is_pinhole,
+            np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), sound.bboxes_xyxy,
+            bboxes[rows], open_edges[rows], not camera.is_pinhole,
             np.array(sound.class_ids, dtype=np.str_), sound.scores,
             embeddings.astype(np.float16), depths, spreads,
             (detected - start) * 1e3, (embedded - detected) * 1e3)
