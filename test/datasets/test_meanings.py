@@ -20,7 +20,7 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.messages import image_from_msg
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
-from cliploc_ros.offline.datasets.bag_poses import find_poses, poses_of_tf, poses_of_topic
+from cliploc_ros.offline.datasets.bag_poses import PoseSource
 from cliploc_ros.offline.datasets.bags import BagWriter, typestore
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
@@ -92,7 +92,7 @@ def write_bag(path, room, *, frame='camera', pose=lambda pose: pose, info=lambda
 
 
 def reads(bag, topics=None, poses=None, depth=None):
-    return bag_frames(bag, topics or BagTopics(), poses or find_poses(0), depth)
+    return bag_frames(bag, topics or BagTopics(), poses or PoseSource(), depth)
 
 
 def refuses(expected, bag, *more):
@@ -473,8 +473,8 @@ def test_tf_under_the_name_of_a_robot_and_a_way_out_of_bad_drivers(room, tmp_pat
     second = [(at, '/robot2/tf', TF, message) for at, _, _, message in moving]
     bag = write_bag(tmp_path / 'two', room, more=[*moving, *second], poses=False)
     refuses('several robots: /robot1/tf, /robot2/tf; give `tf`', bag, None,
-            poses_of_tf('map', None, 0))
-    frames = reads(bag, None, poses_of_tf('map', None, 0, '/robot2/tf'))
+            PoseSource(map_frame='map'))
+    frames = reads(bag, None, PoseSource(map_frame='map', tf='/robot2/tf'))
     assert next(frames.read()).map_from_camera is not None
     # no calibration: use a file instead
     bag = write_bag(tmp_path / 'zero', room, info=lambda message: replace(
@@ -489,7 +489,7 @@ def test_tf_under_the_name_of_a_robot_and_a_way_out_of_bad_drivers(room, tmp_pat
              for at, _, pose, _ in room[:3]]
     bag = write_bag(tmp_path / 'apart', room[:3], more=apart)
     for tolerance_ns, known in ((20 * MS, False), (100 * MS, True)):
-        frame = next(reads(bag, None, poses_of_topic('/late', 0, None, tolerance_ns)).read())
+        frame = next(reads(bag, None, PoseSource('/late', tolerance_ns=tolerance_ns)).read())
         assert (frame.map_from_camera is not None) == known
 
 

@@ -20,12 +20,7 @@ from cliploc_ros.offline.datasets.bag_frames import (
     bag_frames,
     find_topics,
 )
-from cliploc_ros.offline.datasets.bag_poses import (
-    bag_odometry,
-    find_poses,
-    poses_of_tf,
-    poses_of_topic,
-)
+from cliploc_ros.offline.datasets.bag_poses import PoseSource, bag_odometry
 from cliploc_ros.offline.datasets.bags import BagWriter, typestore
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
@@ -110,9 +105,9 @@ def positions(frames):
 def test_poses_are_interpolated_within_a_gap(tmp_path):
     bag = write_bag(tmp_path / 'bag', [250, 500, 710, 950],
                     drive([0, 200, 300, 600, 1000]))
-    frames = bag_frames(bag, BagTopics(), poses_of_topic('/pose', 300 * MS))
+    frames = bag_frames(bag, BagTopics(), PoseSource('/pose', topic_gap_ns=300 * MS))
     assert positions(frames) == [0.25, 0.5, None, None]
-    assert positions(bag_frames(bag, BagTopics(), poses_of_topic('/pose'))) == [None] * 4
+    assert positions(bag_frames(bag, BagTopics(), PoseSource('/pose'))) == [None] * 4
     assert frames.count == 4
     raw = list(frames.read_raw(lambda place, stamp, pose: pose is not None and place > 0))
     assert [frame.place for frame in raw] == [1]
@@ -139,7 +134,7 @@ def test_what_contradicts_itself_in_a_recording(tmp_path, camera, frame_id, topi
             bag.write(name, START, message)
 
     def read():
-        frames = bag_frames(tmp_path / 'bag', BagTopics(topic, '/info'), poses_of_topic('/pose'))
+        frames = bag_frames(tmp_path / 'bag', BagTopics(topic, '/info'), PoseSource('/pose'))
         return list(frames.read()), frames.notes
     if error is not None:
         with pytest.raises(DatasetError, match=error):
@@ -157,8 +152,8 @@ def test_the_only_topics_and_poses_are_found(tmp_path):
             data=np.zeros(1, np.uint8))),
         (450, '/depth/image', bag_messages.IMAGE, depth_message(START, np.ones((2, 2))))])
     assert find_topics(bag, None, None) == ('/image', '/camera_info')
-    frame, = bag_frames(bag, BagTopics(), find_poses(1000 * MS)).read()
-    expected, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 1000 * MS)).read()
+    frame, = bag_frames(bag, BagTopics(), PoseSource(max_gap_ns=1000 * MS)).read()
+    expected, = bag_frames(bag, BagTopics(), of_tf('map', 1000)).read()
     np.testing.assert_array_equal(frame.map_from_camera, expected.map_from_camera)
 
 
@@ -178,15 +173,16 @@ def test_odometry_and_covariance_with_a_mount(tmp_path):
                   covariance=zeros), twist=twist)) for t in (0, 100)]
     bag = write_bag(tmp_path / 'bag', [50], [*with_covariance, *odometry])
     mount = mount_from_numbers([0.3, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
-    frame, = bag_frames(bag, BagTopics(), poses_of_topic('/amcl_pose', 200 * MS, mount)).read()
+    frame, = bag_frames(bag, BagTopics(), PoseSource(
+        '/amcl_pose', topic_gap_ns=200 * MS, body_from_camera=mount)).read()
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.05, 0.3, 0.5], atol=1e-9)
     # they are poses of 'base', as child_frame_id states
     with pytest.raises(DatasetError, match=r"of 'base' .*`mount`"):
-        bag_frames(bag, BagTopics(), poses_of_topic('/odom', 200 * MS))
+        bag_frames(bag, BagTopics(), PoseSource('/odom', topic_gap_ns=200 * MS))
     known = write_bag(tmp_path / 'with_tf', [50], [*odometry, (
         0, '/tf_static', TF, make(TF, transforms=[transform_message(
             START, 'base', 'camera', pose_at(0.2))]))])
-    frame, = bag_frames(known, BagTopics(), poses_of_topic('/odom', 200 * MS)).read()
+    frame, = bag_frames(known, BagTopics(), PoseSource('/odom', topic_gap_ns=200 * MS)).read()
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.3, 0.0, 0.0], atol=1e-9)
 
 
@@ -203,28 +199,32 @@ def tf_messages(*, static=True, parent='odom'):
     return moving
 
 
+def of_tf(map_frame, max_gap_ms, camera_frame=None):
+    return PoseSource(map_frame=map_frame, camera_frame=camera_frame, max_gap_ns=max_gap_ms * MS)
+
+
 def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
     bag = write_bag(tmp_path / 'bag', [450], tf_messages())
-    frame, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 1000 * MS)).read()
+    frame, = bag_frames(bag, BagTopics(), of_tf('map', 1000)).read()
     expected = pose_at(0.0, 90.0 * 0.45) @ pose_at(0.45) @ pose_at(0.2)
     np.testing.assert_allclose(frame.map_from_camera, expected, atol=1e-9)
     # the corrections are too infrequent for a smaller gap
-    frame, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 500 * MS)).read()
+    frame, = bag_frames(bag, BagTopics(), of_tf('map', 500)).read()
     assert frame.map_from_camera is None
     # a map that is a leaf of the tree
-    frame, = bag_frames(bag, BagTopics(), poses_of_tf('base', None, 0)).read()
+    frame, = bag_frames(bag, BagTopics(), of_tf('base', 0)).read()
     np.testing.assert_allclose(frame.map_from_camera, pose_at(0.2), atol=1e-9)
 
 
 def test_odometry_is_read_from_tf(tmp_path):
     bag = write_bag(tmp_path / 'bag', [450], tf_messages())
-    odometry = bag_odometry(bag, '/image', poses_of_tf('odom', None, 200 * MS))
+    odometry = bag_odometry(bag, '/image', of_tf('odom', 200))
     # map -> odom changes, and is not included
     np.testing.assert_allclose(odometry.pose_at(START + 450 * MS), pose_at(0.65), atol=1e-9)
     assert odometry.pose_at(START + 1200 * MS) is None
     other = write_bag(tmp_path / 'other', [0, 900], drive(offset_ns=-1_699_999_000 * 10**9))
     with pytest.raises(DatasetError, match='different clocks'):
-        bag_odometry(other, '/image', poses_of_topic('/pose'))
+        bag_odometry(other, '/image', PoseSource('/pose'))
 
 
 @pytest.mark.parametrize(('messages', 'frames', 'expected'), [
@@ -239,7 +239,7 @@ def test_odometry_is_read_from_tf(tmp_path):
 def test_tf_that_does_not_serve(tmp_path, messages, frames, expected):
     bag = write_bag(tmp_path / 'bag', [450], messages)
     with pytest.raises(DatasetError, match=expected):
-        bag_frames(bag, BagTopics(), poses_of_tf(*frames, 1000 * MS))
+        bag_frames(bag, BagTopics(), of_tf(frames[0], 1000, frames[1]))
 
 
 def test_depth_is_paired_with_the_nearest_image(tmp_path):
@@ -247,7 +247,7 @@ def test_depth_is_paired_with_the_nearest_image(tmp_path):
         START + t * MS, np.full((48, 64), value, dtype=np.uint16)))
         for t, value in ((0, 1000), (95, 2000), (130, 3000), (400, 0))]
     bag = write_bag(tmp_path / 'bag', [0, 100, 300, 400], [*drive(), *depths])
-    frames = bag_frames(bag, BagTopics(depth='/depth'), poses_of_topic('/pose', 200 * MS))
+    frames = bag_frames(bag, BagTopics(depth='/depth'), PoseSource('/pose', topic_gap_ns=200 * MS))
     shown = [None if frame.depth is None else frame.depth.depths_m[0, 0]
              for frame in frames.read()]
     assert shown[:3] == [pytest.approx(1.0), pytest.approx(2.0), None]
@@ -269,7 +269,7 @@ def test_compressed_depth(tmp_path):
         *drive(), (1, '/depth', COMPRESSED, compressed_depth(START, '16UC1', counts)),
         (101, '/depth', COMPRESSED, compressed_depth(START + 100 * MS, '32FC1', inverse, a, b)),
         (201, '/depth', COMPRESSED, cut)])
-    frames = bag_frames(bag, BagTopics(depth='/depth'), poses_of_topic('/pose')).read()
+    frames = bag_frames(bag, BagTopics(depth='/depth'), PoseSource('/pose')).read()
     np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 0.7], [1.5, np.nan]],
                                rtol=1e-6)
     np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 1.5], [4.0, 9.0]],

@@ -24,6 +24,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import MappingError, ModelError
+from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
@@ -31,6 +32,7 @@ from cliploc_ros.offline.mapping.make_map import find_labeller, make_map, update
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.pose_noise import _sample
 from cliploc_ros.offline.mapping.views import make_views, number_viewpoints, thin_out
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
 AWAY_M = np.array([12.0, 0.0, 0.0])
 
@@ -194,13 +196,17 @@ def test_a_long_recording_gives_one_landmark_for_each_object():
 def test_a_map_is_made_written_and_updated(tmp_path):
     table, file = make_table(), tmp_path / 'map.yaml'
     detections = see(table, walk_around())
-    stages = []
-    made = make_map(detections, find_labeller(detections, None),
+    stages, labeller = [], find_labeller(detections, None)
+    made = make_map(detections, labeller,
                     progress=lambda stage, share: stages.append(stage))
     write_map(file, made.landmark_map, made.report.lines()[:1], made.embeddings)
     assert nearest_errors(LandmarkMap.from_file(file), table).max() < 0.003
     assert made.layer is None and stages[-1] == 'done'
-    labeller = find_labeller(detections, None)
+    blind = Frames(tmp_path / 'walk', 0, lambda wanted: iter(()))
+    assert 'of 0 images, none' in make_map(detections, labeller, None, blind, LayerOptions()).note
+    with pytest.raises(MappingError, match='no detections'):
+        make_map(detections.select_boxes(np.zeros(len(detections.classes), bool)), labeller, None,
+                 blind, LayerOptions())
     again = update_map(file, detections, labeller, MappingOptions())
     assert again.landmark_map.landmark_ids == made.landmark_map.landmark_ids
     assert not again.report.new

@@ -21,12 +21,7 @@ from cliploc_ros.core.geometry.camera_faults import check_faults
 from cliploc_ros.errors import CameraError, CliplocError, DatasetError
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_agreement
-from cliploc_ros.offline.datasets.bag_poses import (
-    ReadPoses,
-    plain_name,
-    poses_of_images,
-    poses_of_tf,
-)
+from cliploc_ros.offline.datasets.bag_poses import PoseSource, plain_name, poses_of_images
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.offline.datasets.intrinsics import find_camera
@@ -70,7 +65,7 @@ class BagTopics:
     intrinsics: str | None = None  #: The camera to use instead of camera_info, see find_camera
     #: Greatest difference between the stamps of a colour image and its depth image [ns]
     tolerance_ns: int = STAMP_TOLERANCE_NS
-    tf: str | None = None  #: Topic of the tf from depth to image, see poses_of_tf
+    tf: str | None = None  #: Topic of the tf from depth to image, see PoseSource
 
     def of_camera(self, name: str) -> 'BagTopics':
         """Return the topics of a camera of a rig; an empty name changes nothing."""
@@ -113,7 +108,7 @@ def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[
             beside if beside in infos else only(infos, 'camera_info', 'camera_info'))
 
 
-def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
+def bag_frames(bag: Path, topics: BagTopics, source: PoseSource,
                depth: DepthFormat | None = None) -> Frames:
     """Return the frames of a recording, a rosbag2 folder or file.
 
@@ -124,7 +119,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
     form = depth or DepthFormat()
     with BagReader(bag) as reader:
         _check_topics(reader, topics)
-        poses = poses_of_images(reader, topics.image, read_poses, str(bag))
+        poses = poses_of_images(reader, topics.image, source, str(bag))
         cameras = _Cameras.read(reader, topics)
         count, notes = reader.topic(topics.image).message_count, _notes(reader, topics)
         if topics.depth:
@@ -242,8 +237,9 @@ def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat
         try:
             if not _is_calibrated(info, rectified=False):
                 raise DatasetError(f'{beside} has no calibration')
-            chain = poses_of_tf(image, depth, 10 * NS_PER_S, topics.tf)(reader, depth)
-            pose = chain.pose_at(bag_messages.stamp_ns(reader.first(topics.depth)))
+            poses = PoseSource(map_frame=image, tf=topics.tf, max_gap_ns=10 * NS_PER_S).read(
+                reader, depth)
+            pose = poses.pose_at(bag_messages.stamp_ns(reader.first(topics.depth)))
             if pose is not None:
                 return replace(form, camera=DepthCamera(fx, fy, cx, cy, pose))
             problem = 'tf between them does not cover the first depth image'

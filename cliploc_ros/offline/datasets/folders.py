@@ -28,7 +28,7 @@ from cliploc_ros.offline.datasets.intrinsics import find_camera, read_camera
 from cliploc_ros.offline.datasets.parsing import naming, parse_all, read_lines
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_tum
-from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
+from cliploc_ros.offline.mapping.tilt import find_levelling, tilt_note
 from cliploc_ros.units import NS_PER_S
 
 # Depth and colour of 7-Scenes are not registered, and its authors give no intrinsics for colour.
@@ -160,11 +160,10 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
     files = placing.place_images(capture.files, axes, scale or 1.0, turn)
     poses = np.array([file.pose for file in files if file.pose is not None]).reshape(-1, 4, 4)
     if options.level:
-        found = find_tilt(poses)
-        if found is None:
-            raise DatasetError(f'{folder}: {NO_VERTICAL}')
-        files = placing.place_images(capture.files, axes, scale or 1.0, found[0] @ turn)
-        notes.append(f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z')
+        with naming(folder, DatasetError):
+            rotation, note = find_levelling(poses, True)
+        files = placing.place_images(capture.files, axes, scale or 1.0, rotation @ turn)
+        notes.append(note)
     elif not capture.up:
         notes.append(tilt_note(poses))
     form = replace(capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,

@@ -28,7 +28,7 @@ from cliploc_ros.offline.datasets.map_recording import (
     recording_path,
     save_recording,
 )
-from cliploc_ros.offline.mapping.building import MappingReport, build_map
+from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map
 from cliploc_ros.offline.mapping.labelling import embed_landmarks, label_landmarks
 from cliploc_ros.offline.mapping.landmarks import classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
@@ -54,6 +54,7 @@ class MadeMap:
     embeddings: LandmarkEmbeddings | None = None  #: Embeddings of the crops of each landmark
     layer: KeyframeLayer | None = None
     mount: MountCorrection | None = None  #: Correction of the mount, if requested
+    note: str = ''  #: The reason why the requested layer is missing
     removed: LandmarkMap | None = None  #: Landmarks that updates removed from the map
 
 
@@ -147,9 +148,11 @@ def _has_embeddings(detections: PosedDetections) -> bool:
 
 def make_map(detections: PosedDetections, labeller: Labeller,
              options: MappingOptions | None = None, frames: Frames | None = None,
-             layer: LayerOptions | None = None,
-             progress: Callable[[str, float], None] | None = None) -> MadeMap:
+             layer: LayerOptions | None = None, progress: Progress | None = None) -> MadeMap:
     """Make a map from a recording.
+
+    If no landmark is found, keyframes alone make a map. If the images give no keyframes,
+    landmarks alone do, and the map has a note.
 
     Parameters
     ----------
@@ -170,11 +173,23 @@ def make_map(detections: PosedDetections, labeller: Labeller,
     CliplocError
         The input does not allow a map; the message says what to correct.
     """
-    built = build_map(detections, options, progress)
-    landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
-    return MadeMap(landmark_map, built.report, embeddings,
-                   None if frames is None or layer is None
-                   else build_layer(frames, landmark_map, layer), built.mount)
+    options, failure = options or MappingOptions(), None
+    try:
+        built = build_map(detections, options, progress)
+        landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
+        made = MadeMap(landmark_map, built.report, embeddings, mount=built.mount)
+    except MappingError as error:
+        failure = error
+        made = MadeMap(LandmarkMap.empty(options.frame_id),
+                       MappingReport.of_nothing(detections, error))
+    try:
+        if frames is not None and layer is not None:
+            return replace(made, layer=build_layer(frames, made.landmark_map, layer))
+    except MappingError as error:
+        made = replace(made, note=f'no keyframes: {error}')
+    if failure is not None:
+        raise failure
+    return made
 
 
 def scale_of_objects(detections: PosedDetections, options: MappingOptions, class_name: str,

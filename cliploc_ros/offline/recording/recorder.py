@@ -3,9 +3,9 @@
 """Record observations once, in an observation file next to the recording.
 
 The file is named after a hash of all that determines its content: source, networks, keyframes.
-The outputs of the networks are also kept next to it, in a file that is named after a hash of images
-and networks. A run takes them from there, whatever the poses, keyframes and depth are, and also
-after an interrupted run.
+The outputs of the networks are also kept next to it, in a file named after a hash of images and
+networks. A run takes them from there, whatever the poses, keyframes and depth are, and also after
+an interrupted run.
 """
 
 import base64
