@@ -169,8 +169,13 @@ class _Cameras(NamedTuple):
             content = message.data[:4] + message.data[12:]  # all but the stamp
             infos.setdefault(content, message.data)
             found.append((stamp_ns, message.stamp_ns, content))
-        sound = {content: data for content, data in infos.items()
-                 if _says_calibration(data, topics.rectified)} or dict([*infos.items()][:1])
+        sound = {}
+        for content, data in infos.items():
+            with suppress(DatasetError):
+                if _is_calibrated(deserialize(data, bag_messages.CAMERA_INFO, where),
+                                  topics.rectified):
+                    sound[content] = data
+        sound = sound or dict([*infos.items()][:1])
         _check_one_camera(map(_frame_of, sound.values()), f'{reader.path}: {topics.camera_info}')
         for stamp_ns, _, content in found:
             if content not in sound and len(sound) < len(infos):
@@ -197,14 +202,6 @@ class _Cameras(NamedTuple):
             offsets = np.abs(self.times_ns - (stamp_ns if self.by_stamp else recorded_ns))
             info = self.infos[self.rows[int(np.argmin(offsets))] if len(self.infos) > 1 else 0]
         return partial(_decode_color, self.where, info, self.rectified, self.msgtype, data)
-
-
-def _says_calibration(data: bytes, rectified: bool) -> bool:
-    try:
-        info = deserialize(data, bag_messages.CAMERA_INFO, 'camera_info')
-    except DatasetError:
-        return False
-    return _is_calibrated(info, rectified)
 
 
 def _is_calibrated(info: Any, rectified: bool) -> bool:
@@ -262,14 +259,10 @@ def _sampled(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Camer
         step = max(1, len(found) // _COMPARED_OF_PART)
         images = BagImages(reader.path, topics.image, np.array(found[::step], dtype=np.int64
                                                                ).reshape(-1, 2), cameras)
-        views += [View(poses.pose_at(stamp_ns), partial(images.look, place),
-                       partial(_pose_after, poses, stamp_ns))
+        views += [View(poses.pose_at(stamp_ns), partial(images.read, place), None,
+                       poses.pose_at, stamp_ns)
                   for place, (stamp_ns, _) in enumerate(found[::step])]
     return views
-
-
-def _pose_after(poses: Poses, stamp_ns: int, later_ns: int) -> NDArray[np.float64] | None:
-    return poses.pose_at(stamp_ns + later_ns)
 
 
 def _readings(cameras: _Cameras, rectified: bool) -> dict[str, Reading]:
@@ -341,10 +334,6 @@ class BagImages:
     #: (F, 2): stamp and time of recording of each image [ns]
     times_ns: NDArray[np.int64]
     cameras: _Cameras
-
-    def look(self, place: int, upright: bool) -> tuple[NDArray[np.uint8], Camera]:
-        """Read an image and its camera; messages have no EXIF orientation to apply."""
-        return self.read(place)
 
     def read(self, place: int) -> tuple[NDArray[np.uint8], Camera]:
         """Read an image (h, w, 3), RGB, and its camera.

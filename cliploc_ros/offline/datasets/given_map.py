@@ -21,7 +21,7 @@ from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.files.storage import read_file
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.parsing import naming, unit_quaternion
-from cliploc_ros.offline.mapping.refit import refit_map
+from cliploc_ros.offline.mapping.building import refit_map
 
 # A smaller semi-axis is a collapsed fit; a larger one does not belong to an object. Not measured.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)

@@ -156,25 +156,15 @@ def _pose_of_matrix(numbers: list[float], where: str) -> list[float]:
 def read_tum_accelerometer(path: str | Path) -> tuple[list[int], NDArray[np.float64]]:
     """Read the stamps [ns] and accelerations (n, 3) [m/s^2] of an accelerometer.txt.
 
-    DatasetError: a line does not hold four numbers; the message names file and line.
-    """
-    stamps_ns, rows = read_stamped(Path(path), 'ax ay az')
-    return stamps_ns, np.array(rows).reshape(-1, 3)
-
-
-def read_stamped(path: Path, names: str) -> tuple[list[int], list[list[float]]]:
-    """Read a stamp [ns] and the named numbers from each line of a file.
-
-    DatasetError: a line has other cells, or a number that is not finite; the message names file
-    and line.
+    DatasetError: a line does not hold four finite numbers; the message names file and line.
     """
     stamps_ns, rows = [], []
-    for where, (stamp, *cells) in parsing.read_cells(path, f'timestamp {names}'):
+    for where, (stamp, *cells) in parsing.read_cells(Path(path), 'timestamp ax ay az'):
         stamps_ns.append(parsing.parse_stamp_ns(stamp, where))
         rows.append(parsing.parse_all(cells, float, where))
         if not np.all(np.isfinite(rows[-1])):
             raise DatasetError(f'{where}: {" ".join(cells)!r} is not finite')
-    return stamps_ns, rows
+    return stamps_ns, np.array(rows).reshape(-1, 3)
 
 
 def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:

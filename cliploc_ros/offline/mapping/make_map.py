@@ -29,7 +29,11 @@ from cliploc_ros.offline.datasets.map_recording import (
     save_recording,
 )
 from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map
-from cliploc_ros.offline.mapping.labelling import embed_landmarks, label_landmarks
+from cliploc_ros.offline.mapping.labelling import (
+    embed_landmarks,
+    label_landmarks,
+    phrases_of_classes,
+)
 from cliploc_ros.offline.mapping.landmarks import classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -37,7 +41,6 @@ from cliploc_ros.offline.mapping.systematic import MountCorrection
 from cliploc_ros.offline.mapping.update.updating import UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
 from cliploc_ros.offline.vocabulary.vocabulary import Vocabulary, load_vocabulary, shipped_phrases
 
 # A scale by objects of known size: greatest number of trial maps, and the relative change of the
