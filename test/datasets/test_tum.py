@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
-from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames, tum_frames
+from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat
 from cliploc_ros.offline.datasets.images import open_images
 from cliploc_ros.offline.datasets.intrinsics import PRESETS, find_camera, read_camera
@@ -106,7 +106,7 @@ def test_images_alone_need_no_poses(sequence_folder, truth, message):
     with pytest.raises(DatasetError, match=message):
         read_folder(sequence_folder)
     with pytest.raises(DatasetError, match=message):
-        tum_frames(read_tum(sequence_folder), find_camera(None, sequence_folder)[0])
+        read_folder(sequence_folder, FolderOptions(layout='tum'))
 
 
 def test_an_empty_cell_is_no_cell_of_another_column(tmp_path):

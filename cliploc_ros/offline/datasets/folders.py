@@ -167,7 +167,11 @@ def find_layout(folder: Path, key: str = '') -> Layout | None:
 def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptions) -> Frames:
     """Return the frames of a capture, in the map's coordinate frame."""
     if capture.trajectory is not None:
-        _check_trajectory(folder, capture.files, capture.trajectory)
+        if not len(capture.trajectory):
+            raise DatasetError(f'{folder}: there are no poses: groundtruth.txt is missing; give '
+                               'a `trajectory`')
+        check_clock(capture.trajectory, capture.files[0].stamp_ns, capture.files[-1].stamp_ns,
+                    str(folder))
     axes, scale, turn = options.axes or capture.axes, options.scale, _UP[capture.up or 'z']
     files = _place_images(capture.files, axes)
     notes = [f'read as {layout.name}: {sum(file.pose is not None for file in files)} of '
@@ -202,16 +206,6 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
         [(file.color.name, file.stamp_ns, file.camera) for file, _ in posed],
         [np.round(pose, 6).tolist() for _, pose in posed]))
     return replace(frames, digest=digest, notes=(*filter(None, notes), *frames.notes))
-
-
-def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:
-    """Return the frames of a TUM folder of one camera, without depth.
-
-    DatasetError: there are no poses, or their time span does not overlap that of the images.
-    """
-    files = _tum_files(sequence, camera, sequence.trajectory, {})
-    _check_trajectory(sequence.folder, files, sequence.trajectory)
-    return folder_frames(sequence.folder, files)
 
 
 def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
@@ -312,23 +306,10 @@ def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Captu
         sequence.trajectory if options.trajectory is None else options.trajectory,
         max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera,
         tolerance_ns=options.tolerance_ns)
-    return Capture(_tum_files(sequence, camera, trajectory, depths), depth=DepthFormat(TUM_UNIT),
-                   trajectory=trajectory)
-
-
-def _tum_files(sequence: TumSequence, camera: Camera, trajectory: TimedPoses,
-               depths: Mapping[int, Path]) -> tuple[ImageFile, ...]:
-    """Return the images of a folder, each with its pose and depth image; None where missing."""
-    return tuple(ImageFile(stamp, path, camera, trajectory.pose_at(stamp), depths.get(stamp))
-                 for stamp, path in zip(sequence.stamps_ns, sequence.image_paths, strict=True))
-
-
-def _check_trajectory(folder: Path, files: Sequence[ImageFile], trajectory: TimedPoses) -> None:
-    """Refuse a trajectory that has no poses or does not overlap the images in time."""
-    if not len(trajectory):
-        raise DatasetError(f'{folder}: there are no poses: groundtruth.txt is missing; give '
-                           'a `trajectory`')
-    check_clock(trajectory, files[0].stamp_ns, files[-1].stamp_ns, str(folder))
+    return Capture(tuple(
+        ImageFile(stamp, path, camera, trajectory.pose_at(stamp), depths.get(stamp))
+        for stamp, path in zip(sequence.stamps_ns, sequence.image_paths, strict=True)),
+        depth=DepthFormat(TUM_UNIT), trajectory=trajectory)
 
 
 def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
