@@ -119,9 +119,8 @@ def build(options: argparse.Namespace) -> int:
     try:
         if update is not None:
             made = make_map.update_map(update, detections, labeller, mapping)
-            if layer_path(update).exists():
-                note = ('the new map has no keyframes, which need all images: it localizes by '
-                        'objects alone; build a new map to have both')
+            note = ('the new map has no keyframes, which need all images: it localizes by objects '
+                    'alone; build a new map to have both') if layer_path(update).exists() else ''
         else:
             frames = source.frames and move_frames(source.frames, scale, rotation)
             with command.StageBar() as bar:
@@ -201,7 +200,8 @@ def _mapping_options(options: argparse.Namespace, source: str) -> 'MappingOption
     """Return the options of mapping; source is the origin that the map names."""
     from cliploc_ros.offline.mapping import options as mapping
 
-    errors = mapping.PoseErrors(*options.pose_noise or (0.02, 0.5), options.pose_correlation)
+    errors = mapping.PoseErrors(*options.pose_noise or (0.02, 0.5),
+                                correlation_s=options.pose_correlation)
     return mapping.MappingOptions(
         pose_errors=errors if options.joint or options.pose_noise else None,
         estimate_pose_errors=options.joint is None,

@@ -56,9 +56,10 @@ def layer_options(options: argparse.Namespace) -> 'tuple[LayerOptions | None, st
                                (options.keyframe_features == XFEAT, '--keyframe-features')):
             if is_given:
                 raise OptionsError(f'{name} is for --keyframe-layer')
-        return None, problem and f'no keyframes with {problem}'
-    return LayerOptions(*options.keyframes, options.keyframe_points, options.keyframe_images,
-                        load_xfeat() if options.keyframe_features == XFEAT else features.SIFT), ''
+        return None, '' if options.keyframe_layer is False else f'no keyframes with {problem}'
+    return LayerOptions(
+        *options.keyframes, most_points=options.keyframe_points, images=options.keyframe_images,
+        kind=load_xfeat() if options.keyframe_features == XFEAT else features.SIFT), ''
 
 
 def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:

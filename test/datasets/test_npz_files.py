@@ -169,16 +169,6 @@ def test_queries_come_back(tmp_path):
 
 
 # ---- observations -------------------------------------------------------------------------------
-def test_a_written_file_is_read_back(tmp_path):
-    first = load_observations(save(tmp_path / 'o.npz', observation_arrays()))
-    save_observations(tmp_path / 'again.npz', first)
-    again = load_observations(tmp_path / 'again.npz')
-    for name in ('map_from_camera', 'stamps_s', 'frame_offsets', 'bboxes_xyxy', 'classes',
-                 'scores'):
-        assert (getattr(again, name) == getattr(first, name)).all()
-    assert (again.cameras, again.class_names) == (first.cameras, first.class_names)
-
-
 def test_odometry_is_read_back_in_the_order_of_time(tmp_path):
     odometry = np.tile(np.eye(4), (3, 1, 1))
     odometry[:, 0, 3] = [3.0, np.nan, 1.0]

@@ -30,7 +30,6 @@ from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.make_map import find_labeller, make_map, update_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.offline.mapping.pose_noise import _sample
 from cliploc_ros.offline.mapping.views import make_views, number_viewpoints, thin_out
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
@@ -294,18 +293,6 @@ def test_far_landmarks_are_passed_over_without_a_loss(floor, seen):
     assert list(zip(found.boxes.tolist(), found.landmarks.tolist(), strict=True)) == sorted(
         expected)
     assert len(expected) > 900
-
-
-def test_pose_errors_of_a_long_recording_are_estimated_from_a_part_of_it(seen):
-    far = np.tile(np.eye(4), (8000, 1, 1))
-    far[:, 0, 3] = np.arange(8000)
-    long = replace(seen, map_from_camera=far, stamps_s=np.arange(8000.0),
-                   frame_offsets=np.zeros(8001, dtype=np.int64), classes=np.empty(0, np.int64),
-                   bboxes_xyxy=np.empty((0, 4)), scores=np.empty(0))
-    frames, rows = _sample(make_views(long))
-    assert (len(frames), len(rows)) == (200, 0)
-    assert 2900 < np.ptp(frames) < 3000
-    assert abs(frames.mean() - 4000) < 10
 
 
 def test_no_landmarks_and_no_boxes(floor, seen):

@@ -40,17 +40,6 @@ _RECTIFIED_PX, _RECTIFIED_BETTER = 0.6, 0.6
 _COMPARED_PARTS, _COMPARED_OF_PART, _PART_S = 12, 8, 4.0
 
 
-class _Selected(NamedTuple):
-    """A serialized image of a recording, and its depth image."""
-
-    place: int
-    stamp_ns: int
-    recorded_ns: int
-    pose: NDArray[np.float64] | None
-    data: bytes
-    depth: bytes | None = None
-
-
 @dataclass(frozen=True)
 class BagTopics:
     """The topics of a recording, and how to read them."""
@@ -132,11 +121,7 @@ def bag_frames(bag: Path, topics: BagTopics, source: PoseSource,
 
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
         with BagReader(bag) as reader:
-            for image in _paired(reader, topics, poses, is_wanted):
-                yield RawFrame(
-                    image.place, image.stamp_ns, image.pose,
-                    cameras.decoder(image.stamp_ns, image.recorded_ns, image.data),
-                    None if image.depth is None else partial(decode_depth, image.depth))
+            yield from _paired(reader, topics, poses, cameras, decode_depth, is_wanted)
     return Frames(bag, count, read_raw, varies=len(cameras.infos) > 1, notes=tuple(
         f'note: {note}' for note in notes if note))
 
@@ -256,12 +241,10 @@ def _sampled(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Camer
         found = [(_peek_stamp_ns(message), message.stamp_ns) for message in reader.messages(
             [topics.image], begin_ns, int(begin) + round(_PART_S * NS_PER_S))]
         last = max([last, *(recorded_ns + 1 for _, recorded_ns in found)])
-        step = max(1, len(found) // _COMPARED_OF_PART)
-        images = BagImages(reader.path, topics.image, np.array(found[::step], dtype=np.int64
-                                                               ).reshape(-1, 2), cameras)
-        views += [View(poses.pose_at(stamp_ns), partial(images.read, place), None,
-                       poses.pose_at, stamp_ns)
-                  for place, (stamp_ns, _) in enumerate(found[::step])]
+        views += [View(poses.pose_at(stamp_ns), partial(
+            _read_image, reader.path, topics.image, cameras, stamp_ns, recorded_ns), None,
+            poses.pose_at, stamp_ns)
+            for stamp_ns, recorded_ns in found[::max(1, len(found) // _COMPARED_OF_PART)]]
     return views
 
 
@@ -311,42 +294,34 @@ def _notes(reader: BagReader, topics: BagTopics) -> list[str]:
     return [fault.text for fault in faults]
 
 
-def bag_images(bag: Path, topics: BagTopics) -> 'BagImages':
-    """Open the images of a recording, to be read in any order.
+def bag_images(bag: Path, topics: BagTopics, camera: str = '') -> list[RawFrame]:
+    """Return the images of a recording without poses, each read on demand; camera is their name.
 
     The recording is read once, for the stamps. DatasetError: a topic is missing, of another type,
     or empty.
     """
     with BagReader(bag) as reader:
         _check_topics(reader, topics)
+        cameras = _Cameras.read(reader, topics)
         times_ns = [(_peek_stamp_ns(message), message.stamp_ns)
                     for message in reader.messages([topics.image])]
-        return BagImages(bag, topics.image, np.array(times_ns, dtype=np.int64).reshape(-1, 2),
-                         _Cameras.read(reader, topics))
+    return [RawFrame(place, stamp_ns, None, partial(
+        _read_image, bag, topics.image, cameras, stamp_ns, recorded_ns), camera=camera)
+        for place, (stamp_ns, recorded_ns) in enumerate(times_ns)]
 
 
-@dataclass(frozen=True)
-class BagImages:
-    """The images of a recording, read one at a time by their time of recording."""
+def _read_image(bag: Path, topic: str, cameras: _Cameras, stamp_ns: int, recorded_ns: int
+                ) -> tuple[NDArray[np.uint8], Camera]:
+    """Read an image (h, w, 3), RGB, and its camera, by its stamp and time of recording.
 
-    bag: Path
-    topic: str
-    #: (F, 2): stamp and time of recording of each image [ns]
-    times_ns: NDArray[np.int64]
-    cameras: _Cameras
-
-    def read(self, place: int) -> tuple[NDArray[np.uint8], Camera]:
-        """Read an image (h, w, 3), RGB, and its camera.
-
-        DatasetError: the image cannot be decoded, or the recording has changed.
-        """
-        taken_ns, recorded_ns = self.times_ns[place].tolist()
-        with BagReader(self.bag) as reader:
-            for message in reader.messages([self.topic], recorded_ns, recorded_ns + 1):
-                if _peek_stamp_ns(message) == taken_ns:
-                    return self.cameras.decoder(taken_ns, recorded_ns, message.data)()
-        raise DatasetError(f'{self.bag}: image {place} of {self.topic} is missing: the recording '
-                           'has changed; start again')
+    DatasetError: the image cannot be decoded, or the recording has changed.
+    """
+    with BagReader(bag) as reader:
+        for message in reader.messages([topic], recorded_ns, recorded_ns + 1):
+            if _peek_stamp_ns(message) == stamp_ns:
+                return cameras.decoder(stamp_ns, recorded_ns, message.data)()
+    raise DatasetError(f'{bag}: the image of {topic} at {stamp_ns / NS_PER_S:.6f} s is missing: '
+                       'the recording has changed; start again')
 
 
 def _check_topics(reader: BagReader, topics: BagTopics) -> None:
@@ -361,17 +336,17 @@ def _check_topics(reader: BagReader, topics: BagTopics) -> None:
             raise DatasetError(f'{reader.path}: {name} has no messages')
 
 
-def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wanted
-            ) -> Iterator[_Selected]:
+def _paired(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Cameras,
+            decode_depth: Callable[[bytes], DepthImage], is_wanted: Wanted) -> Iterator[RawFrame]:
     """Yield the wanted images, each with the depth image nearest in time, or None."""
-    waiting: deque[_Selected] = deque()
+    waiting: deque[RawFrame] = deque()
     depths: deque[tuple[int, bytes]] = deque(maxlen=2 * _MAX_WAITING)
 
-    def with_depth(selected: _Selected) -> _Selected:
-        nearest = min(depths, key=lambda depth: abs(depth[0] - selected.stamp_ns), default=None)
-        if nearest is None or abs(nearest[0] - selected.stamp_ns) > topics.tolerance_ns:
-            return selected
-        return selected._replace(depth=nearest[1])
+    def with_depth(raw: RawFrame) -> RawFrame:
+        nearest = min(depths, key=lambda depth: abs(depth[0] - raw.stamp_ns), default=None)
+        if nearest is None or abs(nearest[0] - raw.stamp_ns) > topics.tolerance_ns:
+            return raw
+        return replace(raw, depth=partial(decode_depth, nearest[1]))
     place, before, frame = 0, 0, ''
     for recorded in reader.messages([topics.image, *([topics.depth] if topics.depth else [])]):
         stamp_ns = _peek_stamp_ns(recorded)
@@ -383,7 +358,8 @@ def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wante
             _check_one_camera([earlier, frame], f'{reader.path}: {topics.image}')
             pose, before = poses.pose_at(stamp_ns), stamp_ns
             if is_wanted(place, stamp_ns, pose):
-                waiting.append(_Selected(place, stamp_ns, recorded.stamp_ns, pose, recorded.data))
+                waiting.append(RawFrame(place, stamp_ns, pose, cameras.decoder(
+                    stamp_ns, recorded.stamp_ns, recorded.data)))
             place += 1
         while waiting and (not topics.depth or len(waiting) > _MAX_WAITING or (
                 depths and depths[-1][0] >= waiting[0].stamp_ns + topics.tolerance_ns)):

@@ -341,15 +341,11 @@ def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
     """Read a pose (4, 4); None where tracking was lost: the file has NaN or infinite numbers."""
-    rows = []
-    for where, line in read_lines(path):
-        cells = line.partition('#')[0].split()
-        if len(cells) != 4:
-            raise DatasetError(f'{where}: is not a 4x4 matrix: {line[:60]!r}')
-        rows.append(parse_all(cells, float, where))
+    rows = [parse_all(line.partition('#')[0].split(), float, where)
+            for where, line in read_lines(path)]
+    if [len(row) for row in rows] != [4] * 4:
+        raise DatasetError(f'{path}: is not a 4x4 matrix')
     pose = np.array(rows)
-    if pose.shape != (4, 4):
-        raise DatasetError(f'{path}: is not a 4x4 matrix, its shape is {pose.shape}')
     if not np.isfinite(pose).all():
         return None
     if not transforms.is_rigid(pose, tolerance=1e-3):

@@ -4,7 +4,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -99,10 +99,8 @@ def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),
         capture = layout.read(path, folder)
         return Images(list(folder_frames(path, capture.files, capture.depth).read_raw(
             lambda place, stamp_ns, pose: True)))
-    return Images([RawFrame(place, stamp_ns, None, partial(images.read, place), camera=name)
-                   for name in cameras
-                   for images in [bag_images(path, topics.of_camera(name))]
-                   for place, stamp_ns in enumerate(images.times_ns[:, 0].tolist())])
+    return Images([frame for name in cameras
+                   for frame in bag_images(path, topics.of_camera(name), name)])
 
 
 def views_of_folder(path: Path) -> PosedDetections:

@@ -6,7 +6,6 @@ import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -92,16 +91,7 @@ class LoadNetworks:
             set_threads(self.threads)
         encoder = (None if self.clip is None
                    else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
-        return partial(_look_if_readable,
-                       RunNetworks(load_detector(self.detector).detect, encoder))
-
-
-def _look_if_readable(look: 'RunNetworks', raw: RawFrame) -> SeenFrame | str:
-    """Run the networks on a frame; return the reason instead if its images are unusable."""
-    try:
-        return look(raw)
-    except DatasetError as error:
-        return str(error)
+        return RunNetworks(load_detector(self.detector).detect, encoder)
 
 
 @dataclass(frozen=True)
@@ -112,12 +102,15 @@ class RunNetworks:
     detect: Callable[[NDArray[np.uint8]], Detections]
     encoder: ImageTextEncoder | None = None
 
-    def __call__(self, raw: RawFrame) -> SeenFrame:
+    def __call__(self, raw: RawFrame) -> SeenFrame | str:
         """Run the networks on a frame that has a pose.
 
-        DatasetError: the image or depth image cannot be used.
+        If the image or depth image cannot be used, return the reason.
         """
-        frame = raw.decode()
+        try:
+            frame = raw.decode()
+        except DatasetError as error:
+            return str(error)
         camera = frame.camera
         assert frame.map_from_camera is not None
         start = time.perf_counter()

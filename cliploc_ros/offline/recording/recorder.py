@@ -77,7 +77,7 @@ class KeyframeFilter:
     def __init__(self, options: KeyframeOptions) -> None:
         self._options = options
         self._last: NDArray[np.float64] | None = None
-        self.asked = self.without_pose = self.keyframes = 0
+        self.asked = self.without_pose = 0
 
     def __call__(self, place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
         """Return whether the frame with this pose is a keyframe."""
@@ -90,7 +90,6 @@ class KeyframeFilter:
             if distance < self._options.distance_m and angle < self._options.angle_deg:
                 return False
         self._last = pose
-        self.keyframes += 1
         return True
 
 
