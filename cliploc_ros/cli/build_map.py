@@ -107,8 +107,8 @@ def build(options: argparse.Namespace) -> int:
                            'updated; build a new one')
     mapping = _mapping_options(options, f'build_map {name}')
     source = sources.read_source(options)
-    _tell_misspelt(mapping.moving_classes, source.recorded.detections.class_names)
-    detections, scale, rotation = _placed(source.recorded.detections, options, mapping)
+    _tell_misspelt(mapping.moving_classes, source.recorded.class_names)
+    detections, scale, rotation = _placed(source.recorded, options, mapping)
     if without := source.recorded.without_pose:
         print(f'no pose: {without} of {source.recorded.images} images', flush=True)
     if options.every > 1:
@@ -200,8 +200,8 @@ def _mapping_options(options: argparse.Namespace, source: str) -> 'MappingOption
     """Return the options of mapping; source is the origin that the map names."""
     from cliploc_ros.offline.mapping import options as mapping
 
-    errors = mapping.PoseErrors(*options.pose_noise or (0.02, 0.5),
-                                correlation_s=options.pose_correlation)
+    sigma_m, sigma_deg = options.pose_noise or (0.02, 0.5)
+    errors = mapping.PoseErrors(sigma_m, sigma_deg, options.pose_correlation)
     return mapping.MappingOptions(
         pose_errors=errors if options.joint or options.pose_noise else None,
         estimate_pose_errors=options.joint is None,

@@ -57,9 +57,10 @@ def layer_options(options: argparse.Namespace) -> 'tuple[LayerOptions | None, st
             if is_given:
                 raise OptionsError(f'{name} is for --keyframe-layer')
         return None, '' if options.keyframe_layer is False else f'no keyframes with {problem}'
+    distance_m, angle_deg = options.keyframes
     return LayerOptions(
-        *options.keyframes, most_points=options.keyframe_points, images=options.keyframe_images,
-        kind=load_xfeat() if options.keyframe_features == XFEAT else features.SIFT), ''
+        distance_m, angle_deg, options.keyframe_points, options.keyframe_images,
+        load_xfeat() if options.keyframe_features == XFEAT else features.SIFT), ''
 
 
 def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:

@@ -25,9 +25,10 @@ from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, join_frames, move_frames
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
-from cliploc_ros.offline.datasets.observations import Recorded, load_recorded
+from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.recording import recorder
 from cliploc_ros.units import NS_PER_S
 
@@ -88,7 +89,7 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
 class Source(NamedTuple):
     """The content of a source: observations, their file, and images if there are any."""
 
-    recorded: Recorded
+    recorded: PosedDetections
     file: Path
     frames: Frames | None
 
@@ -104,7 +105,7 @@ def read_source(options: argparse.Namespace) -> Source:
     check_folder_options(options)
     find_topics(options, options.bag)
     if options.observations is not None:
-        return Source(load_recorded(options.observations), options.observations, None)
+        return Source(load_observations(options.observations), options.observations, None)
     frames = read_frames(options)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
     recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))

@@ -61,7 +61,7 @@ def _look(walk: Path) -> PosedDetections:
     networks = RecordingOptions(DetectorOptions(model=str(ASSETS / 'yolo.onnx')), clip,
                                 KeyframeOptions(0.0, 0.0), '')
     return record_once(read_folder(walk, FolderOptions(layout='tum')), networks,
-                       walk.with_suffix('.npz')).detections
+                       walk.with_suffix('.npz'))
 
 
 def main() -> None:

@@ -165,7 +165,7 @@ def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, Key
     if not path.exists():
         frames = frames_of_raws(Path(place.name), place.mapped)
         landmark_map = build_map(
-            record_every_frame(frames, RunNetworks(looker.detect)).detections).landmark_map \
+            record_every_frame(frames, RunNetworks(looker.detect))).landmark_map \
             if place.map_file is None else LandmarkMap.from_file(place.map_file)
         layer = build_layer(frames, landmark_map, LayerOptions(0.0, 0.0))
         print(f'{place.name}: {len(landmark_map)} landmarks, {len(layer)} keyframes, '

@@ -424,9 +424,7 @@ def test_paths_of_other_systems_and_folders_of_splatting(shots, tmp_path):
 
 
 @pytest.mark.parametrize(('there', 'expected'), [
-    (('mav0/cam0/data.csv',), 'EuRoC'), (('image_0/000000.png', 'times.txt'), 'KITTI'),
-    (('color/0.jpg', 'pose/0.txt', 'intrinsic/intrinsic_color.txt'), 'ScanNet'),
-    (('results/frame000000.jpg', 'traj.txt'), 'Replica'),
+    (('mav0/cam0/data.csv',), 'write rgb.txt'),
     (('groundtruth.txt', 'rgb/1.png'), 'lacks rgb.txt'),
     (('rgb.mp4', 'camera_matrix.csv'), 'lacks odometry.csv'),
     (('database.db', 'images/1.jpg'), 'mapper')])

@@ -19,7 +19,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
-from cliploc_ros.offline.datasets.observations import load_recorded
+from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.recording.recorder import (
     KeyframeFilter,
     KeyframeOptions,
@@ -76,20 +76,20 @@ def recorded(walk):
 def assert_equal(one, other):
     for name in ('bboxes_xyxy', 'classes', 'scores', 'map_from_camera', 'stamps_s'):
         # with another number of threads, PyTorch sums in another order
-        np.testing.assert_allclose(getattr(one.detections, name),
-                                   getattr(other.detections, name), atol=1e-2)
-    np.testing.assert_allclose(one.detections.embeddings.astype(float),
-                               other.detections.embeddings.astype(float), atol=1e-3)
+        np.testing.assert_allclose(getattr(one, name),
+                                   getattr(other, name), atol=1e-2)
+    np.testing.assert_allclose(one.embeddings.astype(float),
+                               other.embeddings.astype(float), atol=1e-3)
     assert (one.stamps_ns == other.stamps_ns).all()
 
 
 def test_observations_lie_next_to_the_recording(walk, recorded, capsys):
-    content = load_recorded(recorded)
-    assert (content.images, content.without_pose, len(content.detections)) == (16, 1, 15)
-    embeddings = content.detections.embeddings
-    assert embeddings.shape == (len(content.detections.scores), 128)
+    content = load_observations(recorded)
+    assert (content.images, content.without_pose, len(content)) == (16, 1, 15)
+    embeddings = content.embeddings
+    assert embeddings.shape == (len(content.scores), 128)
     np.testing.assert_allclose(np.linalg.norm(embeddings.astype(float), axis=1), 1.0, atol=1e-3)
-    assert content.detections.encoder_key
+    assert content.encoder_key
     before = recorded.stat().st_mtime_ns
     begin = time.process_time()
     assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--seed', 3, '--out',
@@ -140,7 +140,7 @@ def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
     with outputs.open('ab') as damaged:
         damaged.write(b'{"run": 1}\n"other"\n[]\n\x00\x10')
     assert main(command) == 0
-    assert_equal(load_recorded(file), load_recorded(recorded))
+    assert_equal(load_observations(file), load_observations(recorded))
 
 
 def test_other_options_use_the_boxes_again_and_depth_is_stored(walk, tmp_path, caplog):
@@ -152,7 +152,7 @@ def test_other_options_use_the_boxes_again_and_depth_is_stored(walk, tmp_path, c
     code = main(arguments(*command, '--keyframes', '1', '180'))
     assert code in (0, 1)  # few keyframes may give no map
     assert f'boxes of 1 images of earlier runs: {outputs}' in caplog.text
-    content = load_recorded(file).detections
+    content = load_observations(file)
     assert 2 <= len(content) < 15
     assert content.embeddings is None
     # 10,000 counts of TUM are 2 m, without variation
@@ -168,7 +168,7 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
     assert main(arguments(*command)) == 0
     assert '/camera_info' in capsys.readouterr().out
     assert main(arguments(*command, '--pose-topic', '/ground_truth')) == 0
-    from_bag, from_folder = load_recorded(file).detections, load_recorded(recorded).detections
+    from_bag, from_folder = load_observations(file), load_observations(recorded)
     np.testing.assert_allclose(from_bag.bboxes_xyxy, from_folder.bboxes_xyxy, atol=1e-2)
     np.testing.assert_allclose(from_bag.map_from_camera, from_folder.map_from_camera, atol=1e-6)
     assert from_bag.odom_from_camera is None
@@ -177,7 +177,7 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
     assert main(arguments(*linked, '/wheels')) == 1
     assert 'no topic /wheels' in capsys.readouterr().err
     assert main(arguments(*linked, '/ground_truth')) == 0
-    again = load_recorded(file).detections
+    again = load_observations(file)
     assert (again.odom_from_camera == again.map_from_camera).all()
     assert (again.bboxes_xyxy == from_bag.bboxes_xyxy).all()
     assert main(arguments(*linked, '/ground_truth', '--pose-noise', 0.02, 0.5,

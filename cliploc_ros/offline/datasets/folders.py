@@ -70,11 +70,6 @@ _NEARLY = (('TUM RGB-D', 'groundtruth.txt', 'rgb.txt'), ('TUM RGB-D', 'depth.txt
            ('7-Scenes', 'frame-*.pose.txt', 'frame-000000.color.jpg'),
            ('Record3D', 'rgbd', 'metadata.json'), ('Polycam', 'mesh_info.json', 'keyframes'),
            ('COLMAP', 'database.db', 'sparse/0 (run its mapper)'))
-# Layouts that are not supported, and the files that identify them.
-_OTHERS = {'EuRoC': ('mav0',), 'KITTI': ('image_[0-3]', 'times.txt'),
-           'ScanNet': ('color', 'pose', 'intrinsic'), 'Replica': ('results', 'traj.txt'),
-           'ScanNet++': ('iphone', 'dslr'), 'nuScenes': ('samples', 'sweeps'),
-           'Matterport3D': ('matterport_color_images',), 'ROS 1': ('*.bag',)}
 
 
 class Layout(NamedTuple):
@@ -101,9 +96,13 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
     """
     layout = find_layout(folder, options.layout)
     if layout is None:
+        nearly = next((f'it has {mark} as {name} does, but lacks {lacking}'
+                       for name, mark, lacking in _NEARLY
+                       if any(folder.glob(mark)) and not (folder / lacking).exists()), '')
         remedy = ('it is a recording: give it as `bag`' if (folder / 'metadata.yaml').is_file()
-                  else 'unpack it' if folder.suffix in ('.r3d', '.zip') else _unread(folder)
-                  or 'images without poses need a pose estimator, such as COLMAP')
+                  else 'unpack it' if folder.suffix in ('.r3d', '.zip') else nearly or
+                  'write rgb.txt, groundtruth.txt and camera.json next to its images, as in TUM '
+                  'RGB-D; images without poses need a pose estimator, such as COLMAP')
         known = ', '.join(sorted({layout.name for layout in LAYOUTS}))
         raise DatasetError(f'{folder}: has none of the known layouts ({known}); {remedy}')
     given = {'intrinsics': options.intrinsics, 'trajectory': options.trajectory,
@@ -115,17 +114,6 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
                                f'{" and ".join(able)}')
     with naming(folder, OSError, what='cannot be read: '):
         return _placed(folder, layout, layout.read(folder, options), options)
-
-
-def _unread(folder: Path) -> str:
-    """Describe the incomplete or unsupported layout of a folder; '' if there is none."""
-    for name, mark, lacking in _NEARLY:
-        if any(folder.glob(mark)) and not (folder / lacking).exists():
-            return f'it has {mark} as {name} does, but lacks {lacking}'
-    other = next((name for name, marks in _OTHERS.items()
-                  if all(any(folder.glob(mark)) for mark in marks)), '')
-    return other and (f'its layout is that of {other}: write rgb.txt, groundtruth.txt and '
-                      'camera.json next to its images, as in TUM RGB-D, or a transforms.json')
 
 
 def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:

@@ -102,8 +102,12 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
         numbers = parsing.parse_all(cells[1:], float, where)
         if not np.all(np.isfinite(numbers)):
             raise DatasetError(f'{where}: {" ".join(cells[1:])!r} is not finite')
-        if matrix:
-            numbers = _pose_of_matrix(numbers, where)
+        if matrix:  # by rows
+            pose = np.array([*numbers[:12], 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
+            if numbers[12:] not in ([], [0.0, 0.0, 0.0, 1.0]) or not is_rigid(pose, 1e-2):
+                raise DatasetError(f'{where}: {len(numbers)} numbers are not the matrix of a pose: '
+                                   f'expected {_COLUMNS}, or name the columns first')
+            numbers = [*pose[:3, 3].tolist(), *quaternion_from_transform(pose).tolist()]
         parsing.unit_quaternion(numbers[3:], where, _MAX_NORM_ERROR)
         stamps_ns.append(parsing.parse_stamp_ns(cells[0], where, stamp_s))
         rows.append([*(metres * number for number in numbers[:3]), *numbers[3:]])
@@ -142,15 +146,6 @@ def _role(name: str) -> str:
         ('q', ('q', 'rot', 'orientation')), ('t', ('t', 'p', 'x', 'y', 'z', 'trans')))
         if word.startswith(starts)), '')
     return f'{kind}{word[-1]}' if kind and word[-1] in 'xyzw' else ''
-
-
-def _pose_of_matrix(numbers: list[float], where: str) -> list[float]:
-    """Convert a matrix of 12 or 16 numbers, by rows, to a position and a quaternion."""
-    pose = np.array([*numbers[:12], 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
-    if numbers[12:] not in ([], [0.0, 0.0, 0.0, 1.0]) or not is_rigid(pose, 1e-2):
-        raise DatasetError(f'{where}: {len(numbers)} numbers are not the matrix of a pose; '
-                           f'expected {_COLUMNS}, or name the columns in the first line')
-    return [*pose[:3, 3].tolist(), *quaternion_from_transform(pose).tolist()]
 
 
 def read_tum_accelerometer(path: str | Path) -> tuple[list[int], NDArray[np.float64]]:

@@ -34,7 +34,7 @@ from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.bags import MOST_LEFT_OUT
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
-from cliploc_ros.offline.datasets.observations import Recorded, load_recorded, save_recorded
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.datasets.poses import Poses
 from cliploc_ros.offline.mapping.posed_detections import (
     PosedDetections,
@@ -155,7 +155,7 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
 
 
 def record_once(frames: Frames, options: RecordingOptions, file: Path | None = None,
-                odometry: Mapping[str, Poses] | None = None) -> Recorded:
+                odometry: Mapping[str, Poses] | None = None) -> PosedDetections:
     """Return the observations of a source; record them unless an earlier run did.
 
     The networks do not depend on odometry, so that an earlier run without odometry is used too.
@@ -176,14 +176,13 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
     file = file or observation_file(frames, options)
     if file.exists():
         try:
-            recorded = load_recorded(file)
+            recorded = load_observations(file)
             if recorded.described == described:
                 logger.warning('using the observations of an earlier run: %s', file)
                 linked = _with_odometry(recorded, odometry)
-                old = recorded.detections.odom_from_camera
-                new = linked.detections.odom_from_camera
+                old, new = recorded.odom_from_camera, linked.odom_from_camera
                 if new is not None and (old is None or not np.array_equal(old, new, True)):
-                    save_recorded(file, linked)
+                    save_observations(file, linked)
                 return linked
             logger.warning('recording again, because the options changed: %s', file)
         except DatasetError as error:
@@ -192,22 +191,25 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
                      'make room or name another file with `record_to`, then run again: it '
                      'continues from here', _parse_entry)) as outputs:
         recorded = _with_odometry(_record(frames, options, described, outputs), odometry)
-    save_recorded(file, recorded)
+    save_observations(file, recorded)
     logger.warning('wrote %s', file)
     return recorded
 
 
-def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> Recorded:
+def _with_odometry(recorded: PosedDetections, odometry: Mapping[str, Poses] | None
+                   ) -> PosedDetections:
     """Return observations with the odometry at their stamps; earlier odometry is replaced."""
     placed = None
     if odometry is not None:
-        poses = [odometry[recorded.detections.name_of(frame)].pose_at(int(stamp_ns))
+        assert recorded.stamps_ns is not None
+        poses = [odometry[recorded.name_of(frame)].pose_at(int(stamp_ns))
                  for frame, stamp_ns in enumerate(recorded.stamps_ns)]
         placed = np.array([_UNKNOWN if pose is None else pose for pose in poses])
-    return replace(recorded, detections=replace(recorded.detections, odom_from_camera=placed))
+    return replace(recorded, odom_from_camera=placed)
 
 
-def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | str]) -> Recorded:
+def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | str]
+                       ) -> PosedDetections:
     """Run given networks on every frame with a pose; write no file.
 
     Frames that cannot be decoded are left out: for these, `look` returns the reason.
@@ -243,7 +245,8 @@ def _again(seen: SeenFrame, raw: RawFrame) -> SeenFrame:
                    depth_spreads=depths[1])
 
 
-def _record(frames: Frames, options: RecordingOptions, described: str, outputs: Log) -> Recorded:
+def _record(frames: Frames, options: RecordingOptions, described: str, outputs: Log
+            ) -> PosedDetections:
     """Run the networks on all keyframes without an earlier output."""
     earlier = {(entry.camera, entry.place, entry.stamp_ns): entry for entry in outputs.read()[0]}
     if earlier:
@@ -309,7 +312,7 @@ def _read_keyframes(frames: Frames, options: KeyframeOptions
 
 
 def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, KeyframeFilter],
-              encoder_key: str, described: str) -> Recorded:
+              encoder_key: str, described: str) -> PosedDetections:
     """Return the observations of frames, in order of time.
 
     DatasetError: a camera has no frames, or its intrinsics change.
@@ -330,7 +333,7 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
     depths = np.concatenate([frame.depths for frame in seen])
     has_depth = bool(np.isfinite(depths).any())
     needs_edges = len(names) > 0 and any(frame.is_distorted for frame in seen)
-    detections = PosedDetections(
+    return PosedDetections(
         cameras=cameras,
         map_from_camera=np.array([frame.map_from_camera for frame in seen]),
         stamps_s=np.array([frame.stamp_ns / NS_PER_S for frame in seen]),
@@ -346,13 +349,13 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
         encoder_key=encoder_key,
         open_edges=np.concatenate([frame.open_edges for frame in seen]) if needs_edges else None,
         camera_rows=None if camera_names == ('',) else rows,
-        camera_names=camera_names)
-    return Recorded(
-        detections, np.array([frame.stamp_ns for frame in seen], dtype=np.int64),
-        np.array([frame.detector_ms for frame in seen]),
-        np.array([frame.clip_ms for frame in seen]),
-        sum(keyframes.asked for keyframes in filters.values()),
-        sum(keyframes.without_pose for keyframes in filters.values()), described)
+        camera_names=camera_names,
+        stamps_ns=np.array([frame.stamp_ns for frame in seen], dtype=np.int64),
+        detector_ms=np.array([frame.detector_ms for frame in seen]),
+        clip_ms=np.array([frame.clip_ms for frame in seen]),
+        images=sum(keyframes.asked for keyframes in filters.values()),
+        without_pose=sum(keyframes.without_pose for keyframes in filters.values()),
+        described=described)
 
 
 def _seen_by(seen: SeenFrame, other: Camera) -> SeenFrame:
