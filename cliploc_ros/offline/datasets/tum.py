@@ -105,8 +105,8 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
         if matrix:  # by rows
             pose = np.array([*numbers[:12], 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
             if numbers[12:] not in ([], [0.0, 0.0, 0.0, 1.0]) or not is_rigid(pose, 1e-2):
-                raise DatasetError(f'{where}: {len(numbers)} numbers are not the matrix of a pose: '
-                                   f'expected {_COLUMNS}, or name the columns first')
+                raise DatasetError(f'{where}: {len(numbers)} numbers are not a pose: expected '
+                                   f'{_COLUMNS}, or name the columns in the first line')
             numbers = [*pose[:3, 3].tolist(), *quaternion_from_transform(pose).tolist()]
         parsing.unit_quaternion(numbers[3:], where, _MAX_NORM_ERROR)
         stamps_ns.append(parsing.parse_stamp_ns(cells[0], where, stamp_s))
