@@ -107,11 +107,11 @@ def views_of_folder(path: Path) -> PosedDetections:
     """Read the poses of a folder as views without boxes; DatasetError: it has no poses."""
     layout = find_layout(path)
     if layout is None:
-        raise DatasetError(f'{path}: has no camera poses; also give --observations')
+        raise DatasetError(f'{path}: has no camera poses; also give `observations`')
     capture = layout.read(path, FolderOptions())
     if not capture.is_metric:
         raise DatasetError(f'{path}: the unit of {layout.name} is unknown; also give '
-                           '--observations, which build_map writes with --scale')
+                           '`observations`, which build_map writes with `scale`')
     posed, cameras = [], []
     for raw in read_folder(path).read_raw(lambda place, stamp_ns, pose: pose is not None):
         posed.append((raw.stamp_ns, raw.map_from_camera))
