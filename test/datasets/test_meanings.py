@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_folders import shots_of, write_colmap, write_nerf
-from rig_bag import TF, transform
+from rig_bag import TF, depth_message, make, transform, write_messages
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
@@ -22,7 +22,6 @@ from cliploc_ros.messages import image_from_msg
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 from cliploc_ros.offline.datasets.bag_poses import PoseSource
-from cliploc_ros.offline.datasets.bags import BagWriter, typestore
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
@@ -31,6 +30,7 @@ pytestmark = pytest.mark.needs('pycolmap')
 METRES = FolderOptions(scale=1.0)
 START, MS = 1_700_000_000 * 10**9, 10**6
 ODOMETRY = 'nav_msgs/msg/Odometry'
+DEPTH = np.full((48, 64), 2000, dtype=np.uint16)
 
 
 @pytest.fixture(scope='module')
@@ -44,10 +44,6 @@ def room(shared_data):
     frames = read_folder(shared_data / 'rooms/hololens_office', FolderOptions(layout='tum'))
     return [(START + 100 * MS * place, one.image_rgb, one.map_from_camera, one.camera)
             for place, one in enumerate(frames.select(range(48)).read())]
-
-
-def make(name, **fields):
-    return typestore().types[name](**fields)
 
 
 def odometry_message(stamp, child, pose):
@@ -73,12 +69,7 @@ def write_bag(path, room, *, frame='camera', pose=lambda pose: pose, info=lambda
         if poses:
             recorded.append((at, '/ground_truth', bag_messages.POSE,
                              bag_messages.pose_message(stamp(at), 'map', pose(true_pose))))
-    with BagWriter(path) as bag:
-        for topic, kind in dict.fromkeys((topic, kind) for _, topic, kind, _ in recorded):
-            bag.add_topic(topic, kind)
-        for at, topic, _, message in sorted(recorded, key=lambda one: one[0]):
-            bag.write(topic, at, message)
-    return path
+    return write_messages(path, recorded)
 
 
 def reads(bag, topics=None, poses=None, depth=None):
@@ -226,7 +217,7 @@ def test_whose_poses_they_are_and_in_which_frame_depth_is(room, tmp_path):
         tmp_path / 'c', room, pose=lambda pose: pose @ invert_transform(body)))
     # depth of another camera needs its camera_info and tf
     depth_from = make_transform(np.eye(3), np.array([0.05, 0.0, 0.0]))
-    depths = [(at, '/depth/image', bag_messages.IMAGE, depth_message(at, 'depth'))
+    depths = [(at, '/depth/image', bag_messages.IMAGE, depth_message(at, DEPTH, 'depth'))
               for at, *_ in room]
     topics = BagTopics(depth='/depth/image')
     refuses("frame 'depth'.*/depth/camera_info is missing", write_bag(
@@ -236,13 +227,6 @@ def test_whose_poses_they_are_and_in_which_frame_depth_is(room, tmp_path):
              (START, '/tf_static', TF, transform(START, 'camera', 'depth', depth_from))]
     frame = next(reads(write_bag(tmp_path / 'e', room, more=[*depths, *infos]), topics).read())
     np.testing.assert_allclose(frame.depth.camera.color_from_depth, depth_from, atol=1e-9)
-
-
-def depth_message(stamp, frame):
-    message = bag_messages.image_message(stamp, frame, np.zeros((48, 64, 3), dtype=np.uint8))
-    values = np.full((48, 64), 2000, dtype=np.uint16)
-    return replace(message, encoding='16UC1', step=128,
-                   data=np.frombuffer(values.tobytes(), dtype=np.uint8))
 
 
 @pytest.mark.parametrize(('header', 'row'), [
@@ -355,7 +339,8 @@ def test_models_of_splatting_are_those_below_the_folder(shots, tmp_path):
 def test_depth_of_a_camera_without_calibration_and_of_one_of_several_robots(room, tmp_path):
     few, topics = room[:3], BagTopics(depth='/depth/image', tf='/robot2/tf')
     info = bag_messages.camera_info_message(START, 'depth', room[0][3])
-    more = [(at, '/depth/image', bag_messages.IMAGE, depth_message(at, 'depth')) for at, *_ in few]
+    more = [(at, '/depth/image', bag_messages.IMAGE, depth_message(at, DEPTH, 'depth'))
+            for at, *_ in few]
     more += [(START, '/depth/camera_info', bag_messages.CAMERA_INFO, info)]
     for robot in ('/robot1', '/robot2'):
         more += [(START, f'{robot}/tf_static', TF, transform(

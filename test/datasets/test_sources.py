@@ -9,7 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from rig_bag import TF, transform
+from rig_bag import TF, depth_message, make, transform, write_messages
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
@@ -22,17 +22,12 @@ from cliploc_ros.offline.datasets.bag_frames import (
     find_topics,
 )
 from cliploc_ros.offline.datasets.bag_poses import PoseSource, bag_odometry
-from cliploc_ros.offline.datasets.bags import BagWriter, typestore
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
 MS = 1_000_000
 START = 1_700_000_000_000 * MS
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5, 'plumb_bob', (0.0,) * 5)
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
-
-
-def make(name, **fields):
-    return typestore().types[name](**fields)
 
 
 def header(stamp, frame_id):
@@ -43,13 +38,6 @@ def header(stamp, frame_id):
 def pose_at(x, turn_deg=0.0):
     return make_transform(Rotation.from_euler('z', turn_deg, degrees=True).as_matrix(),
                           np.array([x, 0.0, 0.0]))
-
-
-def depth_message(stamp, values):
-    return make('sensor_msgs/msg/Image', header=header(stamp, 'camera'), height=values.shape[0],
-                width=values.shape[1], encoding='16UC1' if values.dtype == np.uint16 else '32FC1',
-                is_bigendian=0, step=values.shape[1] * values.itemsize,
-                data=np.frombuffer(values.tobytes(), dtype=np.uint8))
 
 
 def compressed_depth(stamp, encoding, values, a=0.0, b=0.0):
@@ -68,13 +56,7 @@ def write_bag(path, images_ms, messages):
     recorded += [(t, '/camera_info', bag_messages.CAMERA_INFO,
                   bag_messages.camera_info_message(START + t * MS, 'camera', CAMERA))
                  for t in images_ms]
-    recorded += messages
-    with BagWriter(path) as bag:
-        for topic, msgtype in {(topic, msgtype) for _, topic, msgtype, _ in recorded}:
-            bag.add_topic(topic, msgtype)
-        for t, topic, _, message in sorted(recorded, key=lambda one: one[0]):
-            bag.write(topic, START + t * MS, message)
-    return path
+    return write_messages(path, [(START + t * MS, *rest) for t, *rest in [*recorded, *messages]])
 
 
 def drive(stamps_ms=range(0, 1001, 100), offset_ns=0):
@@ -112,12 +94,10 @@ def test_what_contradicts_itself_in_a_recording(tmp_path, camera, frame_id, topi
     """The node's functions check them: refused, or reported in a note."""
     image = bag_messages.image_message(START, 'camera', np.zeros((48, 64, 3), dtype=np.uint8))
     info = bag_messages.camera_info_message(START, frame_id, camera)
-    with BagWriter(tmp_path / 'bag') as bag:
-        for name, msgtype, message in (
-                (topic, bag_messages.IMAGE, image), ('/info', bag_messages.CAMERA_INFO, info),
-                ('/pose', bag_messages.POSE, bag_messages.pose_message(START, 'map', np.eye(4)))):
-            bag.add_topic(name, msgtype)
-            bag.write(name, START, message)
+    write_messages(tmp_path / 'bag', [
+        (START, topic, bag_messages.IMAGE, image),
+        (START, '/info', bag_messages.CAMERA_INFO, info),
+        (START, '/pose', bag_messages.POSE, bag_messages.pose_message(START, 'map', np.eye(4)))])
 
     def read():
         frames = bag_frames(tmp_path / 'bag', BagTopics(topic, '/info'), PoseSource('/pose'))
