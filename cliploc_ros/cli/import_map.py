@@ -74,7 +74,12 @@ def import_map(options: argparse.Namespace,
     from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
     begin = time.monotonic()
-    _check_paths(options)
+    for name, path in (('out', options.out), ('report', options.report)):
+        if path is not None:
+            check_output(path)
+            if any(other is not None and path.exists() and other.exists() and path.samefile(other)
+                   for other in (options.input, options.refit)):
+                raise OptionsError(f'--{name} {path} is an input; name another file')
     if not options.frame_id.strip():
         raise OptionsError('--frame-id: must not be empty')
     try:
@@ -114,18 +119,6 @@ def import_map(options: argparse.Namespace,
     print(f'wrote {options.out} with {len(landmark_map)} landmarks in '
           f'{time.monotonic() - begin:.1f} s')
     return 0
-
-
-def _check_paths(options: argparse.Namespace) -> None:
-    """Refuse outputs that cannot be written, or are also inputs, before any work is done."""
-    for name in ('out', 'report'):
-        path = getattr(options, name)
-        if path is None:
-            continue
-        check_output(path)
-        for other in (options.input, options.refit):
-            if other is not None and path.exists() and other.exists() and path.samefile(other):
-                raise OptionsError(f'--{name} {path} is an input; name another file')
 
 
 if __name__ == '__main__':

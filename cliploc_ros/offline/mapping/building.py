@@ -42,8 +42,8 @@ from cliploc_ros.offline.mapping.pose_noise import (
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection, refine_mount
 from cliploc_ros.offline.mapping.triangulation import (
+    MAX_SIGMA_WITH_DEPTH_M,
     SUPPORT_IOU,
-    options_with_depth,
     scaled_depths,
     triangulate,
 )
@@ -198,7 +198,10 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
         # the draft from boxes alone gives the scale of depth
         given, depth_notes = scaled_depths(given, detections, draft.landmarks, draft.shown)
         notes += depth_notes
-        builder = builder._replace(options=options_with_depth(options))
+        # depth limits the deviation, not the parallax
+        builder = builder._replace(options=replace(
+            options, min_baseline_deg=0.0, max_position_sigma_m=max(
+                options.max_position_sigma_m, MAX_SIGMA_WITH_DEPTH_M)))
         draft = builder.draft(given)
     mount, odometry = None, detections.odom_from_camera
     if options.refine_mount:
