@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observations of the demo's walk with its real networks: complete, resumed, by two workers."""
 
+import fcntl
 import shutil
 import signal
 import subprocess
@@ -119,6 +120,11 @@ def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen):
         record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
     left = list(tmp_path.iterdir())
     assert len(left) == bool(seen)
+    for path in left:  # while another run has it open
+        with path.open('ab') as other, pytest.raises(DatasetError, match='ends here'):
+            fcntl.flock(other, fcntl.LOCK_EX)
+            record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
+        assert len(list(tmp_path.iterdir())) == 2
     assert all(str(path) in caplog.text for path in left)
 
 

@@ -176,7 +176,7 @@ def test_a_run_that_is_killed_twice_goes_on(server, write_sources, cache, run_he
     assert 0 < size <= HELD_BYTES and not whole.exists()
     server.held = ''
     kill_once(sources, out, lambda: any(
-        file.stat().st_size for file in out.glob('fr3/.mapped.cliploc-*.unfinished')))
+        file.stat().st_size for file in out.glob('fr3/.mapped.cliploc-*.outputs')))
     assert (ARCHIVE, f'bytes={size}-') in server.asked
     assert whole.read_bytes() == server.files[ARCHIVE]
     assert not (out / 'fr3/map.yaml').exists()

@@ -12,6 +12,7 @@ import base64
 import hashlib
 import json
 import logging
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -187,9 +188,7 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
             logger.warning('recording again, because the options changed: %s', file)
         except DatasetError as error:
             logger.warning('recording again: %s', error)
-    with closing(Log(file.with_name(outputs_name(frames, described)), DatasetError,
-                     'make room or name another file with `record_to`, then run again: it '
-                     'continues from here', _parse_entry)) as outputs:
+    with closing(_open_outputs(file.with_name(outputs_name(frames, described)))) as outputs:
         recorded = _with_odometry(_record(frames, options, described, outputs), odometry)
     save_observations(file, recorded)
     logger.warning('wrote %s', file)
@@ -230,6 +229,18 @@ def outputs_name(frames: Frames, described: str) -> str:
         content |= {'source': [*content['source'][:3], frames.digest.partition(' ')[0]],
                     'reading': None}
     return f'.{frames.source.resolve().name}{_BESIDE}{_digest(json.dumps(content))}.outputs'
+
+
+def _open_outputs(path: Path) -> Log:
+    """Open a file of outputs; while another run adds to it, another file beside it."""
+    try:
+        return Log(path, DatasetError, 'make room or name another file with `record_to`, then run '
+                   'again: it continues from here', lambda line: SeenFrame.from_bytes(
+                       base64.b64decode(parse_json(line))))
+    except DatasetError as error:
+        if not isinstance(error.__cause__, BlockingIOError):
+            raise
+        return _open_outputs(path.with_suffix(f'.{os.getpid()}.outputs'))
 
 
 def _again(seen: SeenFrame, raw: RawFrame) -> SeenFrame:
@@ -291,10 +302,6 @@ def _record(frames: Frames, options: RecordingOptions, described: str, outputs: 
                        unusable[0])
     encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
     return _assemble(seen, frames, filters, encoder_key, described)
-
-
-def _parse_entry(line: bytes) -> SeenFrame:
-    return SeenFrame.from_bytes(base64.b64decode(parse_json(line)))
 
 
 @contextmanager
