@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -104,8 +103,19 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
             bag.add_topic(boxes_topic, bag_messages.DETECTIONS)
         for stamp_ns, path in progress(
                 list(zip(sequence.stamps_ns, sequence.image_paths, strict=True))):
-            bag.write(image_topic, stamp_ns,
-                      _image_message(stamp_ns, frame, path, camera, is_compressed))
+            # decoded in any case, to refuse a damaged file before a node receives it
+            pixels_rgb, _ = read_color(ImageFile(stamp_ns, path, camera))
+            if is_compressed:
+                with naming(path, OSError, what='cannot be read: '):
+                    data = read_file(path)
+                codec = next((codec for magic, codec in _CODECS.items()
+                              if data.startswith(magic)), None)
+                if codec is None:
+                    raise DatasetError(f'{path}: is neither PNG nor JPEG; write raw images')
+                message = bag_messages.compressed_image_message(stamp_ns, frame, data, codec)
+            else:
+                message = bag_messages.image_message(stamp_ns, frame, pixels_rgb)
+            bag.write(image_topic, stamp_ns, message)
             bag.write(info_topic, stamp_ns,
                       bag_messages.camera_info_message(stamp_ns, frame, camera))
             if stamp_ns in recorded:
@@ -123,21 +133,6 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
                 bag.write(imu_topic, stamp_ns, bag_messages.imu_message(
                     stamp_ns, options.imu_frame, acceleration))
     return ConversionResult(len(sequence), poses, boxes, len(stamps_ns))
-
-
-def _image_message(stamp_ns: int, frame_id: str, path: Path, camera: Camera, is_compressed: bool
-                   ) -> Any:
-    """Make a message of an image file; DatasetError: it is damaged or has another size."""
-    # Compressed images are decoded too, to refuse a damaged file before a node receives it.
-    pixels_rgb, _ = read_color(ImageFile(stamp_ns, path, camera))
-    if not is_compressed:
-        return bag_messages.image_message(stamp_ns, frame_id, pixels_rgb)
-    with naming(path, OSError, what='cannot be read: '):
-        data = read_file(path)
-    for magic, codec in _CODECS.items():
-        if data.startswith(magic):
-            return bag_messages.compressed_image_message(stamp_ns, frame_id, data, codec)
-    raise DatasetError(f'{path}: is neither PNG nor JPEG; write raw images instead')
 
 
 def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | None = None

@@ -334,7 +334,11 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
     if frames.varies:
         cameras, rows = group_cameras([frame.pinhole for frame in seen])
         camera_names = names_of_group(cameras)
-        seen = [_seen_by(frame, cameras[row]) for frame, row in zip(seen, rows, strict=True)]
+        # boxes as the merged pinhole camera at the same pose would see them
+        seen = [frame if frame.pinhole == cameras[row] else replace(
+            frame, is_distorted=True, bboxes_xyxy=cameras[row].bboxes_in_pixels(
+                frame.pinhole.normalize_bboxes(frame.bboxes_xyxy)))
+            for frame, row in zip(seen, rows, strict=True)]
     names = np.concatenate([frame.class_ids for frame in seen])
     class_names, classes = np.unique(names, return_inverse=True)
     depths = np.concatenate([frame.depths for frame in seen])
@@ -363,14 +367,6 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
         images=sum(keyframes.asked for keyframes in filters.values()),
         without_pose=sum(keyframes.without_pose for keyframes in filters.values()),
         described=described)
-
-
-def _seen_by(seen: SeenFrame, other: Camera) -> SeenFrame:
-    """Return a frame with the boxes that another pinhole camera at the same pose would see."""
-    if seen.pinhole == other:
-        return seen
-    rays = seen.pinhole.normalize_bboxes(seen.bboxes_xyxy)
-    return replace(seen, bboxes_xyxy=other.bboxes_in_pixels(rays), is_distorted=True)
 
 
 def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> Camera:
