@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from types import FrameType
 from typing import Any, Self
 
 from cliploc_ros.errors import CliplocError, MapError, OptionsError
@@ -294,8 +293,4 @@ class Interruption:
 
 def interrupt_on_sigterm() -> None:
     """Make SIGTERM raise KeyboardInterrupt as Ctrl-C does, so that partial output is removed."""
-    signal.signal(signal.SIGTERM, _interrupt)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+    signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -12,9 +12,9 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.folders import tum_frames
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.observations import load_recorded
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.offline.evaluation.recording import make_queries_of
@@ -52,7 +52,7 @@ def run_map_demo(options: DemoOptions) -> None:
     objects = read_objects(walk)
     files = {name: options.out / f'built_map.{name}' for name in ('yaml', 'json', 'npz')}
     _build(options, walk, files)
-    detections = load_recorded(files['npz']).detections
+    detections = load_observations(files['npz'])
     review = review_map(
         LandmarkMap.from_file(files['yaml']), objects,
         count_sightings(tuple(read_frames(walk)), detections),
@@ -86,7 +86,7 @@ def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
     print(f'localizing all {len(sequence)} images of the wake-ups in both maps', flush=True)
     look = LoadNetworks(DetectorOptions(model=str(options.assets / 'yolo.onnx')), clip)()
     recorded = record_every_frame(
-        tum_frames(sequence, find_camera(None, sequence.folder)[0]), look)
+        read_folder(sequence.folder, FolderOptions(layout='tum')), look)
     method = Method(options.method, options.values.options())
     summaries = {}
     for name, file in (('built map', built_map_file), ('true map', options.assets / 'map.yaml')):

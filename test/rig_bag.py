@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 
-from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagWriter, typestore
 from cliploc_ros.offline.datasets.intrinsics import find_camera
@@ -69,12 +69,33 @@ def write_rig_bag(path, cameras=tuple(MOUNTS), halved=(), in_tf=tuple(MOUNTS)):
 
 def transform(stamp, parent, child, pose):
     """Make a tf message with the pose of one coordinate frame in another."""
-    types, header = typestore().types, bag_messages.pose_message(stamp, parent, pose).header
-    numbers = [pose[:3, 3], quaternion_from_transform(pose)]
-    translation, rotation = (
-        types[f'geometry_msgs/msg/{name}'](**dict(zip(axes, row.tolist(), strict=True)))
-        for name, axes, row in zip(('Vector3', 'Quaternion'), ('xyz', 'xyzw'), numbers,
-                                   strict=True))
-    return types[TF](transforms=[types['geometry_msgs/msg/TransformStamped'](
-        header=header, child_frame_id=child, transform=types['geometry_msgs/msg/Transform'](
-            translation=translation, rotation=rotation))])
+    field = bag_messages.pose_message(stamp, parent, pose)
+    x, y, z = pose[:3, 3].tolist()
+    return make(TF, transforms=[make(
+        'geometry_msgs/msg/TransformStamped', header=field.header, child_frame_id=child,
+        transform=make('geometry_msgs/msg/Transform', rotation=field.pose.orientation,
+                       translation=make('geometry_msgs/msg/Vector3', x=x, y=y, z=z)))])
+
+
+def make(name, **fields):
+    """Make a message of a type."""
+    return typestore().types[name](**fields)
+
+
+def depth_message(stamp, values, frame='camera'):
+    """Make a depth image (h, w) of 16-bit counts or of floats."""
+    return make('sensor_msgs/msg/Image', header=bag_messages.pose_message(
+        stamp, frame, np.eye(4)).header, height=values.shape[0], width=values.shape[1],
+        encoding='16UC1' if values.dtype == np.uint16 else '32FC1', is_bigendian=0,
+        step=values.shape[1] * values.itemsize,
+        data=np.frombuffer(values.tobytes(), dtype=np.uint8))
+
+
+def write_messages(path, recorded):
+    """Write messages, given by time of recording [ns], topic, type and message, in any order."""
+    with BagWriter(path) as bag:
+        for topic, kind in dict.fromkeys((topic, kind) for _, topic, kind, _ in recorded):
+            bag.add_topic(topic, kind)
+        for at, topic, _, message in sorted(recorded, key=lambda one: one[0]):
+            bag.write(topic, at, message)
+    return path

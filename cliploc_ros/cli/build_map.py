@@ -6,9 +6,8 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,9 +22,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.core.keyframes.layer import KeyframeLayer
-    from cliploc_ros.offline.datasets.frames import Frames
-    from cliploc_ros.offline.mapping.make_map import Labeller, MadeMap
+    from cliploc_ros.offline.datasets.map_recording import MapRecording
+    from cliploc_ros.offline.mapping.make_map import MadeMap
     from cliploc_ros.offline.mapping.options import MappingOptions
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
@@ -97,49 +95,47 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import move_frames
-    from cliploc_ros.offline.mapping.building import LEAST_EXPLAINED, MappingReport
-    from cliploc_ros.offline.mapping.make_map import find_labeller, update_map, write_made_map
+    from cliploc_ros.offline.mapping import make_map
 
     begin = time.monotonic()
     update, name = options.update, sources.source_of(options).name
-    _check(options)
+    command.check_output(options.out)
+    layer, note = map_layer.layer_options(options)
+    _refuse_conflicts(options)
     if update is not None and not len(LandmarkMap.from_file(update)):
         raise OptionsError(f'--update {update}: is a map of keyframes alone, which cannot be '
                            'updated; build a new one')
     mapping = _mapping_options(options, f'build_map {name}')
     source = sources.read_source(options)
-    _tell_misspelt(mapping.moving_classes, source.recorded.detections.class_names)
-    detections, scale, rotation = _placed(source.recorded.detections, options, mapping)
+    _tell_misspelt(mapping.moving_classes, source.recorded.class_names)
+    detections, scale, rotation = _placed(source.recorded, options, mapping)
     if without := source.recorded.without_pose:
         print(f'no pose: {without} of {source.recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
-    clip = partial(sources.clip_options, options) if options.clip else None
-    labeller = find_labeller(detections, clip, options.vocabulary)
-    layer, note = None, ''
-    with _report_to(options.report) as report:
-        if update is None:
-            frames = source.frames and move_frames(source.frames, scale, rotation)
-            made, layer, note = _make(options, detections, labeller, mapping, frames)
+    labeller = make_map.find_labeller(
+        detections, partial(sources.clip_options, options) if options.clip else None,
+        options.vocabulary)
+    try:
+        if update is not None:
+            made = make_map.update_map(update, detections, labeller, mapping)
+            note = ('the new map has no keyframes, which need all images: it localizes by objects '
+                    'alone; build a new map to have both') if layer_path(update).exists() else ''
         else:
-            if layer_path(update).exists():
-                note = ('the new map has no keyframes, which need all images: it localizes by '
-                        'objects alone; build a new map to have both')
-            made = update_map(update, detections, labeller, mapping)
-        report |= made.report.as_dict()
-    lines = made.report.lines()
-    head = [f'built by build_map from {name}', *lines[:2]] if update is None else [
-        f'{update.name}, updated by build_map from {name}', lines[0]]
-    if made.mount is not None:
-        lines.append(_mount_option(options, made.mount.given_from_corrected))
-    is_poor = isinstance(made.report, MappingReport) and made.report.landmarks > 0 and (
-        made.report.explained_of_classes < LEAST_EXPLAINED)
-    path = options.out.with_stem(f'{options.out.stem}.refused') if is_poor else options.out
-    lines += write_made_map(path, replace(made, layer=layer), head, sources.recording_of(
-        options, source.file, scale, rotation), update)
-    print('\n'.join(lines))
-    for text in filter(None, (labeller.note, note)):
-        print(f'note: {text}')
+            frames = source.frames and move_frames(source.frames, scale, rotation)
+            with command.StageBar() as bar:
+                made = make_map.make_map(detections, labeller, mapping, frames, layer, bar.show)
+            note = note or made.note
+            if options.keyframe_layer and note:
+                raise MappingError(note)
+    except MappingError as error:
+        left_out = getattr(error, 'left_out', ())
+        _write_report(options.report, {'failure': str(error),
+                                       'left_out': [asdict(landmark) for landmark in left_out]})
+        raise
+    _write_report(options.report, made.report.as_dict())
+    recording = sources.recording_of(options, source.file, scale, rotation)
+    path, is_poor = _write(options, made, name, recording, [labeller.note, note])
     print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
     try:
         if options.check:
@@ -154,90 +150,37 @@ def build(options: argparse.Namespace) -> int:
     return int(is_poor)
 
 
-def _mapping_options(options: argparse.Namespace, source: str) -> 'MappingOptions':
-    """Return the options of mapping; source is the origin that the map names."""
-    from cliploc_ros.offline.mapping.options import (
-        MOVING_CLASSES,
-        MappingOptions,
-        OdometryErrors,
-        PoseErrors,
-    )
+def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: 'MapRecording',
+           notes: Sequence[str]) -> tuple[Path, bool]:
+    """Write a map, and print its report.
 
-    sigma_m, sigma_deg = options.pose_noise or (0.02, 0.5)
-    errors = PoseErrors(sigma_m, sigma_deg, options.pose_correlation)
-    return MappingOptions(
-        pose_errors=errors if options.joint or options.pose_noise else None,
-        estimate_pose_errors=options.joint is None,
-        odometry_errors=OdometryErrors(*options.odometry_noise or ()),
-        refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
-        min_baseline_deg=options.min_baseline, frame_id=options.frame_id, source=source,
-        random_seed=options.seed,
-        moving_classes=MOVING_CLASSES if options.moving is None else tuple(
-            filter(None, map(str.strip, options.moving.split(',')))))
-
-
-def _tell_misspelt(moving: Sequence[str], seen: Sequence[str]) -> None:
-    """Report names of --moving that look misspelt: their objects would become landmarks."""
-    from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
-
-    known = {name.lower() for name in (*seen, *shipped_classes())}
-    for name, hint in misspelt_classes(map(str.lower, moving), known, all_known=True).items():
-        print(f"note: --moving: no box is of class '{name}'{hint}", flush=True)
-
-
-def _make(options: argparse.Namespace, detections: 'PosedDetections', labeller: 'Labeller',
-          mapping: 'MappingOptions', frames: 'Frames | None'
-          ) -> 'tuple[MadeMap, KeyframeLayer | None, str]':
-    """Return a new map, its keyframes, and a note if it has no keyframes.
-
-    If no landmark is found, keyframes alone make a map. MappingError: there are no keyframes,
-    either.
+    Return its path, which is another one if the map is poor, and whether it is.
     """
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.offline.mapping.building import MappingReport
-    from cliploc_ros.offline.mapping.make_map import MadeMap, make_map
+    from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+    from cliploc_ros.offline.datasets.poses import mount_from_numbers
+    from cliploc_ros.offline.mapping.building import LEAST_EXPLAINED, MappingReport
+    from cliploc_ros.offline.mapping.make_map import write_made_map
 
-    failure = None
-    with command.StageBar() as bar:
-        try:
-            made = make_map(detections, labeller, mapping, progress=bar.show)
-        except MappingError as error:
-            if frames is None or options.keyframe_layer is False:
-                raise
-            failure = error
-            made = MadeMap(LandmarkMap.empty(options.frame_id),
-                           MappingReport.of_nothing(detections, error))
-        layer, note = map_layer.make_layer(options, frames, made.landmark_map)
-        if failure is not None and layer is None:
-            raise failure
-    return made, layer, note
-
-
-@contextmanager
-def _report_to(path: Path | None) -> Iterator[dict[str, Any]]:
-    """Write the report that the caller fills, or the reason of a MappingError, if a path is given.
-
-    The report of a failure also has the landmarks that were left out.
-    """
-    from cliploc_ros.files.storage import write_text
-
-    report: dict[str, Any] = {}
-    try:
-        yield report
-    except MappingError as error:
-        left_out = getattr(error, 'left_out', ())
-        report |= {'failure': str(error), 'left_out': [asdict(landmark) for landmark in left_out]}
-        raise
-    finally:
-        if path is not None and report:
-            write_text(path, json.dumps(report, indent=1))
-            print(f'report: {path}', flush=True)
+    lines = made.report.lines()
+    head = [f'built by build_map from {name}', *lines[:2]] if options.update is None else [
+        f'{options.update.name}, updated by build_map from {name}', lines[0]]
+    if made.mount is not None:
+        mount = made.mount.given_from_corrected
+        if options.mount is not None:
+            mount = mount_from_numbers(options.mount) @ mount
+        numbers = [*mount[:3, 3], *quaternion_from_transform(mount)]
+        lines.append('corrected mount: --mount ' + ' '.join(
+            f'{number:.5f}' for number in numbers))
+    is_poor = isinstance(made.report, MappingReport) and made.report.landmarks > 0 and (
+        made.report.explained_of_classes < LEAST_EXPLAINED)
+    path = options.out.with_stem(f'{options.out.stem}.refused') if is_poor else options.out
+    lines += write_made_map(path, made, head, recording, options.update)
+    print('\n'.join([*lines, *(f'note: {text}' for text in notes if text)]))
+    return path, is_poor
 
 
-def _check(options: argparse.Namespace) -> None:
-    """Refuse an unwritable output and conflicting options, before any work is done."""
-    command.check_output(options.out)
-    map_layer.check_layer_options(options)
+def _refuse_conflicts(options: argparse.Namespace) -> None:
+    """Refuse conflicting options, before any work is done."""
     is_update = options.update is not None
     for is_wrong, text in (
             (options.level and is_update, '--level is for new maps, not for --update'),
@@ -253,6 +196,41 @@ def _check(options: argparse.Namespace) -> None:
             raise OptionsError(text)
 
 
+def _mapping_options(options: argparse.Namespace, source: str) -> 'MappingOptions':
+    """Return the options of mapping; source is the origin that the map names."""
+    from cliploc_ros.offline.mapping import options as mapping
+
+    sigma_m, sigma_deg = options.pose_noise or (0.02, 0.5)
+    errors = mapping.PoseErrors(sigma_m, sigma_deg, options.pose_correlation)
+    return mapping.MappingOptions(
+        pose_errors=errors if options.joint or options.pose_noise else None,
+        estimate_pose_errors=options.joint is None,
+        odometry_errors=mapping.OdometryErrors(*options.odometry_noise or ()),
+        refine_mount=options.refine_mount, min_viewpoints=options.min_viewpoints,
+        min_baseline_deg=options.min_baseline, frame_id=options.frame_id, source=source,
+        random_seed=options.seed,
+        moving_classes=mapping.MOVING_CLASSES if options.moving is None else tuple(
+            filter(None, map(str.strip, options.moving.split(',')))))
+
+
+def _tell_misspelt(moving: Sequence[str], seen: Sequence[str]) -> None:
+    """Report names of --moving that look misspelt: their objects would become landmarks."""
+    from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
+
+    known = {name.lower() for name in (*seen, *shipped_classes())}
+    for name, hint in misspelt_classes(map(str.lower, moving), known, all_known=True).items():
+        print(f"note: --moving: no box is of class '{name}'{hint}", flush=True)
+
+
+def _write_report(path: Path | None, report: dict[str, Any]) -> None:
+    """Write a report, if a path is given."""
+    from cliploc_ros.files.storage import write_text
+
+    if path is not None:
+        write_text(path, json.dumps(report, indent=1))
+        print(f'report: {path}', flush=True)
+
+
 def _placed(detections: 'PosedDetections', options: argparse.Namespace,
             mapping: 'MappingOptions'
             ) -> 'tuple[PosedDetections, float, NDArray[np.float64]]':
@@ -261,16 +239,11 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
 
     from cliploc_ros.cli.sources import metres_of
     from cliploc_ros.offline.mapping.make_map import scale_of_objects
-    from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
+    from cliploc_ros.offline.mapping.tilt import find_levelling
 
     scale, rotation = 1.0, np.eye(3)
     if folder_of(options) is None:  # folders are levelled when they are read
-        found, note = find_tilt(detections.map_from_camera), tilt_note(detections.map_from_camera)
-        if options.level:
-            if found is None:
-                raise OptionsError(f'--level: {NO_VERTICAL}')
-            rotation = found[0]
-            note = f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z'
+        rotation, note = find_levelling(detections.map_from_camera, options.level)
         print(note + '\n' if note else '', end='', flush=True)
         detections = detections.moved(scale, rotation)
     if options.object_size is not None:
@@ -280,17 +253,6 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
         print(f'a unit is {scale:.5g} m, by {objects} objects of class {class_name}', flush=True)
         detections = detections.moved(scale, np.eye(3))
     return detections, scale, rotation
-
-
-def _mount_option(options: argparse.Namespace, correction: 'NDArray[np.float64]') -> str:
-    """Return the corrected mount as the option --mount takes it."""
-    from cliploc_ros.core.geometry.transforms import quaternion_from_transform
-    from cliploc_ros.offline.datasets.poses import mount_from_numbers
-
-    given = (correction if options.mount is None
-             else mount_from_numbers(options.mount) @ correction)
-    numbers = [*given[:3, 3], *quaternion_from_transform(given)]
-    return 'corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers)
 
 
 if __name__ == '__main__':

@@ -74,7 +74,12 @@ def import_map(options: argparse.Namespace,
     from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
     begin = time.monotonic()
-    _check_paths(options)
+    for name, path in (('out', options.out), ('report', options.report)):
+        if path is not None:
+            check_output(path)
+            if any(other is not None and path.exists() and other.exists() and path.samefile(other)
+                   for other in (options.input, options.refit)):
+                raise OptionsError(f'--{name} {path} is an input; name another file')
     if not options.frame_id.strip():
         raise OptionsError('--frame-id: must not be empty')
     try:
@@ -83,48 +88,37 @@ def import_map(options: argparse.Namespace,
         raise OptionsError(f'--transform: {error}') from error
     given = (read or read_table)(options.input)
     try:
-        imported = place(given, f'import_map {options.format} {options.input.name}',
-                         options.frame_id, options.scale, map_from_given,
-                         tuple(options.errors))
+        landmark_map, left_out = place(
+            given, f'import_map {options.format} {options.input.name}', options.frame_id,
+            options.scale, map_from_given, tuple(options.errors))
     except DatasetError as error:
         raise DatasetError(f'{options.input}: {error}') from error
-    result = refit(imported, options.refit, options.keep_unsupported) if options.refit else (
-        imported._replace(notes=(
-            f'{len(imported.landmark_map)} landmarks, not fitted to a recording',
-            *(f'note: {note}' for note in imported.notes),
-            'note: maps of other systems localize better after --refit OBSERVATIONS')))
+    notes = [f'{len(landmark_map)} landmarks, not fitted to a recording',
+             'note: maps of other systems localize better after --refit OBSERVATIONS']
+    if options.refit is not None:
+        landmark_map, unfitted, notes = refit(landmark_map, options.refit,
+                                              options.keep_unsupported)
+        left_out += unfitted
+    notes += [f'note: {note}' for note in given.notes]
     of_map_before = recording_path(options.out), layer_path(options.out)
     had_layer = of_map_before[1].exists()
-    write_map(options.out, result.landmark_map,
-              [f'imported by import_map from {options.input.name} ({options.format})',
-               *result.notes[:1]], besides=dict.fromkeys(of_map_before))
+    write_map(options.out, landmark_map,
+              [f'imported by import_map from {options.input.name} ({options.format})', notes[0]],
+              besides=dict.fromkeys(of_map_before))
     if had_layer:
         print(removed_layer(options.out))
     if options.report is not None:
         write_text(options.report, json.dumps({
-            'landmarks': len(result.landmark_map), 'lines': result.notes,
-            'left_out': [left_out._asdict() for left_out in result.left_out]}, indent=1))
-    print('\n'.join(printable(line) for line in result.notes))
-    print(f'left out: {len(result.left_out)}')
-    for left_out in result.left_out[:_LEFT_OUT_SHOWN]:
-        print(printable(f'  {left_out.landmark_id}: {left_out.reason}'))
-    if len(result.left_out) > _LEFT_OUT_SHOWN:
-        print(f'  and {len(result.left_out) - _LEFT_OUT_SHOWN} more: see --report')
-    print(f'wrote {options.out} with {len(result.landmark_map)} landmarks in '
+            'landmarks': len(landmark_map), 'lines': notes,
+            'left_out': [skipped._asdict() for skipped in left_out]}, indent=1))
+    lines = [*notes, f'left out: {len(left_out)}', *(
+        f'  {skipped.landmark_id}: {skipped.reason}' for skipped in left_out[:_LEFT_OUT_SHOWN])]
+    if len(left_out) > _LEFT_OUT_SHOWN:
+        lines.append(f'  and {len(left_out) - _LEFT_OUT_SHOWN} more: see --report')
+    print('\n'.join(map(printable, lines)))
+    print(f'wrote {options.out} with {len(landmark_map)} landmarks in '
           f'{time.monotonic() - begin:.1f} s')
     return 0
-
-
-def _check_paths(options: argparse.Namespace) -> None:
-    """Refuse outputs that cannot be written, or are also inputs, before any work is done."""
-    for name in ('out', 'report'):
-        path = getattr(options, name)
-        if path is None:
-            continue
-        check_output(path)
-        for other in (options.input, options.refit):
-            if other is not None and path.exists() and other.exists() and path.samefile(other):
-                raise OptionsError(f'--{name} {path} is an input; name another file')
 
 
 if __name__ == '__main__':

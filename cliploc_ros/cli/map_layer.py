@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.command import option, positive_int
-from cliploc_ros.errors import MapError, MappingError, ModelError, OptionsError
+from cliploc_ros.errors import MapError, ModelError, OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.core.keyframes.features import FeatureKind
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.offline.datasets.frames import Frames
+    from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
 _DEFAULT_POINTS = 600
 SIFT, XFEAT = FEATURES = 'sift', 'xfeat'
@@ -34,65 +33,34 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
            'image: anyone who has the file can see the place')
 
 
-def check_layer_options(options: argparse.Namespace) -> None:
-    """Refuse a layer that cannot be made, before any work is done.
+def layer_options(options: argparse.Namespace) -> 'tuple[LayerOptions | None, str]':
+    """Return the options of the layer; None with a note if there can be none, '' if declined.
 
-    OptionsError: the message names the conflicting options. ModelError: the network of
-    the features is missing.
+    OptionsError: the message names the conflicting options. ModelError: the network of the
+    features is missing.
     """
-    problem = _problem(options)
-    if options.keyframe_layer and problem:
-        raise OptionsError(f'--keyframe-layer is not for {problem}')
-    if options.keyframe_images and (problem or options.keyframe_layer is False):
-        raise OptionsError('--keyframe-images is for --keyframe-layer')
-    if options.keyframe_features == XFEAT:
-        if problem or options.keyframe_layer is False:
-            raise OptionsError('--keyframe-features is for --keyframe-layer')
-        _feature_kind(options)
-
-
-def _problem(options: argparse.Namespace) -> str:
-    """Return the option that prevents keyframes, and what to do; '' if there is none."""
-    for name in ('observations', 'update'):
-        if getattr(options, name) is not None:
-            return (f'--{name}: keyframes need the images of the recording that the map is built '
-                    'from; give --bag or a folder')
-    if options.every > 1:
-        return '--every: choose frames with --keyframes METRES DEGREES'
-    return ('--refine-mount: build again with the corrected --mount' if options.refine_mount
-            else '')
-
-
-def make_layer(options: argparse.Namespace, frames: 'Frames | None', landmark_map: 'LandmarkMap'
-               ) -> 'tuple[KeyframeLayer | None, str]':
-    """Return the layer of a map, and a note if there is none although it was not declined.
-
-    MappingError: a layer was requested, but cannot be made from the images.
-    """
-    from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-
-    if options.keyframe_layer is False:
-        return None, ''
-    if problem := _problem(options):
-        return None, f'no keyframes with {problem}'
-    assert frames is not None  # only --observations comes without images
-    distance_m, angle_deg = options.keyframes
-    try:
-        return build_layer(frames, landmark_map, LayerOptions(
-            distance_m, angle_deg, options.keyframe_points, options.keyframe_images,
-            _feature_kind(options))), ''
-    except MappingError as error:
-        if options.keyframe_layer:
-            raise
-        return None, f'no keyframes: {error}'
-
-
-def _feature_kind(options: argparse.Namespace) -> 'FeatureKind':
-    """Return the kind of features that a layer gets; ModelError: see load_xfeat."""
     from cliploc_ros.core.keyframes import features
     from cliploc_ros.models.xfeat import load_xfeat
+    from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
-    return load_xfeat() if options.keyframe_features == XFEAT else features.SIFT
+    problem = next((
+        f'--{name}: keyframes need the images of the recording that the map is built from; give '
+        '--bag or a folder' for name in ('observations', 'update')
+        if getattr(options, name) is not None),
+        '--every: choose frames with --keyframes METRES DEGREES' if options.every > 1 else
+        '--refine-mount: build again with the corrected --mount' if options.refine_mount else '')
+    if options.keyframe_layer and problem:
+        raise OptionsError(f'--keyframe-layer is not for {problem}')
+    if problem or options.keyframe_layer is False:
+        for is_given, name in ((options.keyframe_images, '--keyframe-images'),
+                               (options.keyframe_features == XFEAT, '--keyframe-features')):
+            if is_given:
+                raise OptionsError(f'{name} is for --keyframe-layer')
+        return None, '' if options.keyframe_layer is False else f'no keyframes with {problem}'
+    distance_m, angle_deg = options.keyframes
+    return LayerOptions(
+        distance_m, angle_deg, options.keyframe_points, options.keyframe_images,
+        load_xfeat() if options.keyframe_features == XFEAT else features.SIFT), ''
 
 
 def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:

@@ -25,9 +25,10 @@ from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, join_frames, move_frames
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
-from cliploc_ros.offline.datasets.observations import Recorded, load_recorded
+from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.recording import recorder
 from cliploc_ros.units import NS_PER_S
 
@@ -88,7 +89,7 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
 class Source(NamedTuple):
     """The content of a source: observations, their file, and images if there are any."""
 
-    recorded: Recorded
+    recorded: PosedDetections
     file: Path
     frames: Frames | None
 
@@ -104,7 +105,7 @@ def read_source(options: argparse.Namespace) -> Source:
     check_folder_options(options)
     find_topics(options, options.bag)
     if options.observations is not None:
-        return Source(load_recorded(options.observations), options.observations, None)
+        return Source(load_observations(options.observations), options.observations, None)
     frames = read_frames(options)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
     recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))
@@ -237,24 +238,10 @@ def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64
     topics = bag_frames.BagTopics(options.image, options.camera_info, options.rectified,
                                   options.depth or '', options.intrinsics,
                                   round(options.stamp_tolerance * NS_PER_S), options.tf)
-    read = _read_poses(options, name, mount, gap_ns)
-    try:
-        return bag_frames.bag_frames(options.bag, topics.of_camera(name), read,
-                                     _depth_format(options))
-    except DatasetError as error:
-        if not name:
-            raise
-        raise DatasetError(f"camera '{name}': {error}") from error
-
-
-def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
-                gap_ns: int) -> bag_poses.ReadPoses:
-    """Return a reader of the poses of a camera of a bag; gap_ns is for poses of a topic."""
-    given = [name for name in ('--pose-topic', '--map-frame', '--trajectory')
-             if getattr(options, name[2:].replace('-', '_')) is not None]
-    max_gap_ns = round(options.max_gap * NS_PER_S)
-    tolerance_ns = round(options.stamp_tolerance * NS_PER_S)
     several = len(options.cameras) > 1
+    given = [name for name, value in (
+        ('--pose-topic', options.pose_topic), ('--map-frame', options.map_frame),
+        ('--trajectory', options.trajectory)) if value is not None]
     for is_wrong, text in (
             (len(given) > 1, f'{", ".join(given)}: give only one source of poses'),
             (not given and mount is not None,
@@ -267,41 +254,44 @@ def _read_poses(options: argparse.Namespace, camera: str, mount: NDArray[np.floa
              '--camera-frame is for one camera: with several, the images name the frames')):
         if is_wrong:
             raise OptionsError(text)
-    if options.pose_topic is not None:
-        return _poses_of_topic(options, options.pose_topic, camera, mount, gap_ns)
-    if options.map_frame is not None:
-        return bag_poses.poses_of_tf(options.map_frame, options.camera_frame, max_gap_ns,
-                                     options.tf)
+    source = _pose_source(options, name, mount, gap_ns, options.pose_topic, options.map_frame)
     if options.trajectory is not None:
-        poses = replace(read_tum_trajectory(options.trajectory), max_gap_ns=max_gap_ns,
-                        body_from_camera=mount, tolerance_ns=tolerance_ns)
-        return lambda reader, camera_frame: poses
-    return bag_poses.find_poses(max_gap_ns, bag_frames.topic_of(camera, bag_poses.GROUND_TRUTH),
-                                options.camera_frame, gap_ns, tolerance_ns, options.tf)
+        source = replace(source, trajectory=replace(
+            read_tum_trajectory(options.trajectory), max_gap_ns=source.max_gap_ns,
+            body_from_camera=mount, tolerance_ns=topics.tolerance_ns))
+    try:
+        return bag_frames.bag_frames(options.bag, topics.of_camera(name), source,
+                                     _depth_format(options))
+    except DatasetError as error:
+        if not name:
+            raise
+        raise DatasetError(f"camera '{name}': {error}") from error
 
 
-def _poses_of_topic(options: argparse.Namespace, topic: str, camera: str,
-                    mount: NDArray[np.float64] | None, gap_ns: int) -> bag_poses.ReadPoses:
-    """Return a reader of a topic, which is in the camera's namespace if there is no mount."""
-    return bag_poses.poses_of_topic(
-        topic if mount is not None else bag_frames.topic_of(camera, topic), gap_ns, mount,
-        round(options.stamp_tolerance * NS_PER_S), options.tf)
+def _pose_source(options: argparse.Namespace, camera: str, mount: NDArray[np.float64] | None,
+                 gap_ns: int, topic: str | None, map_frame: str | None) -> bag_poses.PoseSource:
+    """Return the source of a camera's poses; without a mount, a topic is in its namespace."""
+    if topic is not None and mount is None:
+        topic = bag_frames.topic_of(camera, topic)
+    return bag_poses.PoseSource(
+        topic, map_frame, None, options.camera_frame, options.tf,
+        round(options.max_gap * NS_PER_S), gap_ns, mount,
+        round(options.stamp_tolerance * NS_PER_S),
+        bag_frames.topic_of(camera, bag_poses.GROUND_TRUTH))
 
 
 def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
     """Return the odometry of each camera of a bag, by name; None if no option names any."""
-    topic, max_gap_ns = options.odometry_topic, round(options.max_gap * NS_PER_S)
+    topic = options.odometry_topic
     if options.odometry_frame is None and topic is None:
         return None
     if topic is not None and options.map_frame is not None:
         raise OptionsError('--odometry-topic needs a --mount, which is not for --map-frame: give '
                            '--odometry-frame')
     return {name: bag_poses.bag_odometry(
-        options.bag, bag_frames.topic_of(name, options.image),
-        _poses_of_topic(options, topic, name, mount, max_gap_ns) if topic is not None
-        else bag_poses.poses_of_tf(options.odometry_frame, options.camera_frame, max_gap_ns,
-                                   options.tf))
-        for name, mount in _mounts(options).items()}
+        options.bag, bag_frames.topic_of(name, options.image), _pose_source(
+            options, name, mount, round(options.max_gap * NS_PER_S), topic,
+            options.odometry_frame)) for name, mount in _mounts(options).items()}
 
 
 def _depth_format(options: argparse.Namespace) -> DepthFormat:

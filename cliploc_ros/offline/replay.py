@@ -83,23 +83,18 @@ class Player:
     has another definition.
     """
 
-    def __init__(
-        self, node: Node, reader: BagReader, options: PlayOptions, stop: Interruption
-    ) -> None:
+    def __init__(self, node: Node, reader: BagReader, options: PlayOptions,
+                 stop: Interruption) -> None:
         self._reader, self._options, self._stop = reader, options, stop
-        self.topics, self.without_type = _playable(select_topics(reader, options), options)
+        self.topics, self.without_type = _select_topics(reader, options)
         self.start_ns = reader.start_ns + round(options.start_offset_s * NS_PER_S)
         self.end_ns = reader.end_ns
         if self.start_ns > self.end_ns:
-            length_s = (reader.end_ns - reader.start_ns) / NS_PER_S
             raise DatasetError(
                 f'{reader.path}: start offset {options.start_offset_s} s is after its end at '
-                f'{length_s:.3f} s'
-            )
-        self._publishers = {
-            topic.name: create_publisher(node, topic, options.remap.get(topic.name, topic.name))
-            for topic in self.topics
-        }
+                f'{(reader.end_ns - reader.start_ns) / NS_PER_S:.3f} s')
+        self._publishers = {topic.name: create_publisher(
+            node, topic, options.remap.get(topic.name, topic.name)) for topic in self.topics}
         self._clock = node.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock_hz else None
 
     def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
@@ -173,12 +168,8 @@ class Player:
         messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
         return chain(list(islice(messages, 1)), messages)
 
-    def _play_once(
-        self,
-        messages: Iterator[BagMessage],
-        origin_ns: int,
-        on_message: Callable[[BagMessage], None],
-    ) -> tuple[Counter[str], float]:
+    def _play_once(self, messages: Iterator[BagMessage], origin_ns: int,
+                   on_message: Callable[[BagMessage], None]) -> tuple[Counter[str], float]:
         """Publish messages; return their number by topic, and the greatest delay [s]."""
         timeline = _Timeline(origin_ns, self.start_ns, self._options.rate, self._stop)
         ticker = None
@@ -249,10 +240,11 @@ class _Ticker:
         self.next_ns += self._step_ns * max(missed, 1)
 
 
-def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
-    """Return the topics to play.
+def _select_topics(reader: BagReader, options: PlayOptions
+                   ) -> tuple[list[BagTopic], list[BagTopic]]:
+    """Return the topics to play, and those whose types are not installed.
 
-    DatasetError: a named topic is not recorded, or there is nothing to play.
+    DatasetError: a named topic is not recorded, its type is missing, or there is nothing to play.
     """
     names = list(reader.topics) if options.topics is None else list(options.topics)
     for name in (*names, *options.exclude, *options.remap):
@@ -263,15 +255,6 @@ def select_topics(reader: BagReader, options: PlayOptions) -> list[BagTopic]:
     topics = [reader.topic(name) for name in dict.fromkeys(names) if name not in left_out]
     if not sum(topic.message_count for topic in topics):
         raise DatasetError(f'{reader.path}: holds no messages on the topics to play')
-    return topics
-
-
-def _playable(topics: list[BagTopic], options: PlayOptions
-              ) -> tuple[list[BagTopic], list[BagTopic]]:
-    """Split topics into those whose types are installed, and the others.
-
-    DatasetError: the type of a topic requested by name is missing, or the types of all topics are.
-    """
     lacking = []
     for topic in topics:
         try:
@@ -282,7 +265,7 @@ def _playable(topics: list[BagTopic], options: PlayOptions
             lacking.append(topic)
     playable = [topic for topic in topics if topic not in lacking]
     if not sum(topic.message_count for topic in playable):
-        message_class(lacking[0])
+        message_class(lacking[0])  # raises an error
     return playable, lacking
 
 
@@ -291,10 +274,15 @@ def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
 
     DatasetError: the type is not installed, or differs from the recorded one.
     """
-    publisher: Publisher = node.create_publisher(
-        message_class(topic), name, qos_profile(topic.offered_qos)
-    )
-    _check_definition(node, topic, publisher.topic_name)
+    publisher: Publisher = node.create_publisher(message_class(topic), name,
+                                                 qos_profile(topic.offered_qos))
+    if topic.type_hash.startswith('RIHS01_'):  # introduced by Iron
+        for endpoint in node.get_publishers_info_by_topic(publisher.topic_name):
+            if endpoint.node_name == node.get_name() and str(endpoint.topic_type_hash) not in (
+                    topic.type_hash, 'INVALID'):
+                raise DatasetError(
+                    f'{topic.name} was recorded with a definition of {topic.msgtype} that differs '
+                    f'from the installed one; leave it out: `exclude` {topic.name}')
     return publisher
 
 
@@ -311,8 +299,7 @@ def message_class(topic: BagTopic) -> Any:
         raise DatasetError(
             f'{topic.name} needs {topic.msgtype}, but the package {package} with this type is not '
             f'installed or not sourced: apt install ros-jazzy-{package.replace("_", "-")}, or '
-            f'leave the topic out: --exclude {topic.name}'
-        ) from None
+            f'leave the topic out: `exclude` {topic.name}') from None
 
 
 def qos_profile(offered: Collection[Qos]) -> QoSProfile:
@@ -325,18 +312,14 @@ def qos_profile(offered: Collection[Qos]) -> QoSProfile:
         return QoSProfile(depth=DEFAULT_DEPTH)
     first = next(iter(offered))
     best_effort = all(qos.reliability == QosReliability.BEST_EFFORT for qos in offered)
+    keep_all = first.history == QosHistory.KEEP_ALL
     profile = QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
+        history=HistoryPolicy.KEEP_ALL if keep_all else HistoryPolicy.KEEP_LAST,
         depth=first.depth or DEFAULT_DEPTH,
-        reliability=(
-            ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-        ),
-        durability=(
-            DurabilityPolicy.TRANSIENT_LOCAL if is_latched(offered) else DurabilityPolicy.VOLATILE
-        ),
-    )
-    if first.history == QosHistory.KEEP_ALL:
-        profile.history = HistoryPolicy.KEEP_ALL
+        reliability=(ReliabilityPolicy.BEST_EFFORT if best_effort
+                     else ReliabilityPolicy.RELIABLE),
+        durability=(DurabilityPolicy.TRANSIENT_LOCAL if is_latched(offered)
+                    else DurabilityPolicy.VOLATILE))
     if first.liveliness == QosLiveliness.MANUAL_BY_TOPIC:
         profile.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
     for name in ('deadline', 'lifespan', 'liveliness_lease_duration'):
@@ -349,17 +332,3 @@ def qos_profile(offered: Collection[Qos]) -> QoSProfile:
 def is_latched(offered: Collection[Qos]) -> bool:
     """Return whether a recorded publisher kept messages for late subscribers."""
     return any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in offered)
-
-
-def _check_definition(node: Node, topic: BagTopic, name: str) -> None:
-    """Refuse a topic whose recorded definition differs from the installed one."""
-    if not topic.type_hash.startswith('RIHS01_'):
-        return  # recorded before Iron, which introduced the hash
-    for endpoint in node.get_publishers_info_by_topic(name):
-        if endpoint.node_name == node.get_name() and str(endpoint.topic_type_hash) not in (
-            topic.type_hash, 'INVALID'
-        ):
-            raise DatasetError(
-                f'{topic.name} was recorded with a definition of {topic.msgtype} that differs '
-                f'from the installed one; leave it out: --exclude {topic.name}'
-            )

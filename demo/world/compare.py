@@ -25,10 +25,9 @@ from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
-from cliploc_ros.offline.datasets.folders import tum_frames
-from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.observations import Queries, save_queries
-from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.evaluation.methods import parse_methods
 from cliploc_ros.offline.evaluation.recording import make_queries_of
 from cliploc_ros.offline.evaluation.run import compare_methods
@@ -47,7 +46,7 @@ def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Querie
     clip = ClipOptions(model=str(ASSETS / 'clip.json'), cache_dir=str(cache_dir),
                        pretrained=str(ASSETS / 'clip.safetensors'))
     encoder, labels = load_encoder(clip, landmark_map.weighted_labels)
-    frames = tum_frames(read_tum(sequence), find_camera(None, sequence)[0])
+    frames = read_folder(sequence, FolderOptions(layout='tum'))
     recorded = record_every_frame(frames, RunNetworks(detector.detect, encoder))
     return make_queries_of(recorded, landmark_map, labels)
 

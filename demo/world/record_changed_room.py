@@ -20,10 +20,9 @@ from cliploc_ros.core.map.landmark_embeddings import embeddings_path, save_landm
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.folders import tum_frames
-from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.observations import save_observations
-from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.labelling import embed_landmarks
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
@@ -61,8 +60,8 @@ def _look(walk: Path) -> PosedDetections:
     clip = ClipOptions(pretrained=str(ASSETS / 'clip'))
     networks = RecordingOptions(DetectorOptions(model=str(ASSETS / 'yolo.onnx')), clip,
                                 KeyframeOptions(0.0, 0.0), '')
-    return record_once(tum_frames(read_tum(walk), find_camera(None, walk)[0]), networks,
-                       walk.with_suffix('.npz')).detections
+    return record_once(read_folder(walk, FolderOptions(layout='tum')), networks,
+                       walk.with_suffix('.npz'))
 
 
 def main() -> None:

@@ -29,10 +29,9 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.core.search.scene import Constraint
-from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import RawFrame
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.offline.recording.networks import MAX_DETECTIONS, RunNetworks
@@ -166,7 +165,7 @@ def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, Key
     if not path.exists():
         frames = frames_of_raws(Path(place.name), place.mapped)
         landmark_map = build_map(
-            record_every_frame(frames, RunNetworks(looker.detect)).detections).landmark_map \
+            record_every_frame(frames, RunNetworks(looker.detect))).landmark_map \
             if place.map_file is None else LandmarkMap.from_file(place.map_file)
         layer = build_layer(frames, landmark_map, LayerOptions(0.0, 0.0))
         print(f'{place.name}: {len(landmark_map)} landmarks, {len(layer)} keyframes, '
@@ -244,4 +243,4 @@ def read_places(where: str, model: str) -> Iterator[Place]:
 
 def _walk(folder: Path) -> tuple[RawFrame, ...]:
     """Return the images of a TUM folder, without depth."""
-    return posed(tum_frames(read_tum(folder), find_camera(None, folder)[0]))
+    return posed(read_folder(folder, FolderOptions(layout='tum')))

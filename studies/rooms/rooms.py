@@ -235,7 +235,7 @@ def _seen(frames: Frames, raws: tuple[RawFrame, ...], options: RoomOptions, name
         frames, RecordingOptions(DetectorOptions(options.model, conf=options.conf), None,
                                  EVERY_FRAME, reading=name), options.out / f'{name}.npz')
     looker = Looker(options.out / 'looks', options.model)
-    return {'detections': recorded.detections,
+    return {'detections': recorded,
             'features': tuple(KeptFeatures(looker, raw) for raw in raws)}
 
 

@@ -21,7 +21,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import Watch
-from cliploc_ros.offline.datasets.observations import load_observations, load_recorded
+from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 from cliploc_ros.offline.mapping.building import build_map
 from studies.acceptance.fit import FITTED_KINDS
@@ -74,7 +74,7 @@ def _localizer(options: argparse.Namespace) -> None:
     truth = None if options.truth is None else read_tum_trajectory(options.truth)
     relocalizer = Relocalizer(LandmarkMap.from_file(options.map), RelocalizerOptions(
         matching='class', tilt_deviation_deg=options.tilt_deviation))
-    looks = watch_recording(load_recorded(options.observations), Watch(relocalizer), truth,
+    looks = watch_recording(load_observations(options.observations), Watch(relocalizer), truth,
                             options.period)
     print(write_watch(options.out, looks))
 

@@ -17,8 +17,8 @@ import numpy as np
 from cliploc_ros.core.geometry.transforms import SAME_ANSWER, pose_error
 from cliploc_ros.core.watch.watch import Watch, WatchState
 from cliploc_ros.files.storage import make_folder, write_text
-from cliploc_ros.offline.datasets.observations import Recorded
 from cliploc_ros.offline.datasets.poses import Poses
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.units import NS_PER_S
 from studies.acceptance.places import observation_of
 
@@ -48,7 +48,7 @@ class WatchedLook:
         return self.error_m < SAME_ANSWER.distance_m and self.error_deg < SAME_ANSWER.angle_deg
 
 
-def watch_recording(recorded: Recorded, watch: Watch, truth: Poses | None, period_s: float
+def watch_recording(recorded: PosedDetections, watch: Watch, truth: Poses | None, period_s: float
                     ) -> list[WatchedLook]:
     """Run a watch on a recording, whose poses are those of a localizer.
 
@@ -60,15 +60,16 @@ def watch_recording(recorded: Recorded, watch: Watch, truth: Poses | None, perio
         Least time between two looks [s].
     """
     found, way_m = list[WatchedLook](), 0.0
-    last_ns, last_pose = -NS_PER_S * 10**9, recorded.detections.map_from_camera[:1]
+    last_ns, last_pose = -NS_PER_S * 10**9, recorded.map_from_camera[:1]
+    assert recorded.stamps_ns is not None
     for row, stamp_ns in enumerate(recorded.stamps_ns.tolist()):
-        pose = recorded.detections.map_from_camera[row]
+        pose = recorded.map_from_camera[row]
         way_m += float(np.linalg.norm(pose[:3, 3] - last_pose[..., :3, 3]))
         last_pose = pose
         if stamp_ns - last_ns < period_s * NS_PER_S:
             continue
         last_ns = stamp_ns
-        said = watch.look(observation_of(recorded.detections, row, stamp_ns), pose)
+        said = watch.look(observation_of(recorded, row, stamp_ns), pose)
         true = None if truth is None else truth.pose_at(stamp_ns)
         error_m, error_deg = (None, None) if true is None else pose_error(pose, true)
         found.append(WatchedLook(

@@ -74,20 +74,14 @@ def write_sequence(folder: Path, count: int = 4, suffix: str = 'png') -> SmallSe
         assert cv2.imwrite(str(folder / 'rgb' / f'{stamp}.{suffix}'), image)
     (folder / 'rgb.txt').write_text(''.join(f'{stamp} rgb/{stamp}.{suffix}\n' for stamp in stamps))
     (folder / 'groundtruth.txt').write_text(
-        ''.join(f'{100.1 + index / 100:.2f} {index} 0 0 0 0 0 1\n' for index in range(200))
-    )
+        ''.join(f'{100.1 + index / 100:.2f} {index} 0 0 0 0 0 1\n' for index in range(200)))
     (folder / 'camera.json').write_text(json.dumps(
-        {'width': SIZE[0], 'height': SIZE[1], 'fx': 50, 'fy': 51, 'cx': 32, 'cy': 24}
-    ))
+        {'width': SIZE[0], 'height': SIZE[1], 'fx': 50, 'fy': 51, 'cx': 32, 'cy': 24}))
     detections = folder / 'detections.json'
     box = {'class_id': 'cup', 'score': 0.75, 'bbox_xyxy': [1, 2, 30.5, 40]}
-    detections.write_text(json.dumps({
-        'image_size': SIZE,
-        'frames': [
-            {'timestamp': stamp, 'detections': [box] * (index % 3)}
-            for index, stamp in enumerate(stamps)
-        ],
-    }))
+    detections.write_text(json.dumps({'image_size': SIZE, 'frames': [
+        {'timestamp': stamp, 'detections': [box] * (index % 3)}
+        for index, stamp in enumerate(stamps)]}))
     return SmallSequence(folder, stamps, images, detections)
 
 

@@ -32,13 +32,8 @@ from cliploc_ros.offline.datasets.tum_conversion import (
     read_recorded_detections,
 )
 
-CLASSES = {
-    '/image': Image,
-    '/image/compressed': CompressedImage,
-    '/camera_info': CameraInfo,
-    '/detections': Detection2DArray,
-    '/ground_truth': PoseStamped,
-}
+CLASSES = {'/image': Image, '/image/compressed': CompressedImage, '/camera_info': CameraInfo,
+           '/detections': Detection2DArray, '/ground_truth': PoseStamped}
 
 
 def recorded(path):
@@ -55,9 +50,7 @@ def offset_ms(data):
     return (bag_messages.stamp_ns(deserialize_message(data, PoseStamped)) - START_NS) / MS
 
 
-@pytest.mark.parametrize(
-    ('storage', 'form'), [('sqlite3', 'raw'), ('mcap', 'compressed')]
-)
+@pytest.mark.parametrize(('storage', 'form'), [('sqlite3', 'raw'), ('mcap', 'compressed')])
 def test_real_frames_arrive_byte_identical(shared_data, tmp_path, listener, storage, form):
     folder, bag = shared_data / 'tum_fr3_office', tmp_path / 'bag'
     detections = read_recorded_detections(folder / 'detections.json')
@@ -85,8 +78,7 @@ def test_qos_is_as_recorded(tmp_path, listener, start):
         '/reliable': (RECORDED_QOS, ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
         '/sensor': (best_effort, ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
         '/latched': (latched, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
-        '/map': (LATCHED_QOS, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
-    }
+        '/map': (LATCHED_QOS, ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL)}
     topics = {name: qos for name, (qos, *_) in offered.items()}
     bag = write_poses(tmp_path / 'bag', [0, 600_000], topics)
     process = start('replay', bag)
@@ -127,11 +119,9 @@ def test_names_and_selection(tmp_path, listener):
     bag = write_poses(tmp_path / 'bag', [0, 20], topics)
     for name in ('/x/a', '/renamed', '/c', '/d', '/a', '/b'):
         listener.listen(name, PoseStamped)
-    done = run(
-        'replay', bag, '--topics', 'a', '/b', '/d', '--exclude', '/d', '--remap', 'a:=x/a',
-        '--wait-for-subscribers', '/a', '/b',
-        '--ros-args', '-r', '/b:=/renamed', '-r', '__node:=player',
-    )
+    done = run('replay', bag, '--topics', 'a', '/b', '/d', '--exclude', '/d', '--remap', 'a:=x/a',
+               '--wait-for-subscribers', '/a', '/b',
+               '--ros-args', '-r', '/b:=/renamed', '-r', '__node:=player')
     assert done.returncode == 0, done.stderr
     wait_until(lambda: len(listener.received['/x/a']) == len(listener.received['/renamed']) == 2)
     assert set(listener.received) == {'/x/a', '/renamed'}

@@ -16,7 +16,6 @@ from capture_folders import (
     shots_of,
     write_colmap,
     write_nerf,
-    write_stray,
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -47,25 +46,12 @@ def edited(folder, edit, name='transforms.json'):
     return folder
 
 
-@pytest.mark.parametrize(('fields', 'expected'), [
-    ({'fl_x': 0}, 'fx=0 .* focal lengths must be positive'),
-    ({'fl_y': 0}, 'fy=0 .* focal lengths must be positive'),
-    ({'depth_unit_scale_factor': -1}, 'unit of depth is -1'),
-    ({'applied_scale': 1e-300}, 'm from the origin')])
-def test_numbers_of_transforms_json_that_cannot_be(fields, expected, shots, tmp_path):
-    refuses(edited(write_nerf(tmp_path, shots), lambda values: values.update(fields)), expected)
-
-
 @pytest.mark.parametrize('name', ['/', '\\', '..', 'C:\\', 'a\0b'])
 def test_names_of_no_file_are_counted(name, shots, tmp_path):
     folder = edited(write_nerf(tmp_path, shots), lambda values: values['frames'][0].update(
         file_path=name))
     assert any('1 of 4 listed images are missing' in note
                for note in read_folder(folder, METRES).notes)
-
-
-def test_a_scale_that_no_map_has(shots, tmp_path):
-    refuses(write_nerf(tmp_path, shots), 'm from the origin', FolderOptions(scale=1e9))
 
 
 def test_folders_without_poses_or_images(shots, tmp_path):
@@ -117,14 +103,11 @@ def test_models_in_pieces_and_turned_images(shots, tmp_path):
     refuses(folder, '480x640 px.*EXIF')
 
 
-def test_files_cut_short_and_false_counts_cost_nothing(shots, tmp_path):
+def test_false_counts_cost_nothing(shots, tmp_path):
     folder = write_colmap(tmp_path, shots)
     for name in ('cameras.bin', 'images.bin'):
         path = folder / 'sparse/0' / name
         data = path.read_bytes()
-        for length in range(0, len(data), 7):
-            path.write_bytes(data[:length])
-            refuses(folder, 'cut short|cannot be')
         tracemalloc.start()
         path.write_bytes(struct.pack('<Q', 2**62) + data[8:])
         refuses(folder, f'{name}: .*{2**62}')
@@ -134,6 +117,9 @@ def test_files_cut_short_and_false_counts_cost_nothing(shots, tmp_path):
 
 
 @pytest.mark.parametrize(('edit', 'expected'), [
+    (lambda v: v.update(fl_y=0), 'fy=0 .* focal lengths must be positive'),
+    (lambda v: v.update(depth_unit_scale_factor=-1), 'unit of depth is -1'),
+    (lambda v: v.update(applied_scale=1e-300), 'm from the origin'),
     (lambda v: v.pop('frames'), 'lists no frames'),
     (lambda v: v.pop('fl_x'), 'no intrinsics'),
     (lambda v: v.update(fl_x='wide'), 'fl_x is wide'),
@@ -146,37 +132,6 @@ def test_files_cut_short_and_false_counts_cost_nothing(shots, tmp_path):
      'of shape')])
 def test_faults_of_transforms_json(edit, expected, shots, tmp_path):
     refuses(edited(write_nerf(tmp_path, shots), edit), expected)
-
-
-@pytest.mark.parametrize('header', [
-    '# timestamp, frame, x, y, z, qx, qy, qz, qw', 'time,frame', ''])
-def test_the_first_line_of_stray_scanner_is_its_header(header, shots, tmp_path):
-    table = write_stray(tmp_path / 'scan', shots) / 'odometry.csv'
-    _, *rows = table.read_text().splitlines()
-    table.write_text('\n'.join([header, *rows]))
-    assert read_folder(tmp_path / 'scan').count == len(shots)
-
-
-def test_the_memory_of_large_photos(tmp_path):
-    """Photos of 12 megapixels are read one at a time."""
-    shot = shots_of()[0]
-    photo = tmp_path / 'photo.jpg'
-    cv2.imwrite(str(photo), np.zeros((3000, 4000, 3), dtype=np.uint8))
-    shots = []
-    for number in range(6):
-        pose = shot.pose.copy()
-        pose[0, 3] += number
-        path = tmp_path / f'{number}.jpg'
-        path.hardlink_to(photo)
-        shots.append(shot._replace(path=path, pose=pose))
-    folder = write_colmap(tmp_path / 'c', shots, camera_of=lambda _: (
-        'SIMPLE_RADIAL', 4000, 3000, [3000, 2000, 1500, 0.05]))
-    tracemalloc.start()
-    assert sum(1 for _ in read_folder(folder, METRES).read()) == 6
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    print(f'peak of six photos of 36 MB each: {peak / 1e6:.0f} MB')
-    assert peak < 120e6
 
 
 MUTATIONS = st.lists(st.tuples(st.floats(0.0, 0.999), st.binary(max_size=12)), max_size=6)

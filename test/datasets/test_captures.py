@@ -56,7 +56,7 @@ def look():
 @pytest.fixture(scope='session')
 def recorded(look):
     """Return the detections of the walk as a TUM folder."""
-    return record_every_frame(read_folder(WALK, FolderOptions(layout='tum')), look).detections
+    return record_every_frame(read_folder(WALK, FolderOptions(layout='tum')), look)
 
 
 @pytest.fixture(scope='session')
@@ -90,7 +90,7 @@ def test_what_is_seen_and_from_where_is_that_of_the_original(layout, shots, look
         # where Polycam's confidence is low
         assert np.isnan(depths[0, 0]) == (layout == 'Polycam')
     # flat depth does not match this room
-    seen = record_every_frame(frames, lambda raw: look(replace(raw, depth=None))).detections
+    seen = record_every_frame(frames, lambda raw: look(replace(raw, depth=None)))
     assert len(seen.classes) > 200
     np.testing.assert_array_equal(seen.frames, recorded.frames)
     np.testing.assert_array_equal(seen.classes, recorded.classes)
@@ -142,12 +142,12 @@ def test_images_with_their_own_cameras(shots, look, tmp_path):
     frames = read_folder(folder, METRES)
     assert frames.varies
     recorded = record_every_frame(frames, look)
-    assert len(recorded.detections.cameras) == 1 and recorded.detections.open_edges is not None
+    assert len(recorded.cameras) == 1 and recorded.open_edges is not None
     own = Camera(640, 480, 500 * focus[4], 500 * focus[4], 320 + 4 / 9 - 0.5, 239.5)
     boxes = look.detect(next(read_folder(folder, METRES).select([3]).read()).image_rgb)
-    rows = slice(*recorded.detections.frame_offsets[3:5])
+    rows = slice(*recorded.frame_offsets[3:5])
     np.testing.assert_allclose(
-        recorded.detections.cameras[0].normalize_bboxes(recorded.detections.bboxes_xyxy[rows]),
+        recorded.cameras[0].normalize_bboxes(recorded.bboxes_xyxy[rows]),
         own.normalize_bboxes(boxes.bboxes_xyxy), atol=1e-9)
     # a rotated image has a separate camera, in the file as well
     image = folder / 'images/walk' / shots[0].path.name
@@ -157,7 +157,7 @@ def test_images_with_their_own_cameras(shots, look, tmp_path):
     cv2.imwrite(str(other / 'images/walk' / shots[0].path.name),
                 np.zeros((640, 480, 3), dtype=np.uint8))
     recorded = record_every_frame(read_folder(other, METRES), look)
-    save_observations(tmp_path / 'o.npz', recorded.detections)
+    save_observations(tmp_path / 'o.npz', recorded)
     again = load_observations(tmp_path / 'o.npz')
     assert again.camera_names == ('1: 480x640', '2: 640x480')
     assert again.frame_cameras.tolist() == [0] + [1] * (len(shots) - 1)
@@ -188,7 +188,7 @@ def test_the_scale_by_a_distance_and_by_objects(shots, look, original, tmp_path)
         known_distance=(first.path.name, f'walk/{last.path.name}', apart)))
     assert any('0.4 m' in note for note in frames.notes)
     detections = record_every_frame(read_folder(folder, FolderOptions(any_unit=True)),
-                                    look).detections
+                                    look)
     rows = [row for row, name in enumerate(original.class_ids) if name == 'book']
     metres = float(np.median(2.0 * original.semi_axes[rows].max(axis=1)))
     scale, objects = scale_of_objects(detections, OPTIONS, 'book', metres)

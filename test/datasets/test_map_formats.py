@@ -76,8 +76,9 @@ def test_maps_of_other_systems(true_map, tmp_path, read, name, content, weights,
         with pytest.raises(DatasetError, match='objecttracks'):
             read(path, COCO)
         write(path.with_suffix('.objecttracks'), oaslam_files(true_map)[1])
-    found, left_out, notes = import_all(read(path, COCO))
-    assert left_out == () and ''.join(notes).startswith(note)
+    given = read(path, COCO)
+    found, left_out = import_all(given)
+    assert left_out == [] and ''.join(given.notes).startswith(note)
     assert found.landmark_ids == ('cup_0', 'book_1', 'chair_2', 'cup_3')
     assert found.class_ids == true_map.class_ids
     np.testing.assert_allclose(found.centers, true_map.centers, atol=1e-5)
@@ -91,8 +92,7 @@ def test_what_the_file_does_not_know_of_its_errors_is_given(true_map, tmp_path):
     first = given.landmarks[0]
     given.landmarks[0] = first._replace(details=replace(first.details, position_sigma=0.2))
     scale = 0.5
-    known, *others = place(given, 'a test', 'map', scale, np.eye(4),
-                           (0.05, 1.0)).landmark_map.details
+    known, *others = place(given, 'a test', 'map', scale, np.eye(4), (0.05, 1.0))[0].details
     assert (known.position_sigma, known.shared_sigma) == (0.1, None)
     assert {(other.position_sigma, other.shared_sigma, other.shared_sigma_deg)
             for other in others} == {(0.05, 0.05, 1.0)}
@@ -107,7 +107,7 @@ def test_table_of_a_spreadsheet(tmp_path, encoding):
             ';;;;;;;;;\r\n'
             '"book";0.1;0.1;0.1;0;0;0;;;;\r\n')
     given = read_table(write(tmp_path / 'm.csv', text.encode(encoding)))
-    found = import_all(given).landmark_map
+    found, _ = import_all(given)
     assert found.labels == ('Tasse, groß', 'book')
     assert found.landmark_ids == ('cup_1', 'book_2')
     assert found.centers[0].tolist() == [3.0, -2.0, 1.5]
@@ -122,7 +122,7 @@ def test_scale_and_transform(true_map, tmp_path):
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn.as_matrix(), [5.0, 6.0, 7.0]
     path = write(tmp_path / 'm.csv', table_text(true_map))
-    found = import_all(read_table(path), ('world', 2.0, pose)).landmark_map
+    found, _ = import_all(read_table(path), ('world', 2.0, pose))
     assert found.frame_id == 'world'
     np.testing.assert_allclose(
         found.centers, turn.apply(2.0 * true_map.centers) + pose[:3, 3], atol=1e-9)
@@ -143,9 +143,9 @@ def test_what_no_map_can_hold_is_left_out_with_the_reason(tmp_path):
             (lopsided, [(CUP, 1)]), (dual_quadric([0, 0, 0], [200, 1, 1], [0, 0, 0, 1]),
                                      [(CUP, 1)])]))
         + goreloc_object(0, SPHERE, [(CUP, 3)]))
-    imported = import_all(read_goreloc(path, COCO))
-    assert imported.landmark_map.landmark_ids == ('cup_0',)
-    reasons = dict(imported.left_out)
+    found, left_out = import_all(read_goreloc(path, COCO))
+    assert found.landmark_ids == ('cup_0',)
+    reasons = dict(left_out)
     for name, reason in {
             'object 1': 'not an ellipsoid: squared semi-axes -0.04',
             'object 2': 'not an ellipsoid', 'object 3': 'no finite centre',

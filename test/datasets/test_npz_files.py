@@ -132,15 +132,12 @@ def test_queries_are_read(tmp_path):
     first, second, third = queries
     seen = [frame.observation for frame in queries]
     assert {one.camera for one in seen} == {Camera(640, 480, 500, 501, 320, 240)}
-    assert [len(one.detections) for one in seen] == [2, 0, 1]
     assert [one.stamp_ns for one in seen] == [
         1341847980722988000, 1341847980754743000, 1341847981000000000]
-    assert seen[0].detections.class_ids == ('cup', 'tv')
+    assert [one.detections.class_ids for one in seen] == [('cup', 'tv'), (), ('cup',)]
     np.testing.assert_array_equal(seen[0].detections.bboxes_xyxy, [[0, 0, 10, 10], [5, 6, 7, 8]])
     np.testing.assert_array_equal(first.true_landmark, [0, 2])
-    assert seen[0].similarities.shape == (2, 3)
-    assert seen[1].detections.bboxes_xyxy.shape == (0, 4)
-    assert seen[1].similarities.shape == (0, 3)
+    assert [one.similarities.shape for one in seen] == [(2, 3), (0, 3), (1, 3)]
     np.testing.assert_array_equal(second.map_from_camera[:3, 3], [1, 2, 3])
     np.testing.assert_allclose(seen[2].similarities, [[0.6, 0.7, 0.8]])
     assert [frame.is_main for frame in queries] == [True, False, True]
@@ -169,16 +166,6 @@ def test_queries_come_back(tmp_path):
 
 
 # ---- observations -------------------------------------------------------------------------------
-def test_a_written_file_is_read_back(tmp_path):
-    first = load_observations(save(tmp_path / 'o.npz', observation_arrays()))
-    save_observations(tmp_path / 'again.npz', first)
-    again = load_observations(tmp_path / 'again.npz')
-    for name in ('map_from_camera', 'stamps_s', 'frame_offsets', 'bboxes_xyxy', 'classes',
-                 'scores'):
-        assert (getattr(again, name) == getattr(first, name)).all()
-    assert (again.cameras, again.class_names) == (first.cameras, first.class_names)
-
-
 def test_odometry_is_read_back_in_the_order_of_time(tmp_path):
     odometry = np.tile(np.eye(4), (3, 1, 1))
     odometry[:, 0, 3] = [3.0, np.nan, 1.0]

@@ -13,8 +13,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import agreement
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
-from cliploc_ros.offline.datasets.captures.placing import AXES, check_axes
-from cliploc_ros.offline.datasets.folders import find_layout, read_folder
+from cliploc_ros.offline.datasets.folders import AXES, check_axes, find_layout, read_folder
 from cliploc_ros.offline.mapping.tilt import find_vertical
 
 pytestmark = pytest.mark.needs('pycolmap')

@@ -9,6 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from rig_bag import TF, depth_message, make, transform, write_messages
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
@@ -20,24 +21,13 @@ from cliploc_ros.offline.datasets.bag_frames import (
     bag_frames,
     find_topics,
 )
-from cliploc_ros.offline.datasets.bag_poses import (
-    bag_odometry,
-    find_poses,
-    poses_of_tf,
-    poses_of_topic,
-)
-from cliploc_ros.offline.datasets.bags import BagWriter, typestore
+from cliploc_ros.offline.datasets.bag_poses import PoseSource, bag_odometry
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 
 MS = 1_000_000
 START = 1_700_000_000_000 * MS
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5, 'plumb_bob', (0.0,) * 5)
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
-TF = 'tf2_msgs/msg/TFMessage'
-
-
-def make(name, **fields):
-    return typestore().types[name](**fields)
 
 
 def header(stamp, frame_id):
@@ -48,27 +38,6 @@ def header(stamp, frame_id):
 def pose_at(x, turn_deg=0.0):
     return make_transform(Rotation.from_euler('z', turn_deg, degrees=True).as_matrix(),
                           np.array([x, 0.0, 0.0]))
-
-
-def pose_field(transform):
-    return bag_messages.pose_message(0, '', transform).pose
-
-
-def transform_message(stamp, parent, child, transform):
-    field = pose_field(transform)
-    offset = make('geometry_msgs/msg/Vector3', x=field.position.x, y=field.position.y,
-                  z=field.position.z)
-    return make('geometry_msgs/msg/TransformStamped', header=header(stamp, parent),
-                child_frame_id=child, transform=make(
-                    'geometry_msgs/msg/Transform', translation=offset,
-                    rotation=field.orientation))
-
-
-def depth_message(stamp, values):
-    return make('sensor_msgs/msg/Image', header=header(stamp, 'camera'), height=values.shape[0],
-                width=values.shape[1], encoding='16UC1' if values.dtype == np.uint16 else '32FC1',
-                is_bigendian=0, step=values.shape[1] * values.itemsize,
-                data=np.frombuffer(values.tobytes(), dtype=np.uint8))
 
 
 def compressed_depth(stamp, encoding, values, a=0.0, b=0.0):
@@ -87,13 +56,7 @@ def write_bag(path, images_ms, messages):
     recorded += [(t, '/camera_info', bag_messages.CAMERA_INFO,
                   bag_messages.camera_info_message(START + t * MS, 'camera', CAMERA))
                  for t in images_ms]
-    recorded += messages
-    with BagWriter(path) as bag:
-        for topic, msgtype in {(topic, msgtype) for _, topic, msgtype, _ in recorded}:
-            bag.add_topic(topic, msgtype)
-        for t, topic, _, message in sorted(recorded, key=lambda one: one[0]):
-            bag.write(topic, START + t * MS, message)
-    return path
+    return write_messages(path, [(START + t * MS, *rest) for t, *rest in [*recorded, *messages]])
 
 
 def drive(stamps_ms=range(0, 1001, 100), offset_ns=0):
@@ -110,9 +73,9 @@ def positions(frames):
 def test_poses_are_interpolated_within_a_gap(tmp_path):
     bag = write_bag(tmp_path / 'bag', [250, 500, 710, 950],
                     drive([0, 200, 300, 600, 1000]))
-    frames = bag_frames(bag, BagTopics(), poses_of_topic('/pose', 300 * MS))
+    frames = bag_frames(bag, BagTopics(), PoseSource('/pose', topic_gap_ns=300 * MS))
     assert positions(frames) == [0.25, 0.5, None, None]
-    assert positions(bag_frames(bag, BagTopics(), poses_of_topic('/pose'))) == [None] * 4
+    assert positions(bag_frames(bag, BagTopics(), PoseSource('/pose'))) == [None] * 4
     assert frames.count == 4
     raw = list(frames.read_raw(lambda place, stamp, pose: pose is not None and place > 0))
     assert [frame.place for frame in raw] == [1]
@@ -131,15 +94,13 @@ def test_what_contradicts_itself_in_a_recording(tmp_path, camera, frame_id, topi
     """The node's functions check them: refused, or reported in a note."""
     image = bag_messages.image_message(START, 'camera', np.zeros((48, 64, 3), dtype=np.uint8))
     info = bag_messages.camera_info_message(START, frame_id, camera)
-    with BagWriter(tmp_path / 'bag') as bag:
-        for name, msgtype, message in (
-                (topic, bag_messages.IMAGE, image), ('/info', bag_messages.CAMERA_INFO, info),
-                ('/pose', bag_messages.POSE, bag_messages.pose_message(START, 'map', np.eye(4)))):
-            bag.add_topic(name, msgtype)
-            bag.write(name, START, message)
+    write_messages(tmp_path / 'bag', [
+        (START, topic, bag_messages.IMAGE, image),
+        (START, '/info', bag_messages.CAMERA_INFO, info),
+        (START, '/pose', bag_messages.POSE, bag_messages.pose_message(START, 'map', np.eye(4)))])
 
     def read():
-        frames = bag_frames(tmp_path / 'bag', BagTopics(topic, '/info'), poses_of_topic('/pose'))
+        frames = bag_frames(tmp_path / 'bag', BagTopics(topic, '/info'), PoseSource('/pose'))
         return list(frames.read()), frames.notes
     if error is not None:
         with pytest.raises(DatasetError, match=error):
@@ -157,89 +118,74 @@ def test_the_only_topics_and_poses_are_found(tmp_path):
             data=np.zeros(1, np.uint8))),
         (450, '/depth/image', bag_messages.IMAGE, depth_message(START, np.ones((2, 2))))])
     assert find_topics(bag, None, None) == ('/image', '/camera_info')
-    frame, = bag_frames(bag, BagTopics(), find_poses(1000 * MS)).read()
-    expected, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 1000 * MS)).read()
+    frame, = bag_frames(bag, BagTopics(), PoseSource(max_gap_ns=1000 * MS)).read()
+    expected, = bag_frames(bag, BagTopics(), of_tf('map', 1000)).read()
     np.testing.assert_array_equal(frame.map_from_camera, expected.map_from_camera)
 
 
-def test_odometry_and_covariance_with_a_mount(tmp_path):
-    zeros = np.zeros(36)
+def test_a_covariance_with_a_mount(tmp_path):
     with_covariance = [(t, '/amcl_pose', 'geometry_msgs/msg/PoseWithCovarianceStamped', make(
         'geometry_msgs/msg/PoseWithCovarianceStamped', header=header(START + t * MS, 'map'),
-        pose=make('geometry_msgs/msg/PoseWithCovariance', pose=pose_field(pose_at(t / 1000, 90.0)),
-                  covariance=zeros))) for t in (0, 100)]
-    zero = make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
-    twist = make('geometry_msgs/msg/TwistWithCovariance',
-                 twist=make('geometry_msgs/msg/Twist', linear=zero, angular=zero),
-                 covariance=zeros)
-    odometry = [(t, '/odom', 'nav_msgs/msg/Odometry', make(
-        'nav_msgs/msg/Odometry', header=header(START + t * MS, 'odom'), child_frame_id='base',
-        pose=make('geometry_msgs/msg/PoseWithCovariance', pose=pose_field(pose_at(t / 500)),
-                  covariance=zeros), twist=twist)) for t in (0, 100)]
-    bag = write_bag(tmp_path / 'bag', [50], [*with_covariance, *odometry])
+        pose=make('geometry_msgs/msg/PoseWithCovariance', pose=bag_messages.pose_message(
+            0, '', pose_at(t / 1000, 90.0)).pose, covariance=np.zeros(36)))) for t in (0, 100)]
+    bag = write_bag(tmp_path / 'bag', [50], with_covariance)
     mount = mount_from_numbers([0.3, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
-    frame, = bag_frames(bag, BagTopics(), poses_of_topic('/amcl_pose', 200 * MS, mount)).read()
+    frame, = bag_frames(bag, BagTopics(), PoseSource(
+        '/amcl_pose', topic_gap_ns=200 * MS, body_from_camera=mount)).read()
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.05, 0.3, 0.5], atol=1e-9)
-    # they are poses of 'base', as child_frame_id states
-    with pytest.raises(DatasetError, match=r"of 'base' .*`mount`"):
-        bag_frames(bag, BagTopics(), poses_of_topic('/odom', 200 * MS))
-    known = write_bag(tmp_path / 'with_tf', [50], [*odometry, (
-        0, '/tf_static', TF, make(TF, transforms=[transform_message(
-            START, 'base', 'camera', pose_at(0.2))]))])
-    frame, = bag_frames(known, BagTopics(), poses_of_topic('/odom', 200 * MS)).read()
-    np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.3, 0.0, 0.0], atol=1e-9)
 
 
-def tf_messages(*, static=True, parent='odom'):
+def tf_messages(*, static=True):
     """Write a map corrected at 1 Hz, odometry at 10 Hz, and a camera 0.2 m ahead."""
-    moving = [(t, '/tf', TF, make(TF, transforms=[transform_message(
-        START + t * MS, 'map', 'odom', pose_at(0.0, 90.0 * t / 1000))]))
-        for t in (0, 1000)] if parent == 'odom' else []
-    moving += [(t, '/tf', TF, make(TF, transforms=[transform_message(
-        START + t * MS, 'odom', 'base', pose_at(t / 1000))])) for t in range(0, 1001, 100)]
-    if static:
-        moving.append((0, '/tf_static', TF, make(TF, transforms=[transform_message(
-            START, 'base', '/camera', pose_at(0.2))])))
-    return moving
+    moving = [(t, '/tf', TF, transform(
+        START + t * MS, 'map', 'odom', pose_at(0.0, 90.0 * t / 1000))) for t in (0, 1000)]
+    moving += [(t, '/tf', TF, transform(
+        START + t * MS, 'odom', 'base', pose_at(t / 1000))) for t in range(0, 1001, 100)]
+    return moving + static * [(0, '/tf_static', TF, transform(START, 'base', '/camera',
+                                                               pose_at(0.2)))]
+
+
+def of_tf(map_frame, max_gap_ms, camera_frame=None):
+    return PoseSource(map_frame=map_frame, camera_frame=camera_frame, max_gap_ns=max_gap_ms * MS)
 
 
 def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
     bag = write_bag(tmp_path / 'bag', [450], tf_messages())
-    frame, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 1000 * MS)).read()
+    frame, = bag_frames(bag, BagTopics(), of_tf('map', 1000)).read()
     expected = pose_at(0.0, 90.0 * 0.45) @ pose_at(0.45) @ pose_at(0.2)
     np.testing.assert_allclose(frame.map_from_camera, expected, atol=1e-9)
     # the corrections are too infrequent for a smaller gap
-    frame, = bag_frames(bag, BagTopics(), poses_of_tf('map', None, 500 * MS)).read()
+    frame, = bag_frames(bag, BagTopics(), of_tf('map', 500)).read()
     assert frame.map_from_camera is None
     # a map that is a leaf of the tree
-    frame, = bag_frames(bag, BagTopics(), poses_of_tf('base', None, 0)).read()
+    frame, = bag_frames(bag, BagTopics(), of_tf('base', 0)).read()
     np.testing.assert_allclose(frame.map_from_camera, pose_at(0.2), atol=1e-9)
 
 
 def test_odometry_is_read_from_tf(tmp_path):
     bag = write_bag(tmp_path / 'bag', [450], tf_messages())
-    odometry = bag_odometry(bag, '/image', poses_of_tf('odom', None, 200 * MS))
+    odometry = bag_odometry(bag, '/image', of_tf('odom', 200))
     # map -> odom changes, and is not included
     np.testing.assert_allclose(odometry.pose_at(START + 450 * MS), pose_at(0.65), atol=1e-9)
     assert odometry.pose_at(START + 1200 * MS) is None
     other = write_bag(tmp_path / 'other', [0, 900], drive(offset_ns=-1_699_999_000 * 10**9))
     with pytest.raises(DatasetError, match='different clocks'):
-        bag_odometry(other, '/image', poses_of_topic('/pose'))
+        bag_odometry(other, '/image', PoseSource('/pose'))
 
 
 @pytest.mark.parametrize(('messages', 'frames', 'expected'), [
     (tf_messages(), ('world', 'camera'), "'world'; it has base"),
     (tf_messages(static=False), ('map', 'camera'), "frame 'camera'"),
-    ([*tf_messages(static=False), (0, '/tf_static', TF, make(TF, transforms=[transform_message(
-        START, 'arm', 'camera', np.eye(4))]))], ('map', 'camera'),
+    ([*tf_messages(static=False), (0, '/tf_static', TF, transform(
+        START, 'arm', 'camera', np.eye(4)))], ('map', 'camera'),
      "'map' and 'arm'"),
-    ([*tf_messages(), (900, '/tf', TF, make(TF, transforms=[transform_message(
-        START, 'other_odom', 'base', np.eye(4))]))], ('map', 'camera'),
+    ([*tf_messages(), (900, '/tf', TF, transform(
+        START, 'other_odom', 'base', np.eye(4)))], ('map', 'camera'),
      "'base' has two")])
 def test_tf_that_does_not_serve(tmp_path, messages, frames, expected):
     bag = write_bag(tmp_path / 'bag', [450], messages)
     with pytest.raises(DatasetError, match=expected):
-        bag_frames(bag, BagTopics(), poses_of_tf(*frames, 1000 * MS))
+        bag_frames(bag, BagTopics(), of_tf(frames[0], 1000, frames[1]))
 
 
 def test_depth_is_paired_with_the_nearest_image(tmp_path):
@@ -247,7 +193,7 @@ def test_depth_is_paired_with_the_nearest_image(tmp_path):
         START + t * MS, np.full((48, 64), value, dtype=np.uint16)))
         for t, value in ((0, 1000), (95, 2000), (130, 3000), (400, 0))]
     bag = write_bag(tmp_path / 'bag', [0, 100, 300, 400], [*drive(), *depths])
-    frames = bag_frames(bag, BagTopics(depth='/depth'), poses_of_topic('/pose', 200 * MS))
+    frames = bag_frames(bag, BagTopics(depth='/depth'), PoseSource('/pose', topic_gap_ns=200 * MS))
     shown = [None if frame.depth is None else frame.depth.depths_m[0, 0]
              for frame in frames.read()]
     assert shown[:3] == [pytest.approx(1.0), pytest.approx(2.0), None]
@@ -269,7 +215,7 @@ def test_compressed_depth(tmp_path):
         *drive(), (1, '/depth', COMPRESSED, compressed_depth(START, '16UC1', counts)),
         (101, '/depth', COMPRESSED, compressed_depth(START + 100 * MS, '32FC1', inverse, a, b)),
         (201, '/depth', COMPRESSED, cut)])
-    frames = bag_frames(bag, BagTopics(depth='/depth'), poses_of_topic('/pose')).read()
+    frames = bag_frames(bag, BagTopics(depth='/depth'), PoseSource('/pose')).read()
     np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 0.7], [1.5, np.nan]],
                                rtol=1e-6)
     np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 1.5], [4.0, 9.0]],

@@ -13,9 +13,8 @@ import pytest
 from cliploc_ros.cli.evaluate import main
 from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets.folders import tum_frames
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from demo import ASSETS
 
@@ -29,7 +28,7 @@ def walk(tmp_path_factory):
     folder = tmp_path_factory.mktemp('walk')
     shutil.copytree(ASSETS / 'sequence', folder / 'sequence')
     shutil.copy(ASSETS / 'map.yaml', folder)
-    images = tum_frames(read_tum(ASSETS / 'mapping'), find_camera(None, ASSETS / 'mapping')[0])
+    images = read_folder(ASSETS / 'mapping', FolderOptions(layout='tum'))
     save_layer(layer_path(folder / 'map.yaml'), build_layer(
         images, LandmarkMap.from_file(folder / 'map.yaml'), LayerOptions(0.0, 0.0, 300)))
     (folder / 'objects.yaml').write_text('objects: {keyframes: false}\n')

@@ -25,9 +25,7 @@ from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import Watch
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
-from cliploc_ros.offline.datasets.folders import rgbd_frames, tum_frames
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.keyframes.cases import IMAGE_CHANGES, World, hang, make_picture, twin
 
@@ -51,7 +49,7 @@ def kitchen(shared_data):
 @pytest.fixture(scope='module')
 def office(shared_data):
     folder = shared_data / 'tum_fr3_office'
-    return tum_frames(read_tum(folder), find_camera(None, folder)[0])
+    return read_folder(folder, FolderOptions(layout='tum'))
 
 
 @pytest.fixture(scope='module')

@@ -16,9 +16,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.models.clip_encoder import embed_labels
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.folders import tum_frames
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.evaluation.recording import recorded_queries
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
 from demo import ASSETS
@@ -45,8 +44,7 @@ def walk(tmp_path_factory):
 
 def similarities(walk, compare):
     folder, landmark_map, options = walk
-    sequence = read_tum(folder / 'sequence').every(24)
-    frames = tum_frames(sequence, find_camera(None, folder / 'sequence')[0])
+    frames = read_folder(folder / 'sequence', FolderOptions(layout='tum')).select((0, 24))
     queries = recorded_queries(frames, landmark_map, options, [str(folder / 'map.yaml')], compare)
     assert len(queries) == 2
     return np.concatenate([frame.observation.similarities for frame in queries])

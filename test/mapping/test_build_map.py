@@ -24,13 +24,14 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import MappingError, ModelError
+from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.make_map import find_labeller, make_map, update_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.offline.mapping.pose_noise import _sample
 from cliploc_ros.offline.mapping.views import make_views, number_viewpoints, thin_out
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
 AWAY_M = np.array([12.0, 0.0, 0.0])
 
@@ -194,13 +195,17 @@ def test_a_long_recording_gives_one_landmark_for_each_object():
 def test_a_map_is_made_written_and_updated(tmp_path):
     table, file = make_table(), tmp_path / 'map.yaml'
     detections = see(table, walk_around())
-    stages = []
-    made = make_map(detections, find_labeller(detections, None),
+    stages, labeller = [], find_labeller(detections, None)
+    made = make_map(detections, labeller,
                     progress=lambda stage, share: stages.append(stage))
     write_map(file, made.landmark_map, made.report.lines()[:1], made.embeddings)
     assert nearest_errors(LandmarkMap.from_file(file), table).max() < 0.003
     assert made.layer is None and stages[-1] == 'done'
-    labeller = find_labeller(detections, None)
+    blind = Frames(tmp_path / 'walk', 0, lambda wanted: iter(()))
+    assert 'of 0 images, none' in make_map(detections, labeller, None, blind, LayerOptions()).note
+    with pytest.raises(MappingError, match='no detections'):
+        make_map(detections.select_boxes(np.zeros(len(detections.classes), bool)), labeller, None,
+                 blind, LayerOptions())
     again = update_map(file, detections, labeller, MappingOptions())
     assert again.landmark_map.landmark_ids == made.landmark_map.landmark_ids
     assert not again.report.new
@@ -288,18 +293,6 @@ def test_far_landmarks_are_passed_over_without_a_loss(floor, seen):
     assert list(zip(found.boxes.tolist(), found.landmarks.tolist(), strict=True)) == sorted(
         expected)
     assert len(expected) > 900
-
-
-def test_pose_errors_of_a_long_recording_are_estimated_from_a_part_of_it(seen):
-    far = np.tile(np.eye(4), (8000, 1, 1))
-    far[:, 0, 3] = np.arange(8000)
-    long = replace(seen, map_from_camera=far, stamps_s=np.arange(8000.0),
-                   frame_offsets=np.zeros(8001, dtype=np.int64), classes=np.empty(0, np.int64),
-                   bboxes_xyxy=np.empty((0, 4)), scores=np.empty(0))
-    frames, rows = _sample(make_views(long))
-    assert (len(frames), len(rows)) == (200, 0)
-    assert 2900 < np.ptp(frames) < 3000
-    assert abs(frames.mean() - 4000) < 10
 
 
 def test_no_landmarks_and_no_boxes(floor, seen):

@@ -19,7 +19,7 @@ from walk import look_at, make_table, nearest_errors, see, walk_around
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.offline.mapping.building import build_map
-from cliploc_ros.offline.mapping.joint import PosePrior, State
+from cliploc_ros.offline.mapping.joint import State
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.odometry import link_frames
 from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
@@ -71,17 +71,6 @@ def test_errors_are_estimated(seen, kind, given):
 def test_too_few_boxes_give_no_estimate():
     few = see(make_table(), walk_around(frames=12))
     assert estimate_pose_errors(*draft_of(few), make_views(few)) is None
-
-
-def test_the_determinant_of_the_prior_is_that_of_its_matrix():
-    stamps = np.cumsum(np.random.default_rng(0).uniform(0.1, 2.0, 7))
-    prior = PosePrior.of(stamps, PoseErrors(0.05, 1.0, 3.0))
-    total = 0.0
-    for axis in range(6):
-        matrix = np.diag(prior.diagonal[:, axis])
-        matrix += np.diag(prior.beside[:-1, axis], 1) + np.diag(prior.beside[:-1, axis], -1)
-        total += np.linalg.slogdet(matrix)[1]
-    assert prior.log_determinant() == pytest.approx(total)
 
 
 def test_a_wrong_mount_is_corrected():

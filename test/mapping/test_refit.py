@@ -14,11 +14,10 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.building import build_map, refit_map
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.landmark_faults import find_map_overlaps, hear_witness
 from cliploc_ros.offline.mapping.options import CheckOptions
-from cliploc_ros.offline.mapping.refit import refit_map
 from cliploc_ros.offline.mapping.update.updating import update_map
 from cliploc_ros.offline.mapping.views import make_views
 

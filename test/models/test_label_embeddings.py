@@ -23,7 +23,7 @@ from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.images import check_image_rgb, crop_bounds, visible_boxes
 from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
 from cliploc_ros.models.observer import Observer
-from cliploc_ros.offline.vocabulary.phrase_embeddings import embed_phrases
+from cliploc_ros.offline.mapping.labelling import embed_phrases
 from demo.truth import read_frames
 
 KEY = 'ViT-B-32:gelu:0123'

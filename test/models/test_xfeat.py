@@ -18,7 +18,7 @@ import pytest
 
 from cliploc_ros.cli import evaluate
 from cliploc_ros.cli.build_map import make_parser
-from cliploc_ros.cli.map_layer import check_layer_options, make_layer, read_layer
+from cliploc_ros.cli.map_layer import layer_options, read_layer
 from cliploc_ros.cli.sources import read_frames
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import SIFT
@@ -197,9 +197,9 @@ def test_build_map_refuses_the_features_before_the_work(tmp_path, monkeypatch):
     asked = ['--tum', str(ASSETS / 'mapping'), '--out', str(tmp_path / 'a.yaml'),
              '--keyframe-features', 'xfeat']
     with pytest.raises(ModelError, match='cannot download'):
-        check_layer_options(make_parser().parse_args(asked))
+        layer_options(make_parser().parse_args(asked))
     with pytest.raises(OptionsError, match='--keyframe-features is for --keyframe-layer'):
-        check_layer_options(make_parser().parse_args([*asked, '--no-keyframe-layer']))
+        layer_options(make_parser().parse_args([*asked, '--no-keyframe-layer']))
 
 
 def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch, run_here):
@@ -209,9 +209,8 @@ def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch,
     options = make_parser().parse_args([
         '--tum', str(ASSETS / 'mapping'), '--keyframe-features', 'xfeat', '--keyframe-layer',
         '--out', str(tmp_path / 'map.yaml')])
-    check_layer_options(options)
-    save_layer(layer_path(options.out),
-               make_layer(options, read_frames(options), landmark_map)[0])
+    save_layer(layer_path(options.out), build_layer(read_frames(options), landmark_map,
+                                                    layer_options(options)[0]))
     layer = read_layer(options.out, landmark_map, wanted=True)
     assert layer.kind.dimensions == 64
     asked = run_here(evaluate.main, '--tum', ASSETS / 'sequence', '--every', 24, '--map',

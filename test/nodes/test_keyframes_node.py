@@ -16,9 +16,8 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.offline.datasets.folders import tum_frames
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.tum import read_tum
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
@@ -29,7 +28,7 @@ UNKNOWN = Detections(np.array([[10.0, 10.0, 90.0, 90.0]]), ('z',), np.ones(1))
 
 
 def frames_of(name):
-    return tum_frames(read_tum(ASSETS / name), find_camera(None, ASSETS / name)[0])
+    return read_folder(ASSETS / name, FolderOptions(layout='tum'))
 
 
 @pytest.fixture

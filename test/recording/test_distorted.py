@@ -17,7 +17,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.frames import RawFrame
-from cliploc_ros.offline.datasets.observations import load_recorded
+from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.views import make_views
 from cliploc_ros.offline.recording.networks import RunNetworks
 from demo.truth import read_objects
@@ -66,7 +66,7 @@ def recorded(folder):
     assert build_map(arguments('--tum', folder / 'mapping', *NETWORKS, '--no-clip', '--no-check',
                                '--no-joint', '--out', folder / 'map.yaml', '--record-to',
                                folder / 'mapping.npz')) == 0
-    return load_recorded(folder / 'mapping.npz').detections
+    return load_observations(folder / 'mapping.npz')
 
 
 def landmarks_off(file):

@@ -15,10 +15,9 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, load_layer_of_map, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.datasets.folders import tum_frames
+from cliploc_ros.offline.datasets.captures.capture import FolderOptions
+from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, RawFrame
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.recording.keyframe_layer import (
     LayerOptions,
     build_layer,
@@ -36,7 +35,7 @@ def demo_map():
 
 @pytest.fixture(scope='module')
 def frame():
-    walk = tum_frames(read_tum(ASSETS / 'mapping'), find_camera(None, ASSETS / 'mapping')[0])
+    walk = read_folder(ASSETS / 'mapping', FolderOptions(layout='tum'))
     return next(iter(walk.read()))
 
 

@@ -20,10 +20,8 @@ from cliploc_ros.core.query import CASE, Case, case_arrays, read_case
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
-from cliploc_ros.offline.datasets.folders import rgbd_frames, tum_frames
-from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.observations import load_queries
-from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.evaluation.methods import AUTO, Method
 from cliploc_ros.offline.evaluation.recording import make_queries_of, with_images
 from cliploc_ros.offline.evaluation.trials import make_queries, run_trial
@@ -79,7 +77,7 @@ def kitchen(shared_data):
 def rooms(shared_data):
     """Return map, keyframes and detections of the demo's rooms."""
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
-    walked, asked = (tum_frames(read_tum(ASSETS / name), find_camera(None, ASSETS / name)[0])
+    walked, asked = (read_folder(ASSETS / name, FolderOptions(layout='tum'))
                      for name in ('mapping', 'sequence'))
     asked = asked.select(range(0, asked.count, 5))
     recorded = record_every_frame(asked, LoadNetworks(

@@ -28,7 +28,7 @@ from disks import small_disk
 from cliploc_ros.cli import build_map, evaluate
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
-from cliploc_ros.offline.datasets.bag_poses import GROUND_TRUTH, find_poses
+from cliploc_ros.offline.datasets.bag_poses import PoseSource
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 from demo import ASSETS
 from studies import reproduce
@@ -176,7 +176,7 @@ def test_a_run_that_is_killed_twice_goes_on(server, write_sources, cache, run_he
     assert 0 < size <= HELD_BYTES and not whole.exists()
     server.held = ''
     kill_once(sources, out, lambda: any(
-        file.stat().st_size for file in out.glob('fr3/.mapped.cliploc-*.unfinished')))
+        file.stat().st_size for file in out.glob('fr3/.mapped.cliploc-*.outputs')))
     assert (ARCHIVE, f'bytes={size}-') in server.asked
     assert whole.read_bytes() == server.files[ARCHIVE]
     assert not (out / 'fr3/map.yaml').exists()
@@ -335,7 +335,7 @@ def test_seven_scenes_is_an_archive_in_an_archive(shared_data, tmp_path):
     reproduce.write_bags(one, folder, tmp_path)
     stamps = [[raw.stamp_ns for raw in bag_frames(
         tmp_path / name, BagTopics('/image/compressed', '/camera_info'),
-        find_poses(0, GROUND_TRUTH, None, 0, 0, None)).read_raw(lambda *_: True)]
+        PoseSource(tolerance_ns=0)).read_raw(lambda *_: True)]
         for name in ('mapped', 'asked')]
     assert [len(some) for some in stamps] == [5, 3]
     assert not set(stamps[0]) & set(stamps[1])

@@ -13,7 +13,7 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 from cliploc_ros.offline.datasets.bag_messages import pose_message, stamp_ns
-from cliploc_ros.offline.datasets.bag_poses import bag_odometry, poses_of_topic
+from cliploc_ros.offline.datasets.bag_poses import PoseSource, bag_odometry
 from cliploc_ros.offline.datasets.bags import BagReader, BagWriter
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
@@ -100,11 +100,11 @@ def observations(tmp_path_factory):
                 writer.write('/localizer', message.stamp_ns, pose_message(
                     stamp, 'map', make_transform(np.eye(3), np.array([jump, 0.1, 0.0])) @ pose))
     frames = bag_frames(folder / 'bag', BagTopics('/image/compressed', '/camera_info'),
-                        poses_of_topic('/localizer', 10**9))
+                        PoseSource('/localizer', topic_gap_ns=10**9))
     record_once(frames, RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx')), None,
                                          EVERY_FRAME, ''), folder / 'seen.npz',
                 {'': bag_odometry(folder / 'bag', '/image/compressed',
-                                  poses_of_topic('/wheels', 10**9))})
+                                  PoseSource('/wheels', topic_gap_ns=10**9))})
     return folder / 'seen.npz'
 
 

@@ -16,6 +16,7 @@ from studio_map import demo_studio
 from cliploc_ros.core.depth_image import DepthImage
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import viewpoint
@@ -49,7 +50,7 @@ def test_depth_becomes_a_cloud_below_the_ceiling():
     image = np.zeros((48, 64, 3), dtype=np.uint8)
     image[:, :32, 0] = 200
     depth = DepthImage(np.full((48, 64), 2.0, dtype=np.float32))
-    images = Images(np.array([0]), lambda place: (image, CAMERA), (), lambda place: depth)
+    images = Images([RawFrame(0, 0, None, lambda: (image, CAMERA), lambda: depth)])
     poses = make_transform(UPRIGHT, np.array([3.0, 0.0, 1.0]))[None]
     views = PosedDetections((CAMERA,), poses, np.zeros(1), np.zeros(2, dtype=np.int64),
                             np.empty((0, 4)), (), np.empty(0, dtype=np.int64), np.empty(0))

@@ -52,10 +52,11 @@ class View(NamedTuple):
     """An image and its pose, as recorded."""
 
     pose: _Pose | None
-    #: Returns the image and its camera; the argument: apply the image's EXIF orientation
-    look: Callable[[bool], tuple[NDArray[np.uint8], Camera]]
-    #: Returns the pose at a delay after the image's stamp [ns]
-    pose_after: Callable[[int], _Pose | None] | None = None
+    look: Callable[[], tuple[NDArray[np.uint8], Camera]]  #: Returns the image and its camera
+    #: The same, with the image's EXIF orientation applied
+    look_upright: Callable[[], tuple[NDArray[np.uint8], Camera]] | None = None
+    pose_at: Callable[[int], _Pose | None] | None = None  #: Returns the pose at a stamp [ns]
+    stamp_ns: int = 0
 
 
 class Reading(NamedTuple):
@@ -146,8 +147,8 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
         return {}
     for name, reading in readings.items():
         points, focal_px = kept[reading.upright, reading.camera]
-        first, second = (view.pose if view.pose_after is None or not reading.shift_ns
-                         else view.pose_after(reading.shift_ns) for view in pair)
+        first, second = (view.pose if view.pose_at is None or not reading.shift_ns
+                         else view.pose_at(view.stamp_ns + reading.shift_ns) for view in pair)
         if len(points[0]) and first is not None and second is not None:
             step = invert_transform(reading.pose(second)) @ reading.pose(first)
             errors[name] = focal_px * float(np.median(_sampson(points[0], points[1], step)))
@@ -157,7 +158,8 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
 def _match(pair: tuple[View, View], upright: bool
            ) -> tuple[list[Camera], list[NDArray[np.float64]]]:
     """Match two images; return their cameras, and the matched pixels (n, 2) of each."""
-    looks = [view.look(upright) for view in pair]
+    looks = [view.look_upright() if upright and view.look_upright else view.look()
+             for view in pair]
     features = [extract(image, _FEATURES, _LONGEST_PX) for image, _ in looks]
     ours, theirs = (SIFT.units(feature.descriptors) for feature in features)
     rows, _ = SIFT.match(ours, theirs)

@@ -21,12 +21,7 @@ from cliploc_ros.core.geometry.camera_faults import check_faults
 from cliploc_ros.errors import CameraError, CliplocError, DatasetError
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_agreement
-from cliploc_ros.offline.datasets.bag_poses import (
-    ReadPoses,
-    plain_name,
-    poses_of_images,
-    poses_of_tf,
-)
+from cliploc_ros.offline.datasets.bag_poses import PoseSource, plain_name, poses_of_images
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.offline.datasets.intrinsics import find_camera
@@ -45,17 +40,6 @@ _RECTIFIED_PX, _RECTIFIED_BETTER = 0.6, 0.6
 _COMPARED_PARTS, _COMPARED_OF_PART, _PART_S = 12, 8, 4.0
 
 
-class _Selected(NamedTuple):
-    """A serialized image of a recording, and its depth image."""
-
-    place: int
-    stamp_ns: int
-    recorded_ns: int
-    pose: NDArray[np.float64] | None
-    data: bytes
-    depth: bytes | None = None
-
-
 @dataclass(frozen=True)
 class BagTopics:
     """The topics of a recording, and how to read them."""
@@ -70,7 +54,7 @@ class BagTopics:
     intrinsics: str | None = None  #: The camera to use instead of camera_info, see find_camera
     #: Greatest difference between the stamps of a colour image and its depth image [ns]
     tolerance_ns: int = STAMP_TOLERANCE_NS
-    tf: str | None = None  #: Topic of the tf from depth to image, see poses_of_tf
+    tf: str | None = None  #: Topic of the tf from depth to image, see PoseSource
 
     def of_camera(self, name: str) -> 'BagTopics':
         """Return the topics of a camera of a rig; an empty name changes nothing."""
@@ -113,7 +97,7 @@ def find_topics(bag: Path, image: str | None, camera_info: str | None) -> tuple[
             beside if beside in infos else only(infos, 'camera_info', 'camera_info'))
 
 
-def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
+def bag_frames(bag: Path, topics: BagTopics, source: PoseSource,
                depth: DepthFormat | None = None) -> Frames:
     """Return the frames of a recording, a rosbag2 folder or file.
 
@@ -124,7 +108,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
     form = depth or DepthFormat()
     with BagReader(bag) as reader:
         _check_topics(reader, topics)
-        poses = poses_of_images(reader, topics.image, read_poses, str(bag))
+        poses = poses_of_images(reader, topics.image, source, str(bag))
         cameras = _Cameras.read(reader, topics)
         count, notes = reader.topic(topics.image).message_count, _notes(reader, topics)
         if topics.depth:
@@ -137,11 +121,7 @@ def bag_frames(bag: Path, topics: BagTopics, read_poses: ReadPoses,
 
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
         with BagReader(bag) as reader:
-            for image in _paired(reader, topics, poses, is_wanted):
-                yield RawFrame(
-                    image.place, image.stamp_ns, image.pose,
-                    cameras.decoder(image.stamp_ns, image.recorded_ns, image.data),
-                    None if image.depth is None else partial(decode_depth, image.depth))
+            yield from _paired(reader, topics, poses, cameras, decode_depth, is_wanted)
     return Frames(bag, count, read_raw, varies=len(cameras.infos) > 1, notes=tuple(
         f'note: {note}' for note in notes if note))
 
@@ -174,8 +154,13 @@ class _Cameras(NamedTuple):
             content = message.data[:4] + message.data[12:]  # all but the stamp
             infos.setdefault(content, message.data)
             found.append((stamp_ns, message.stamp_ns, content))
-        sound = {content: data for content, data in infos.items()
-                 if _says_calibration(data, topics.rectified)} or dict([*infos.items()][:1])
+        sound = {}
+        for content, data in infos.items():
+            with suppress(DatasetError):
+                if _is_calibrated(deserialize(data, bag_messages.CAMERA_INFO, where),
+                                  topics.rectified):
+                    sound[content] = data
+        sound = sound or dict([*infos.items()][:1])
         _check_one_camera(map(_frame_of, sound.values()), f'{reader.path}: {topics.camera_info}')
         for stamp_ns, _, content in found:
             if content not in sound and len(sound) < len(infos):
@@ -202,14 +187,6 @@ class _Cameras(NamedTuple):
             offsets = np.abs(self.times_ns - (stamp_ns if self.by_stamp else recorded_ns))
             info = self.infos[self.rows[int(np.argmin(offsets))] if len(self.infos) > 1 else 0]
         return partial(_decode_color, self.where, info, self.rectified, self.msgtype, data)
-
-
-def _says_calibration(data: bytes, rectified: bool) -> bool:
-    try:
-        info = deserialize(data, bag_messages.CAMERA_INFO, 'camera_info')
-    except DatasetError:
-        return False
-    return _is_calibrated(info, rectified)
 
 
 def _is_calibrated(info: Any, rectified: bool) -> bool:
@@ -242,8 +219,9 @@ def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat
         try:
             if not _is_calibrated(info, rectified=False):
                 raise DatasetError(f'{beside} has no calibration')
-            chain = poses_of_tf(image, depth, 10 * NS_PER_S, topics.tf)(reader, depth)
-            pose = chain.pose_at(bag_messages.stamp_ns(reader.first(topics.depth)))
+            poses = PoseSource(map_frame=image, tf=topics.tf, max_gap_ns=10 * NS_PER_S).read(
+                reader, depth)
+            pose = poses.pose_at(bag_messages.stamp_ns(reader.first(topics.depth)))
             if pose is not None:
                 return replace(form, camera=DepthCamera(fx, fy, cx, cy, pose))
             problem = 'tf between them does not cover the first depth image'
@@ -263,17 +241,11 @@ def _sampled(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Camer
         found = [(_peek_stamp_ns(message), message.stamp_ns) for message in reader.messages(
             [topics.image], begin_ns, int(begin) + round(_PART_S * NS_PER_S))]
         last = max([last, *(recorded_ns + 1 for _, recorded_ns in found)])
-        step = max(1, len(found) // _COMPARED_OF_PART)
-        images = BagImages(reader.path, topics.image, np.array(found[::step], dtype=np.int64
-                                                               ).reshape(-1, 2), cameras)
-        views += [View(poses.pose_at(stamp_ns), partial(images.look, place),
-                       partial(_pose_after, poses, stamp_ns))
-                  for place, (stamp_ns, _) in enumerate(found[::step])]
+        views += [View(poses.pose_at(stamp_ns), partial(
+            _read_image, reader.path, topics.image, cameras, stamp_ns, recorded_ns), None,
+            poses.pose_at, stamp_ns)
+            for stamp_ns, recorded_ns in found[::max(1, len(found) // _COMPARED_OF_PART)]]
     return views
-
-
-def _pose_after(poses: Poses, stamp_ns: int, later_ns: int) -> NDArray[np.float64] | None:
-    return poses.pose_at(stamp_ns + later_ns)
 
 
 def _readings(cameras: _Cameras, rectified: bool) -> dict[str, Reading]:
@@ -322,46 +294,34 @@ def _notes(reader: BagReader, topics: BagTopics) -> list[str]:
     return [fault.text for fault in faults]
 
 
-def bag_images(bag: Path, topics: BagTopics) -> 'BagImages':
-    """Open the images of a recording, to be read in any order.
+def bag_images(bag: Path, topics: BagTopics, camera: str = '') -> list[RawFrame]:
+    """Return the images of a recording without poses, each read on demand; camera is their name.
 
     The recording is read once, for the stamps. DatasetError: a topic is missing, of another type,
     or empty.
     """
     with BagReader(bag) as reader:
         _check_topics(reader, topics)
+        cameras = _Cameras.read(reader, topics)
         times_ns = [(_peek_stamp_ns(message), message.stamp_ns)
                     for message in reader.messages([topics.image])]
-        return BagImages(bag, topics.image, np.array(times_ns, dtype=np.int64).reshape(-1, 2),
-                         _Cameras.read(reader, topics))
+    return [RawFrame(place, stamp_ns, None, partial(
+        _read_image, bag, topics.image, cameras, stamp_ns, recorded_ns), camera=camera)
+        for place, (stamp_ns, recorded_ns) in enumerate(times_ns)]
 
 
-@dataclass(frozen=True)
-class BagImages:
-    """The images of a recording, read one at a time by their time of recording."""
+def _read_image(bag: Path, topic: str, cameras: _Cameras, stamp_ns: int, recorded_ns: int
+                ) -> tuple[NDArray[np.uint8], Camera]:
+    """Read an image (h, w, 3), RGB, and its camera, by its stamp and time of recording.
 
-    bag: Path
-    topic: str
-    #: (F, 2): stamp and time of recording of each image [ns]
-    times_ns: NDArray[np.int64]
-    cameras: _Cameras
-
-    def look(self, place: int, upright: bool) -> tuple[NDArray[np.uint8], Camera]:
-        """Read an image and its camera; messages have no EXIF orientation to apply."""
-        return self.read(place)
-
-    def read(self, place: int) -> tuple[NDArray[np.uint8], Camera]:
-        """Read an image (h, w, 3), RGB, and its camera.
-
-        DatasetError: the image cannot be decoded, or the recording has changed.
-        """
-        taken_ns, recorded_ns = self.times_ns[place].tolist()
-        with BagReader(self.bag) as reader:
-            for message in reader.messages([self.topic], recorded_ns, recorded_ns + 1):
-                if _peek_stamp_ns(message) == taken_ns:
-                    return self.cameras.decoder(taken_ns, recorded_ns, message.data)()
-        raise DatasetError(f'{self.bag}: image {place} of {self.topic} is missing: the recording '
-                           'has changed; start again')
+    DatasetError: the image cannot be decoded, or the recording has changed.
+    """
+    with BagReader(bag) as reader:
+        for message in reader.messages([topic], recorded_ns, recorded_ns + 1):
+            if _peek_stamp_ns(message) == stamp_ns:
+                return cameras.decoder(stamp_ns, recorded_ns, message.data)()
+    raise DatasetError(f'{bag}: the image of {topic} at {stamp_ns / NS_PER_S:.6f} s is missing: '
+                       'the recording has changed; start again')
 
 
 def _check_topics(reader: BagReader, topics: BagTopics) -> None:
@@ -376,17 +336,17 @@ def _check_topics(reader: BagReader, topics: BagTopics) -> None:
             raise DatasetError(f'{reader.path}: {name} has no messages')
 
 
-def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wanted
-            ) -> Iterator[_Selected]:
+def _paired(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Cameras,
+            decode_depth: Callable[[bytes], DepthImage], is_wanted: Wanted) -> Iterator[RawFrame]:
     """Yield the wanted images, each with the depth image nearest in time, or None."""
-    waiting: deque[_Selected] = deque()
+    waiting: deque[RawFrame] = deque()
     depths: deque[tuple[int, bytes]] = deque(maxlen=2 * _MAX_WAITING)
 
-    def with_depth(selected: _Selected) -> _Selected:
-        nearest = min(depths, key=lambda depth: abs(depth[0] - selected.stamp_ns), default=None)
-        if nearest is None or abs(nearest[0] - selected.stamp_ns) > topics.tolerance_ns:
-            return selected
-        return selected._replace(depth=nearest[1])
+    def with_depth(raw: RawFrame) -> RawFrame:
+        nearest = min(depths, key=lambda depth: abs(depth[0] - raw.stamp_ns), default=None)
+        if nearest is None or abs(nearest[0] - raw.stamp_ns) > topics.tolerance_ns:
+            return raw
+        return replace(raw, depth=partial(decode_depth, nearest[1]))
     place, before, frame = 0, 0, ''
     for recorded in reader.messages([topics.image, *([topics.depth] if topics.depth else [])]):
         stamp_ns = _peek_stamp_ns(recorded)
@@ -398,7 +358,8 @@ def _paired(reader: BagReader, topics: BagTopics, poses: Poses, is_wanted: Wante
             _check_one_camera([earlier, frame], f'{reader.path}: {topics.image}')
             pose, before = poses.pose_at(stamp_ns), stamp_ns
             if is_wanted(place, stamp_ns, pose):
-                waiting.append(_Selected(place, stamp_ns, recorded.stamp_ns, pose, recorded.data))
+                waiting.append(RawFrame(place, stamp_ns, pose, cameras.decoder(
+                    stamp_ns, recorded.stamp_ns, recorded.data)))
             place += 1
         while waiting and (not topics.depth or len(waiting) > _MAX_WAITING or (
                 depths and depths[-1][0] >= waiting[0].stamp_ns + topics.tolerance_ns)):

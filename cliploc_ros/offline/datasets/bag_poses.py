@@ -35,8 +35,6 @@ _POSE_TYPES: dict[str, Callable[[Any], Any]] = {
     'geometry_msgs/msg/PoseWithCovarianceStamped': lambda message: message.pose.pose,
     'nav_msgs/msg/Odometry': lambda message: message.pose.pose,
 }
-#: Reads the poses of an open recording, given the coordinate frame of its images.
-ReadPoses = Callable[[BagReader, str], Poses]
 #: Default sources of poses: the topic that tum_to_bag writes, and the map's frame in tf.
 GROUND_TRUTH, MAP_FRAME = '/ground_truth', 'map'
 _TF, _TF_STATIC = '/tf', '/tf_static'
@@ -45,21 +43,69 @@ _TF_TYPE = 'tf2_msgs/msg/TFMessage'
 _COMPARED, _SAME_M, _SAME_DEG = 50, 0.05, 2.0
 
 
-def poses_of_topic(name: str, max_gap_ns: int = 0,
-                   body_from_camera: NDArray[np.float64] | None = None,
-                   tolerance_ns: int = STAMP_TOLERANCE_NS, tf: str | None = None) -> ReadPoses:
-    """Return a reader of a topic of PoseStamped, PoseWithCovarianceStamped or Odometry.
+@dataclass(frozen=True)
+class PoseSource:
+    """The source of a camera's poses in a recording: a topic, tf, or a trajectory.
 
-    The parameters are those of TimedPoses. If no mount is given and the child_frame_id differs
-    from the images' frame, tf supplies the transform to the camera. The reader raises a
-    DatasetError if the topic is missing or of another type, if many poses are invalid, or if the
-    transform to the camera is missing.
+    If none of the three is given, the poses are those of the topic of ground truth if there is
+    one, otherwise of tf in the coordinate frame `map`. Other topics are not used: it is unknown
+    which body their poses describe.
     """
-    def read(reader: BagReader, camera_frame: str) -> Poses:
-        pose_of = _POSE_TYPES.get(reader.topic(name).msgtype)
+
+    topic: str | None = None  #: PoseStamped, PoseWithCovarianceStamped or Odometry
+    map_frame: str | None = None  #: Coordinate frame of the map in tf
+    trajectory: TimedPoses | None = None
+    #: The camera's optical coordinate frame (z forward); None: that of the images
+    camera_frame: str | None = None
+    #: Topic to use instead of /tf. The static topic has its name with the suffix _static.
+    tf: str | None = None
+    #: Greatest gap between two samples of tf, and of a topic, to interpolate over [ns]
+    max_gap_ns: int = 0
+    topic_gap_ns: int = 0
+    #: (4, 4): mount of the camera on the body that a topic describes. None: the poses are those of
+    #: child_frame_id, and tf has the transform to the camera; without this id, of the camera
+    body_from_camera: NDArray[np.float64] | None = None
+    tolerance_ns: int = STAMP_TOLERANCE_NS
+    ground_truth: str = GROUND_TRUTH  #: Topic
+
+    def read(self, reader: BagReader, image_frame: str) -> Poses:
+        """Read the poses of an open recording, given the coordinate frame of its images.
+
+        DatasetError: the source is missing or of another type, many poses are invalid, or tf does
+        not connect the two coordinate frames.
+        """
+        camera_frame = plain_name(self.camera_frame or image_frame)
+        if self.trajectory is not None:
+            return self.trajectory
+        if self.topic is not None:
+            return self._of_topic(reader, self.topic, camera_frame)
+        if self.map_frame is not None:
+            return self._of_tf(reader, self.map_frame, camera_frame, self.max_gap_ns)
+        problem, of_tf = 'no tf', None
+        try:
+            if _tf_topics(reader, self.tf):
+                of_tf = self._of_tf(reader, MAP_FRAME, camera_frame, self.max_gap_ns)
+        except DatasetError as error:
+            problem = str(error).removeprefix(f'{reader.path}: ')
+        if self.ground_truth in reader.topics:
+            of_topic = self._of_topic(reader, self.ground_truth, camera_frame)
+            if of_tf is not None and (far := _difference(of_topic, of_tf)):
+                reader.notes.append(f'{self.ground_truth} and tf give different poses of the '
+                                    f'camera: {far} apart; {self.ground_truth} is used; give '
+                                    '`map_frame` for tf')
+            return of_topic
+        if of_tf is not None:
+            return of_tf
+        there = ', '.join(name for name, topic in reader.topics.items()
+                          if topic.msgtype in _POSE_TYPES and topic.message_count) or 'none'
+        raise DatasetError(f'{reader.path}: say where the poses are: `pose_topic`, `map_frame` '
+                           f'(tf) or `trajectory`; topics with poses: {there}; {problem}')
+
+    def _of_topic(self, reader: BagReader, name: str, camera_frame: str) -> Poses:
+        where, kind = f'{reader.path}: {name}', reader.topic(name).msgtype
+        pose_of = _POSE_TYPES.get(kind)
         if pose_of is None:
-            raise DatasetError(f'{reader.path}: {name} is of type {reader.topic(name).msgtype}, '
-                               f'not {" or ".join(_POSE_TYPES)}')
+            raise DatasetError(f'{where} is of type {kind}, not {" or ".join(_POSE_TYPES)}')
         stamps, rows, children = [], [], set[str]()
         for _, message in reader.readable([name]):
             pose = pose_of(message)
@@ -68,60 +114,35 @@ def poses_of_topic(name: str, max_gap_ns: int = 0,
                 stamps.append(bag_messages.stamp_ns(message))
                 rows.append(numbers)
                 children.add(plain_name(getattr(message, 'child_frame_id', '')))
-        check_forward(stamps, f'{reader.path}: {name}')
-        poses = replace(TimedPoses.from_samples(stamps, rows, f'{reader.path}: {name}'),
-                        max_gap_ns=max_gap_ns, body_from_camera=body_from_camera,
-                        tolerance_ns=tolerance_ns)
+        check_forward(stamps, where)
+        poses = replace(TimedPoses.from_samples(stamps, rows, where),
+                        max_gap_ns=self.topic_gap_ns, body_from_camera=self.body_from_camera,
+                        tolerance_ns=self.tolerance_ns)
         if len(children) > 1:
-            raise DatasetError(f'{reader.path}: {name} has poses of several coordinate frames, '
+            raise DatasetError(f'{where} has poses of several coordinate frames, '
                                f'{", ".join(sorted(children))} (child_frame_id): record the '
                                'poses of one frame')
         child = ''.join(children)
-        if body_from_camera is not None or child in ('', plain_name(camera_frame)):
+        if self.body_from_camera is not None or child in ('', camera_frame):
             return poses
         try:
-            chain = poses_of_tf(child, camera_frame, max_gap_ns, tf)(reader, camera_frame)
-            return ChainedPoses(poses, chain)
+            return replace(self._of_tf(reader, child, camera_frame, self.topic_gap_ns), body=poses)
         except DatasetError as error:
             raise DatasetError(
                 f"{reader.path}: the poses of {name} are of '{child}' (child_frame_id), the "
                 f"images of '{camera_frame}': give the `mount` of the camera on it, or record tf "
                 f'between them ({str(error).removeprefix(f"{reader.path}: ")})') from error
-    return read
 
-
-def find_poses(max_gap_ns: int, ground_truth: str = GROUND_TRUTH,
-               camera_frame: str | None = None, topic_gap_ns: int | None = None,
-               tolerance_ns: int = STAMP_TOLERANCE_NS, tf: str | None = None) -> ReadPoses:
-    """Return a reader that finds the source of the camera's poses in a recording.
-
-    It reads the topic of ground truth if there is one, otherwise tf in the coordinate frame `map`.
-    Other topics are not used: it is unknown which body their poses describe. The greatest gap may
-    differ between the topic and tf. The reader raises a DatasetError if there are no poses.
-    """
-    def read(reader: BagReader, image_frame: str) -> Poses:
-        problem, of_tf = 'no tf', None
-        try:
-            if _tf_topics(reader, tf):
-                of_tf = poses_of_tf(MAP_FRAME, camera_frame, max_gap_ns, tf)(reader, image_frame)
-        except DatasetError as error:
-            problem = str(error).removeprefix(f'{reader.path}: ')
-        if ground_truth in reader.topics:
-            of_topic = poses_of_topic(
-                ground_truth, max_gap_ns if topic_gap_ns is None else topic_gap_ns, None,
-                tolerance_ns, tf)(reader, camera_frame or image_frame)
-            if of_tf is not None and (far := _difference(of_topic, of_tf)):
-                reader.notes.append(f'{ground_truth} and tf give different poses of the camera: '
-                                    f'{far} apart; {ground_truth} is used; give `map_frame` for '
-                                    'tf')
-            return of_topic
-        if of_tf is not None:
-            return of_tf
-        there = ', '.join(name for name, topic in reader.topics.items()
-                          if topic.msgtype in _POSE_TYPES and topic.message_count) or 'none'
-        raise DatasetError(f'{reader.path}: say where the poses are: `pose_topic`, `map_frame` '
-                           f'(tf) or `trajectory`; topics with poses: {there}; {problem}')
-    return read
+    def _of_tf(self, reader: BagReader, map_frame: str, camera_frame: str, max_gap_ns: int
+               ) -> 'TransformChain':
+        topics = _tf_topics(reader, self.tf)
+        if not topics:
+            raise DatasetError(f'{reader.path}: has neither {_TF} nor {_TF_STATIC}; record them, '
+                               'or give a topic or file of poses')
+        parents, up, down = _find_way(reader, topics, plain_name(map_frame), camera_frame)
+        links = _read_links(reader, topics, {*up, *down}, parents, max_gap_ns)
+        return TransformChain(tuple(links[child] for child in up),
+                              tuple(links[child] for child in down))
 
 
 def _difference(poses: Poses, others: Poses) -> str:
@@ -152,15 +173,19 @@ class FixedPose:
 class TransformChain:
     """The transforms from two coordinate frames up to their common ancestor.
 
-    Each link is the pose of a coordinate frame in its parent.
+    Each link is the pose of a coordinate frame in its parent. If there is a body, the first frame
+    is that of the body, whose poses are in a map.
     """
 
-    up: tuple[Poses, ...]  #: Links from the map to the common ancestor
+    up: tuple[Poses, ...]  #: Links from the map, or the body, to the common ancestor
     down: tuple[Poses, ...]  #: Links from the camera to the common ancestor
+    body: Poses | None = None
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
-        """Return the first and last stamp at which all links are known [ns]."""
+        """Return the first and last stamp at which all links, or the body, are known [ns]."""
+        if self.body is not None:
+            return self.body.span_ns
         spans = [FixedPose.span_ns, *(link.span_ns for link in (*self.up, *self.down))]
         if None in spans:
             return None
@@ -175,55 +200,11 @@ class TransformChain:
                 if parent_from_child is None:
                     return None
                 ancestor_from[end] = parent_from_child @ ancestor_from[end]
-        return np.asarray(invert_transform(ancestor_from[0]) @ ancestor_from[1])
-
-
-@dataclass(frozen=True)
-class ChainedPoses:
-    """The poses of a body, and the transforms from the body to the camera."""
-
-    body: Poses
-    chain: Poses
-
-    @property
-    def span_ns(self) -> tuple[int, int] | None:
-        """Return the first and last stamp at which the body's pose is known [ns]."""
-        return self.body.span_ns
-
-    def pose_at(self, stamp_ns: int) -> NDArray[np.float64] | None:
-        """Return ``map_from_camera`` (4, 4) at a stamp [ns]; None if it is not known."""
-        first, second = self.body.pose_at(stamp_ns), self.chain.pose_at(stamp_ns)
-        return None if first is None or second is None else np.asarray(first @ second)
-
-
-def poses_of_tf(map_frame: str, camera_frame: str | None, max_gap_ns: int,
-                tf: str | None = None) -> ReadPoses:
-    """Return a reader of a camera's poses in a map, from /tf and /tf_static.
-
-    The reader raises a DatasetError if the recording has no tf, or if tf does not connect the two
-    frames.
-
-    Parameters
-    ----------
-    map_frame, camera_frame : str
-        Coordinate frames. The camera's is the optical frame (z forward); default: the frame of the
-        images.
-    max_gap_ns : int
-        Greatest gap between two samples to interpolate over [ns].
-    tf : str, optional
-        The topic to use instead of /tf. The static topic has its name with the suffix _static.
-    """
-    def read(reader: BagReader, image_frame: str) -> TransformChain:
-        topics = _tf_topics(reader, tf)
-        if not topics:
-            raise DatasetError(f'{reader.path}: has neither {_TF} nor {_TF_STATIC}; record them, '
-                               'or give a topic or file of poses')
-        parents, up, down = _find_way(reader, topics, plain_name(map_frame),
-                                      plain_name(camera_frame or image_frame))
-        links = _read_links(reader, topics, {*up, *down}, parents, max_gap_ns)
-        return TransformChain(tuple(links[child] for child in up),
-                              tuple(links[child] for child in down))
-    return read
+        pose = np.asarray(invert_transform(ancestor_from[0]) @ ancestor_from[1])
+        if self.body is None:
+            return pose
+        body = self.body.pose_at(stamp_ns)
+        return None if body is None else np.asarray(body @ pose)
 
 
 def _tf_topics(reader: BagReader, tf: str | None) -> list[str]:
@@ -342,23 +323,22 @@ def plain_name(frame_id: str) -> str:
     return frame_id.removeprefix('/')
 
 
-def bag_odometry(bag: Path, image_topic: str, read_odometry: ReadPoses) -> Poses:
+def bag_odometry(bag: Path, image_topic: str, source: PoseSource) -> Poses:
     """Read the poses of a recording's camera in the odometry frame.
 
     DatasetError: the topic or tf is missing or invalid, or does not overlap the images in time.
     """
     with BagReader(bag) as reader:
-        return poses_of_images(reader, image_topic, read_odometry, f'{bag}: odometry')
+        return poses_of_images(reader, image_topic, source, f'{bag}: odometry')
 
 
-def poses_of_images(reader: BagReader, image_topic: str, read_poses: ReadPoses, where: str
-                    ) -> Poses:
+def poses_of_images(reader: BagReader, image_topic: str, source: PoseSource, where: str) -> Poses:
     """Read the poses of the camera of an image topic.
 
     DatasetError: the poses are missing or invalid, or do not overlap the images in time.
     """
     image = reader.first(image_topic)
-    poses = read_poses(reader, str(image.header.frame_id))
+    poses = source.read(reader, str(image.header.frame_id))
     first_ns = bag_messages.stamp_ns(image)
     check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, where)
     return poses

@@ -106,7 +106,7 @@ class BagReader:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._reader: Reader | None = None
+        self._reader: Reader  # while it is open
         self._topics: dict[str, BagTopic] = {}
         #: Reasons and times of unusable messages, by topic
         self.left_out: dict[str, dict[str, None]] = {}
@@ -137,9 +137,7 @@ class BagReader:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         """Close the recording."""
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None
+        self._reader.close()
 
     @property
     def topics(self) -> Mapping[str, BagTopic]:
@@ -154,13 +152,13 @@ class BagReader:
     @property
     def start_ns(self) -> int:
         """Stamp of the first message [ns]; 0 for an empty recording."""
-        return self._open_reader.start_time if self.message_count else 0
+        return self._reader.start_time if self.message_count else 0
 
     @property
     def end_ns(self) -> int:
         """Stamp of the last message [ns]; 0 for an empty recording."""
         # The library's end lies one nanosecond after the last message.
-        return self._open_reader.end_time - 1 if self.message_count else 0
+        return self._reader.end_time - 1 if self.message_count else 0
 
     def topic(self, name: str) -> BagTopic:
         """Return a topic.
@@ -190,7 +188,7 @@ class BagReader:
         connections = self._connections({self.topic(name).name for name in names})
         if not connections:
             return
-        stream = self._open_reader.messages(connections, start_ns, stop_ns)
+        stream = self._reader.messages(connections, start_ns, stop_ns)
         while True:
             try:
                 connection, stamp_ns, data = next(stream)
@@ -250,12 +248,6 @@ class BagReader:
         return deserialize(message.data, topic.msgtype,
                            f'{self.path}: {topic.name} at {message.stamp_ns}')
 
-    @property
-    def _open_reader(self) -> Reader:
-        if self._reader is None:
-            raise RuntimeError('the recording is not open: use it in a with statement')
-        return self._reader
-
     def _collect_topics(self, connections: Collection[Connection]) -> dict[str, BagTopic]:
         topics: dict[str, BagTopic] = {}
         for connection in connections:
@@ -278,7 +270,7 @@ class BagReader:
         metadata.yaml, and users edit metadata.yaml to repair QoS. The connections of the files
         always match.
         """
-        reader = self._open_reader
+        reader = self._reader
         files = getattr(reader.storage, 'storages', [])
         handles = [*reader.connections,
                    *(connection for file in files for connection in file.connections)]
@@ -310,7 +302,7 @@ class BagWriter:
             raise DatasetError(f'storage {storage!r} is not one of {", ".join(STORAGES)}')
         self._storage = STORAGES[storage]
         self._staging: Path | None = None
-        self._writer: Writer | None = None
+        self._writer: Writer  # while it is open
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> Self:
@@ -320,32 +312,30 @@ class BagWriter:
             with self._naming_failures():
                 self._staging = Path(tempfile.mkdtemp(
                     prefix=f'.{self.path.name}.', suffix='.partial', dir=self.path.parent))
-                writer = Writer(self._staging / self.path.name, version=9,
-                                storage_plugin=self._storage)
-                writer.open()
+                self._writer = Writer(self._staging / self.path.name, version=9,
+                                      storage_plugin=self._storage)
+                self._writer.open()
         except BaseException:  # Ctrl-C, too
             self._discard()
             raise
-        self._writer = writer
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         """Complete the recording and move it to its final path, or remove it."""
-        writer, self._writer = self._writer, None
-        assert writer is not None and self._staging is not None
+        assert self._staging is not None
         is_complete = False
         try:
             if kind is None:
                 with self._naming_failures():
-                    writer.close()
+                    self._writer.close()
                     self._check_free()  # another process may have written it meanwhile
                     (self._staging / self.path.name).rename(self.path)
                 is_complete = True
         finally:
             if not is_complete:
                 with suppress(Exception):  # the first exception is the one to report
-                    writer.abort()
+                    self._writer.abort()
             self._discard()
 
     def add_topic(self, name: str, msgtype: str, qos: Qos = RELIABLE_QOS) -> None:
@@ -359,7 +349,7 @@ class BagWriter:
             The QoS that the topic's publisher would offer.
         """
         with self._naming_failures():
-            self._connections[name] = self._open_writer.add_connection(
+            self._connections[name] = self._writer.add_connection(
                 name, msgtype, typestore=typestore(), offered_qos_profiles=[qos])
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
@@ -368,13 +358,7 @@ class BagWriter:
         data = (message if isinstance(message, bytes)
                 else typestore().serialize_cdr(message, connection.msgtype))
         with self._naming_failures():
-            self._open_writer.write(connection, stamp_ns, data)
-
-    @property
-    def _open_writer(self) -> Writer:
-        if self._writer is None:
-            raise RuntimeError('the recording is not open: use it in a with statement')
-        return self._writer
+            self._writer.write(connection, stamp_ns, data)
 
     def _check_free(self) -> None:
         if self.path.exists() or self.path.is_symlink():

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Folders of images with poses: the table of their layouts, and a reader for all layouts.
 
-This module reads TUM RGB-D, with or without depth, and 7-Scenes; ``captures`` reads the others.
+This module reads TUM RGB-D, with or without depth, and 7-Scenes; ``captures`` reads the others. It
+converts stored poses to poses in a map: camera axes, unit and vertical. The images reveal a wrong
+choice of axes, see agreement.
 """
 
 import hashlib
@@ -21,14 +23,27 @@ from cliploc_ros.core.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.captures import colmap, devices, placing
+from cliploc_ros.offline.datasets.agreement import (
+    AXES,
+    Reading,
+    View,
+    check_agreement,
+    w_first,
+)
+from cliploc_ros.offline.datasets.captures import colmap, devices
 from cliploc_ros.offline.datasets.captures.capture import Capture, FolderOptions
-from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, ImageFile, folder_frames
+from cliploc_ros.offline.datasets.frames import (
+    DepthFormat,
+    Frames,
+    ImageFile,
+    folder_frames,
+    read_color,
+)
 from cliploc_ros.offline.datasets.intrinsics import find_camera, read_camera
 from cliploc_ros.offline.datasets.parsing import naming, parse_all, read_lines
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_tum
-from cliploc_ros.offline.mapping.tilt import NO_VERTICAL, find_tilt, tilt_note
+from cliploc_ros.offline.mapping.tilt import find_levelling, tilt_note
 from cliploc_ros.units import NS_PER_S
 
 # Depth and colour of 7-Scenes are not registered, and its authors give no intrinsics for colour.
@@ -39,6 +54,14 @@ _SEVEN_SCENES_DEPTH = DepthCamera(
     transforms.make_transform(np.eye(3), np.array([-0.025, 0.0, 0.0])))
 _SEVEN_SCENES_NAME = re.compile(r'frame-(\d+)\.color\.(?:jpe?g|png)')
 _SEVEN_SCENES_HZ = 30
+# Rotations into a coordinate frame with z up, by the axis that points up.
+_UP: Mapping[str, NDArray[np.float64]] = {
+    'z': np.eye(3), 'y': np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
+# Greatest coordinate of a pose in a map [m].
+_MOST_M = 1e7
+# Number of images whose EXIF orientation is checked.
+_ORIENTED = 3
+
 _NO_OPTIONS = FolderOptions()
 # Incomplete layouts: name, a file that identifies the layout, and the file that is missing.
 _NEARLY = (('TUM RGB-D', 'groundtruth.txt', 'rgb.txt'), ('TUM RGB-D', 'depth.txt', 'rgb.txt'),
@@ -47,11 +70,6 @@ _NEARLY = (('TUM RGB-D', 'groundtruth.txt', 'rgb.txt'), ('TUM RGB-D', 'depth.txt
            ('7-Scenes', 'frame-*.pose.txt', 'frame-000000.color.jpg'),
            ('Record3D', 'rgbd', 'metadata.json'), ('Polycam', 'mesh_info.json', 'keyframes'),
            ('COLMAP', 'database.db', 'sparse/0 (run its mapper)'))
-# Layouts that are not supported, and the files that identify them.
-_OTHERS = {'EuRoC': ('mav0',), 'KITTI': ('image_[0-3]', 'times.txt'),
-           'ScanNet': ('color', 'pose', 'intrinsic'), 'Replica': ('results', 'traj.txt'),
-           'ScanNet++': ('iphone', 'dslr'), 'nuScenes': ('samples', 'sweeps'),
-           'Matterport3D': ('matterport_color_images',), 'ROS 1': ('*.bag',)}
 
 
 class Layout(NamedTuple):
@@ -78,9 +96,13 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
     """
     layout = find_layout(folder, options.layout)
     if layout is None:
+        nearly = next((f'it has {mark} as {name} does, but lacks {lacking}'
+                       for name, mark, lacking in _NEARLY
+                       if any(folder.glob(mark)) and not (folder / lacking).exists()), '')
         remedy = ('it is a recording: give it as `bag`' if (folder / 'metadata.yaml').is_file()
-                  else 'unpack it' if folder.suffix in ('.r3d', '.zip') else _unread(folder)
-                  or 'images without poses need a pose estimator, such as COLMAP')
+                  else 'unpack it' if folder.suffix in ('.r3d', '.zip') else nearly or
+                  'write rgb.txt, groundtruth.txt and camera.json next to its images, as in TUM '
+                  'RGB-D; images without poses need a pose estimator, such as COLMAP')
         known = ', '.join(sorted({layout.name for layout in LAYOUTS}))
         raise DatasetError(f'{folder}: has none of the known layouts ({known}); {remedy}')
     given = {'intrinsics': options.intrinsics, 'trajectory': options.trajectory,
@@ -92,17 +114,6 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
                                f'{" and ".join(able)}')
     with naming(folder, OSError, what='cannot be read: '):
         return _placed(folder, layout, layout.read(folder, options), options)
-
-
-def _unread(folder: Path) -> str:
-    """Describe the incomplete or unsupported layout of a folder; '' if there is none."""
-    for name, mark, lacking in _NEARLY:
-        if any(folder.glob(mark)) and not (folder / lacking).exists():
-            return f'it has {mark} as {name} does, but lacks {lacking}'
-    other = next((name for name, marks in _OTHERS.items()
-                  if all(any(folder.glob(mark)) for mark in marks)), '')
-    return other and (f'its layout is that of {other}: write rgb.txt, groundtruth.txt and '
-                      'camera.json next to its images, as in TUM RGB-D, or a transforms.json')
 
 
 def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Camera, str]:
@@ -119,8 +130,8 @@ def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Ca
             file.number is not None for file in capture.files):
         raise DatasetError(f'{folder}: {layout.name} with {len(cameras)} cameras: a recording '
                            'needs image files of one camera, and poses in metres')
-    files = placing.place_images(capture.files, capture.axes,
-                                 map_from_stored=placing.UP[capture.up or 'z'])
+    files = _place_images(capture.files, capture.axes,
+                                 map_from_stored=_UP[capture.up or 'z'])
     posed = {file.stamp_ns: file.pose for file in files if file.pose is not None}
     trajectory = TimedPoses.from_samples(
         list(posed), [[*pose[:3, 3], *transforms.quaternion_from_transform(pose)]
@@ -144,27 +155,30 @@ def find_layout(folder: Path, key: str = '') -> Layout | None:
 def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptions) -> Frames:
     """Return the frames of a capture, in the map's coordinate frame."""
     if capture.trajectory is not None:
-        _check_trajectory(folder, capture.files, capture.trajectory)
-    axes, scale, turn = options.axes or capture.axes, options.scale, placing.UP[capture.up or 'z']
-    files = placing.place_images(capture.files, axes)
+        if not len(capture.trajectory):
+            raise DatasetError(f'{folder}: there are no poses: groundtruth.txt is missing; give '
+                               'a `trajectory`')
+        check_clock(capture.trajectory, capture.files[0].stamp_ns, capture.files[-1].stamp_ns,
+                    str(folder))
+    axes, scale, turn = options.axes or capture.axes, options.scale, _UP[capture.up or 'z']
+    files = _place_images(capture.files, axes)
     notes = [f'read as {layout.name}: {sum(file.pose is not None for file in files)} of '
              f'{max(len(files), capture.images)} images have poses', *capture.notes,
-             placing.check_axes(capture.files, axes, folder)]
+             check_axes(capture.files, axes, folder)]
     if options.known_distance is not None:
-        scale = placing.find_scale(files, *options.known_distance, folder)
+        scale = _find_scale(files, *options.known_distance, folder)
         notes.append(f'a unit is {scale:.5g} m by the known distance')
     if scale is None and not capture.is_metric and not options.any_unit:
         raise DatasetError(f'{folder}: the unit of {layout.name} is unknown: give `scale`, the '
                            'metres of a unit (1 for metres), a `known_distance` or an '
                            '`object_size`')
-    files = placing.place_images(capture.files, axes, scale or 1.0, turn)
+    files = _place_images(capture.files, axes, scale or 1.0, turn)
     poses = np.array([file.pose for file in files if file.pose is not None]).reshape(-1, 4, 4)
     if options.level:
-        found = find_tilt(poses)
-        if found is None:
-            raise DatasetError(f'{folder}: {NO_VERTICAL}')
-        files = placing.place_images(capture.files, axes, scale or 1.0, found[0] @ turn)
-        notes.append(f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z')
+        with naming(folder, DatasetError):
+            rotation, note = find_levelling(poses, True)
+        files = _place_images(capture.files, axes, scale or 1.0, rotation @ turn)
+        notes.append(note)
     elif not capture.up:
         notes.append(tilt_note(poses))
     form = replace(capture.depth, unit_m=options.depth.unit_m or capture.depth.unit_m,
@@ -182,16 +196,6 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
     return replace(frames, digest=digest, notes=(*filter(None, notes), *frames.notes))
 
 
-def tum_frames(sequence: TumSequence, camera: Camera) -> Frames:
-    """Return the frames of a TUM folder of one camera, without depth.
-
-    DatasetError: there are no poses, or their time span does not overlap that of the images.
-    """
-    files = _tum_files(sequence, camera, sequence.trajectory, {})
-    _check_trajectory(sequence.folder, files, sequence.trajectory)
-    return folder_frames(sequence.folder, files)
-
-
 def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
     """Return the frames of a folder with depth: 7-Scenes or TUM RGB-D.
 
@@ -201,6 +205,78 @@ def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
     if is_tum and not (folder / 'depth.txt').exists():
         raise DatasetError(f'{folder}: has no depth.txt; map from it as `tum`, without depth')
     return read_folder(folder, replace(options, layout='rgbd' if is_tum else '7scenes'))
+
+
+def _place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
+                 map_from_stored: NDArray[np.float64] = _UP['z']) -> tuple[ImageFile, ...]:
+    """Replace the stored poses of images by map_from_camera.
+
+    Parameters
+    ----------
+    axes : str
+        One of AXES.
+    scale : float
+        Metres per stored unit.
+    map_from_stored : ndarray (3, 3)
+
+    Raises
+    ------
+    DatasetError
+        A pose is too far from the origin; the message names its image.
+    """
+    placed = tuple(file if file.pose is None else file._replace(pose=transforms.move_poses(
+        np.array(AXES[axes](file.pose))[None], scale, map_from_stored)[0]) for file in files)
+    for file in placed:
+        if file.pose is not None and (far := np.abs(file.pose[:3, 3]).max()) > _MOST_M:
+            raise DatasetError(f'pose of {file.color} is {far:.3g} m from the origin')
+    return placed
+
+
+def _find_scale(files: Sequence[ImageFile], first: str, second: str, metres: float, where: object
+               ) -> float:
+    """Compute the metres per unit of the poses from the distance between two cameras [m].
+
+    `first` and `second` are the names of the two images. DatasetError: an image is unknown, or
+    both were taken at the same place.
+    """
+    places = []
+    for name in (first, second):
+        found = [file.pose[:3, 3] for file in files
+                 if file.pose is not None and str(file.color).endswith(f'/{name}')]
+        if len(found) != 1:
+            posed = [file for file in files if file.pose is not None]
+            shown = ', '.join(file.color.name for file in posed[:3])
+            raise DatasetError(f'{where}: {len(found) or "no"} images with a pose are named {name}'
+                               f'; the first images are {shown}')
+        places.append(found[0])
+    distance = float(np.linalg.norm(places[1] - places[0]))
+    if distance < 1e-6:
+        raise DatasetError(f'{where}: {first} and {second} were taken at the same place; name two '
+                           'images at a known distance')
+    return metres / distance
+
+
+def check_axes(files: Sequence[ImageFile], axes: str, where: object) -> str:
+    """Return a note if images and stored poses do not fit; see check_agreement.
+
+    DatasetError: they fit well under another convention; the message names it.
+    """
+    readings = {name: Reading(f'give `axes` {name}', AXES[name])
+                for name in sorted(AXES, key=lambda name: name != axes)}
+    readings['quaternions w x y z'] = Reading(
+        'name the columns in the first line, such as `# timestamp tx ty tz qw qx qy qz`',
+        lambda pose: AXES[axes](w_first(pose)))
+    stored = [file for file in files if file.number is None][::max(1, len(files) // _ORIENTED)]
+    has_orientation = any(not np.array_equal(read_color(file)[0], read_color(file, True)[0])
+                          for file in stored)
+    if has_orientation:
+        readings['turned by EXIF'] = Reading(
+            'rotate the pixels, for example with mogrify -auto-orient', AXES[axes], upright=True)
+    note = check_agreement([View(file.pose, partial(read_color, file),
+                                 partial(read_color, file, True)) for file in files],
+                           readings, where)
+    return note or ('the EXIF orientation of the images is ignored: poses and intrinsics must '
+                    'refer to the stored pixels' if has_orientation else '')
 
 
 def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Capture:
@@ -218,23 +294,10 @@ def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Captu
         sequence.trajectory if options.trajectory is None else options.trajectory,
         max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera,
         tolerance_ns=options.tolerance_ns)
-    return Capture(_tum_files(sequence, camera, trajectory, depths), depth=DepthFormat(TUM_UNIT),
-                   trajectory=trajectory)
-
-
-def _tum_files(sequence: TumSequence, camera: Camera, trajectory: TimedPoses,
-               depths: Mapping[int, Path]) -> tuple[ImageFile, ...]:
-    """Return the images of a folder, each with its pose and depth image; None where missing."""
-    return tuple(ImageFile(stamp, path, camera, trajectory.pose_at(stamp), depths.get(stamp))
-                 for stamp, path in zip(sequence.stamps_ns, sequence.image_paths, strict=True))
-
-
-def _check_trajectory(folder: Path, files: Sequence[ImageFile], trajectory: TimedPoses) -> None:
-    """Refuse a trajectory that has no poses or does not overlap the images in time."""
-    if not len(trajectory):
-        raise DatasetError(f'{folder}: there are no poses: groundtruth.txt is missing; give '
-                           'a `trajectory`')
-    check_clock(trajectory, files[0].stamp_ns, files[-1].stamp_ns, str(folder))
+    return Capture(tuple(
+        ImageFile(stamp, path, camera, trajectory.pose_at(stamp), depths.get(stamp))
+        for stamp, path in zip(sequence.stamps_ns, sequence.image_paths, strict=True)),
+        depth=DepthFormat(TUM_UNIT), trajectory=trajectory)
 
 
 def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
@@ -266,15 +329,11 @@ def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
     """Read a pose (4, 4); None where tracking was lost: the file has NaN or infinite numbers."""
-    rows = []
-    for where, line in read_lines(path):
-        cells = line.partition('#')[0].split()
-        if len(cells) != 4:
-            raise DatasetError(f'{where}: is not a 4x4 matrix: {line[:60]!r}')
-        rows.append(parse_all(cells, float, where))
+    rows = [parse_all(line.partition('#')[0].split(), float, where)
+            for where, line in read_lines(path)]
+    if [len(row) for row in rows] != [4] * 4:
+        raise DatasetError(f'{path}: is not a 4x4 matrix')
     pose = np.array(rows)
-    if pose.shape != (4, 4):
-        raise DatasetError(f'{path}: is not a 4x4 matrix, its shape is {pose.shape}')
     if not np.isfinite(pose).all():
         return None
     if not transforms.is_rigid(pose, tolerance=1e-3):

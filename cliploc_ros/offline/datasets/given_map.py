@@ -21,7 +21,7 @@ from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.files.storage import read_file
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.parsing import naming, unit_quaternion
-from cliploc_ros.offline.mapping.refit import refit_map
+from cliploc_ros.offline.mapping.building import refit_map
 
 # A smaller semi-axis is a collapsed fit; a larger one does not belong to an object. Not measured.
 _SEMI_AXIS_RANGE_M = (1e-3, 100.0)
@@ -58,18 +58,10 @@ class GivenMap(NamedTuple):
     notes: list[str]
 
 
-class ImportedMap(NamedTuple):
-    """A converted map, the objects left out with reasons, and notes for the user."""
-
-    landmark_map: LandmarkMap
-    left_out: tuple[Skipped, ...]
-    notes: tuple[str, ...]
-
-
 def place(given: GivenMap, source: str, frame_id: str, scale: float,
           map_from_given: NDArray[np.float64], errors: tuple[float, float] | None = None
-          ) -> ImportedMap:
-    """Convert a map to our coordinate frame and to metres.
+          ) -> tuple[LandmarkMap, list[Skipped]]:
+    """Convert a map to our coordinate frame and to metres; also return what is left out.
 
     Invalid landmarks are left out. DatasetError: no landmark is valid; the message gives the
     reason of the first.
@@ -92,64 +84,56 @@ def place(given: GivenMap, source: str, frame_id: str, scale: float,
     for landmark in given.landmarks:
         reason = ('its id is repeated' if landmark.landmark_id in kept
                   else _reason_against(landmark, scale))
-        if reason is None:
-            kept[landmark.landmark_id] = landmark
-        else:
+        if reason is not None:
             left_out.append(Skipped(landmark.landmark_id, reason))
+            continue
+        details = replace(landmark.details, source=source)
+        if details.position_sigma is not None:
+            details = replace(details, position_sigma=scale * details.position_sigma)
+        elif errors is not None:
+            details = replace(details, position_sigma=errors[0], shared_sigma=errors[0],
+                              shared_sigma_deg=errors[1])
+        kept[landmark.landmark_id] = landmark._replace(details=details)
     if not kept:
         why = f'; the first one: {left_out[0].reason}' if left_out else ''
         raise DatasetError(f'none of its {len(left_out)} landmarks can be used{why}')
-    ids, labels, class_ids, centers, semi_axes, quats, details = zip(*kept.values(), strict=True)
+    ids, labels, class_ids, centers, semi_axes, quats, details_of = zip(
+        *kept.values(), strict=True)
     turn = map_from_given[:3, :3]
     rotations = Rotation.from_matrix(turn) * Rotation.from_quat(np.array(quats, dtype=np.float64))
-    landmark_map = LandmarkMap(
+    return LandmarkMap(
         frame_id, ids, labels, class_ids,
         np.array(centers) * scale @ turn.T + map_from_given[:3, 3],
-        np.array(semi_axes) * scale, rotations.as_quat(),
-        tuple(_with_errors(replace(detail, source=source), scale, errors) for detail in details))
-    return ImportedMap(landmark_map, tuple(left_out), tuple(given.notes))
+        np.array(semi_axes) * scale, rotations.as_quat(), details_of), left_out
 
 
-def _with_errors(details: LandmarkDetails, scale: float, errors: tuple[float, float] | None
-                 ) -> LandmarkDetails:
-    """Set the standard deviations of details: those of the file in metres, or the given ones."""
-    if details.position_sigma is not None:
-        return replace(details, position_sigma=scale * details.position_sigma)
-    if errors is None:
-        return details
-    return replace(details, position_sigma=errors[0], shared_sigma=errors[0],
-                   shared_sigma_deg=errors[1])
-
-
-def refit(imported: ImportedMap, observations: Path, keep_unsupported: bool) -> ImportedMap:
-    """Fit an imported map to the boxes of an observation file.
+def refit(before: LandmarkMap, observations: Path, keep_unsupported: bool
+          ) -> tuple[LandmarkMap, list[Skipped], list[str]]:
+    """Fit a map to the boxes of an observation file; also return what is left out, and notes.
 
     `keep_unsupported` keeps landmarks that cannot be fitted, unchanged. CliplocError: the file is
     invalid, or no landmark can be fitted.
     """
     detections = load_observations(observations)
-    before = imported.landmark_map
     try:
         fit = refit_map(detections, before)
     except MappingError as error:
         raise MappingError(f'{observations}: {error}') from error
-    left_out, kept = list(imported.left_out), []
-    for row, reason in enumerate(fit.reasons):
-        if reason is None or (keep_unsupported and fit.part_of[row] == row):
-            kept.append(row)
-        else:
-            left_out.append(Skipped(before.landmark_ids[row], reason))
+    left_out = [Skipped(before.landmark_ids[row], reason) for row, reason in enumerate(fit.reasons)
+                if reason is not None and not (keep_unsupported and fit.part_of[row] == row)]
     fitted = [row for row, reason in enumerate(fit.reasons) if reason is None]
     moved_m = np.linalg.norm(fit.landmark_map.centers - before.centers, axis=1)
-    far = [row for row in fitted if moved_m[row] > 2.0 * before.semi_axes[row].max()]
-    return ImportedMap(fit.landmark_map.select(kept), tuple(left_out), (
+    gone = {skipped.landmark_id for skipped in left_out}
+    return fit.landmark_map.select(
+        [row for row, name in enumerate(before.landmark_ids) if name not in gone]), left_out, [
         f'{len(fitted)} of {len(before)} landmarks fitted to {observations.name}: explained '
         f'boxes {fit.explained_before:.1%} -> {fit.explained:.1%}, median IoU '
         f'{fit.iou_before:.3f} -> {fit.iou:.3f} (on the frames used for fitting)',
         f'they moved by {np.median(moved_m[fitted]) * 100:.1f} cm (median)',
-        *(f'note: {note}' for note in (*imported.notes, *fit.notes)),
+        *(f'note: {note}' for note in fit.notes),
         *(f'note: {before.landmark_ids[row]} moved by {moved_m[row]:.2f} m, more than its size: '
-          'check its label' for row in far)))
+          'check its label' for row in fitted
+          if moved_m[row] > 2.0 * before.semi_axes[row].max())]
 
 
 def _reason_against(landmark: GivenLandmark, scale: float) -> str | None:
@@ -278,20 +262,16 @@ def _landmark_of_row(row: Mapping[str, str], number: int, where: str
     for name, value in zip(_SEMI_AXES, semi_axes, strict=True):
         if value <= 0.0:
             raise DatasetError(f'{where}: column {name}: {value:g} must be above 0')
-    return GivenLandmark(landmark_id, label, class_id,
-                         [_number(row, name, where) for name in _CENTER], semi_axes, quat_xyzw,
-                         _details(row, where))
-
-
-def _details(row: Mapping[str, str], where: str) -> LandmarkDetails:
-    values: dict[str, Any] = {name: _number(row, name, where) for name in _DETAILS
-                              if row.get(name)}
-    for name, value in values.items():
+    details: dict[str, Any] = {name: _number(row, name, where) for name in _DETAILS
+                               if row.get(name)}
+    for name, value in details.items():
         if value < 0.0:
             raise DatasetError(f'{where}: column {name}: {value:g} must not be negative')
-    if 'support' in values:
-        values['support'] = int(values['support'])
-    return LandmarkDetails(**values)
+    if 'support' in details:
+        details['support'] = int(details['support'])
+    return GivenLandmark(landmark_id, label, class_id,
+                         [_number(row, name, where) for name in _CENTER], semi_axes, quat_xyzw,
+                         LandmarkDetails(**details))
 
 
 def _text(row: Mapping[str, str], name: str, where: str) -> str:

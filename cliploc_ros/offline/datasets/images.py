@@ -16,7 +16,7 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder
-from cliploc_ros.offline.datasets.frames import read_color, read_depth, undistorted
+from cliploc_ros.offline.datasets.frames import RawFrame, folder_frames, undistorted
 from cliploc_ros.offline.datasets.map_recording import MapRecording
 from cliploc_ros.offline.mapping.posed_detections import (
     PosedDetections,
@@ -32,23 +32,15 @@ _NO_OPTIONS = FolderOptions()
 
 
 class Images:
-    """The images of a folder or a recording, by their stamps (F,) [ns].
+    """The images of a folder or a recording, found by stamp, and by camera in a recording."""
 
-    ``read`` returns the image and camera of an index, 0 to F - 1. ``cameras`` are the camera names
-    (F,) of a recording; a folder needs none, because its stamps are unique. ``read_depth`` returns
-    the depth image of an index, or None.
-    """
-
-    def __init__(self, stamps_ns: NDArray[np.int64],
-                 read: Callable[[int], tuple[NDArray[np.uint8], Camera]],
-                 cameras: Sequence[str] = (),
-                 read_depth: Callable[[int], DepthImage | None] = lambda place: None):
-        self._stamps_ns = stamps_ns
-        self._read_raw, self._read_depth = read, read_depth
-        self._cameras = np.array(cameras, dtype=np.str_)
+    def __init__(self, frames: Sequence[RawFrame]):
+        self._frames = frames
+        self._stamps_ns = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
+        self._cameras = np.array([frame.camera for frame in frames], dtype=np.str_)
         self._lock = threading.Lock()  # readers of recordings are not thread-safe
         self._read: Callable[[int, Camera | None], NDArray[np.uint8]] = lru_cache(_IMAGES_KEPT)(
-            lambda place, pinhole: undistorted(*read(place), pinhole))
+            lambda place, pinhole: undistorted(*frames[place].color(), pinhole))
 
     def near(self, stamp_s: float, camera: str = '', pinhole: Camera | None = None
              ) -> NDArray[np.uint8] | None:
@@ -71,12 +63,13 @@ class Images:
         """Return a camera's distorted image at a time [s], its camera and its depth image."""
         place = self._place(stamp_s, camera)
         with self._lock:
-            depth = None if place is None else self._read_depth(place)
-            return None if place is None or depth is None else (*self._read_raw(place), depth)
+            read_depth = None if place is None else self._frames[place].depth
+            return None if place is None or read_depth is None else (
+                *self._frames[place].color(), read_depth())
 
     def _place(self, stamp_s: float, camera: str) -> int | None:
-        places = (np.nonzero(self._cameras == camera)[0] if len(self._cameras)
-                  else np.arange(len(self._stamps_ns)))
+        # the stamps of a folder are unique, whatever its cameras
+        places = np.nonzero((self._cameras == camera) | (self._cameras == ''))[0]
         if not len(places):
             return None
         offsets = np.abs(self._stamps_ns[places] - round(stamp_s * NS_PER_S))
@@ -104,27 +97,21 @@ def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),
         raise DatasetError(f'{path}: no such folder or recording')
     if (layout := find_layout(path, folder.layout)) is not None:
         capture = layout.read(path, folder)
-        files = capture.files
-        return Images(np.array([file.stamp_ns for file in files], dtype=np.int64),
-                      lambda place: read_color(files[place]), (),
-                      lambda place: (None if files[place].depth is None
-                                     else read_depth(files[place], capture.depth)))
-    of_cameras = [bag_images(path, topics.of_camera(name)) for name in cameras]
-    places = [(images, place) for images in of_cameras for place in range(len(images.times_ns))]
-    names = np.repeat(np.array(cameras), [len(images.times_ns) for images in of_cameras])
-    return Images(np.concatenate([images.times_ns[:, 0] for images in of_cameras]),
-                  lambda number: places[number][0].read(places[number][1]), names.tolist())
+        return Images(list(folder_frames(path, capture.files, capture.depth).read_raw(
+            lambda place, stamp_ns, pose: True)))
+    return Images([frame for name in cameras
+                   for frame in bag_images(path, topics.of_camera(name), name)])
 
 
 def views_of_folder(path: Path) -> PosedDetections:
     """Read the poses of a folder as views without boxes; DatasetError: it has no poses."""
     layout = find_layout(path)
     if layout is None:
-        raise DatasetError(f'{path}: has no camera poses; also give --observations')
+        raise DatasetError(f'{path}: has no camera poses; also give `observations`')
     capture = layout.read(path, FolderOptions())
     if not capture.is_metric:
         raise DatasetError(f'{path}: the unit of {layout.name} is unknown; also give '
-                           '--observations, which build_map writes with --scale')
+                           '`observations`, which build_map writes with `scale`')
     posed, cameras = [], []
     for raw in read_folder(path).read_raw(lambda place, stamp_ns, pose: pose is not None):
         posed.append((raw.stamp_ns, raw.map_from_camera))

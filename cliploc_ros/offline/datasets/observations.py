@@ -237,22 +237,8 @@ _OBSERVATIONS = npz.Schema('observation file', {
     {'similarities': 'this is a query file: map from an observation file'})
 
 # Optional fields of PosedDetections
-_OPTIONAL = ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera', 'open_edges')
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """Observations of F frames, with the settings and run times of their recording."""
-
-    detections: PosedDetections
-    stamps_ns: NDArray[np.int64]  #: (F,): exact stamps [ns]
-    #: (F,): run time of the networks [ms]; NaN where unknown
-    detector_ms: NDArray[np.float64]
-    clip_ms: NDArray[np.float64]
-    #: Number of images in the source, and of images without a pose
-    images: int
-    without_pose: int
-    described: str  #: All inputs and settings of the observations; '' where unknown
+_OPTIONAL = ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera', 'open_edges',
+             'stamps_ns', *_STAGES)
 
 
 def camera_from_numbers(size: NDArray[Any], intrinsics: NDArray[Any]) -> Camera:
@@ -270,11 +256,6 @@ def load_observations(path: str | Path) -> PosedDetections:
     Frames are sorted by time. A frame may have no boxes. A file without any boxes is valid here,
     but mapping refuses it. DatasetError: the message names file, array, error and remedy.
     """
-    return load_recorded(path).detections
-
-
-def load_recorded(path: str | Path) -> Recorded:
-    """Read and validate an observation file with its settings; see load_observations."""
     arrays = _OBSERVATIONS.read(Path(path))
     try:
         cameras = tuple(camera_from_numbers(*numbers) for numbers in zip(
@@ -283,6 +264,10 @@ def load_recorded(path: str | Path) -> Recorded:
     except CameraError as error:
         raise _OBSERVATIONS.invalid(Path(path), error) from error
     names, classes = np.unique(arrays['class_ids'], return_inverse=True)
+    frames = len(arrays['timestamps'])
+    detector_ms, clip_ms = (arrays.get(name, np.full(frames, np.nan)).astype(np.float64)
+                            for name in _STAGES)
+    images, without_pose = arrays.get('image_counts', (frames, 0))
     detections = PosedDetections(
         cameras=cameras, map_from_camera=arrays['map_from_camera'].astype(np.float64),
         stamps_s=arrays['timestamps'].astype(np.float64),
@@ -295,17 +280,12 @@ def load_recorded(path: str | Path) -> Recorded:
                           if 'odom_from_camera' in arrays else None),
         camera_rows=arrays['camera_rows'].astype(np.int64) if 'camera_rows' in arrays else None,
         camera_names=tuple(map(str, arrays.get('camera_names', ('',)))),
-        **{name: arrays.get(name) for name in _OPTIONAL if name != 'odom_from_camera'})
+        stamps_ns=_stamps_ns(arrays), detector_ms=detector_ms, clip_ms=clip_ms,
+        images=int(images), without_pose=int(without_pose),
+        described=str(arrays.get('described', '')), **{name: arrays.get(name) for name in (
+            'depths', 'depth_spreads', 'embeddings', 'open_edges')})
     order = np.argsort(detections.stamps_s, kind='stable')
-    if (order != np.arange(len(order))).any():
-        detections = detections.select_frames(order)
-    frames = len(order)
-    detector_ms, clip_ms = (arrays.get(name, np.full(frames, np.nan)).astype(np.float64)[order]
-                            for name in ('detector_ms', 'clip_ms'))
-    images, without_pose = arrays.get('image_counts', (frames, 0))
-    return Recorded(
-        detections, _stamps_ns(arrays)[order], detector_ms,
-        clip_ms, int(images), int(without_pose), str(arrays.get('described', '')))
+    return detections if (order[1:] > order[:-1]).all() else detections.select_frames(order)
 
 
 def save_observations(path: str | Path, detections: PosedDetections) -> None:
@@ -313,18 +293,6 @@ def save_observations(path: str | Path, detections: PosedDetections) -> None:
 
     DatasetError: the detections are malformed, or the file cannot be written.
     """
-    _write(Path(path), detections, {})
-
-
-def save_recorded(path: str | Path, recorded: Recorded) -> None:
-    """Write an observation file with its settings; see save_observations."""
-    _write(Path(path), recorded.detections, {
-        'stamps_ns': recorded.stamps_ns, 'detector_ms': recorded.detector_ms,
-        'clip_ms': recorded.clip_ms, 'described': np.array(recorded.described),
-        'image_counts': np.array([recorded.images, recorded.without_pose])})
-
-
-def _write(path: Path, detections: PosedDetections, more: npz.Arrays) -> None:
     sizes = np.array([[camera.width, camera.height] for camera in detections.cameras])
     intrinsics = np.array([[camera.fx, camera.fy, camera.cx, camera.cy]
                            for camera in detections.cameras])
@@ -336,7 +304,7 @@ def _write(path: Path, detections: PosedDetections, more: npz.Arrays) -> None:
         'class_ids': names[detections.classes] if len(names) else np.empty(0, dtype=np.str_),
         'scores': detections.scores,
         'map_from_camera': detections.map_from_camera,
-        'timestamps': detections.stamps_s, **more,
+        'timestamps': detections.stamps_s,
     }
     for name in _OPTIONAL:
         if (values := getattr(detections, name)) is not None:
@@ -346,5 +314,8 @@ def _write(path: Path, detections: PosedDetections, more: npz.Arrays) -> None:
                    'camera_intrinsics': intrinsics, 'camera_rows': detections.frame_cameras}
     if detections.encoder_key:
         arrays['encoder_key'] = np.array(detections.encoder_key)
+    if detections.described:
+        arrays |= {'described': np.array(detections.described),
+                   'image_counts': np.array([detections.images, detections.without_pose])}
     # compressing embeddings takes minutes and saves nothing
-    _OBSERVATIONS.write(path, arrays, compress='embeddings' not in arrays)
+    _OBSERVATIONS.write(Path(path), arrays, compress='embeddings' not in arrays)

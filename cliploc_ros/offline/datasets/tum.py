@@ -102,8 +102,12 @@ def read_tum_trajectory(path: str | Path) -> TimedPoses:
         numbers = parsing.parse_all(cells[1:], float, where)
         if not np.all(np.isfinite(numbers)):
             raise DatasetError(f'{where}: {" ".join(cells[1:])!r} is not finite')
-        if matrix:
-            numbers = _pose_of_matrix(numbers, where)
+        if matrix:  # by rows
+            pose = np.array([*numbers[:12], 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
+            if numbers[12:] not in ([], [0.0, 0.0, 0.0, 1.0]) or not is_rigid(pose, 1e-2):
+                raise DatasetError(f'{where}: {len(numbers)} numbers are not a pose: expected '
+                                   f'{_COLUMNS}, or name the columns in the first line')
+            numbers = [*pose[:3, 3].tolist(), *quaternion_from_transform(pose).tolist()]
         parsing.unit_quaternion(numbers[3:], where, _MAX_NORM_ERROR)
         stamps_ns.append(parsing.parse_stamp_ns(cells[0], where, stamp_s))
         rows.append([*(metres * number for number in numbers[:3]), *numbers[3:]])
@@ -144,37 +148,18 @@ def _role(name: str) -> str:
     return f'{kind}{word[-1]}' if kind and word[-1] in 'xyzw' else ''
 
 
-def _pose_of_matrix(numbers: list[float], where: str) -> list[float]:
-    """Convert a matrix of 12 or 16 numbers, by rows, to a position and a quaternion."""
-    pose = np.array([*numbers[:12], 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
-    if numbers[12:] not in ([], [0.0, 0.0, 0.0, 1.0]) or not is_rigid(pose, 1e-2):
-        raise DatasetError(f'{where}: {len(numbers)} numbers are not the matrix of a pose; '
-                           f'expected {_COLUMNS}, or name the columns in the first line')
-    return [*pose[:3, 3].tolist(), *quaternion_from_transform(pose).tolist()]
-
-
 def read_tum_accelerometer(path: str | Path) -> tuple[list[int], NDArray[np.float64]]:
     """Read the stamps [ns] and accelerations (n, 3) [m/s^2] of an accelerometer.txt.
 
-    DatasetError: a line does not hold four numbers; the message names file and line.
-    """
-    stamps_ns, rows = read_stamped(Path(path), 'ax ay az')
-    return stamps_ns, np.array(rows).reshape(-1, 3)
-
-
-def read_stamped(path: Path, names: str) -> tuple[list[int], list[list[float]]]:
-    """Read a stamp [ns] and the named numbers from each line of a file.
-
-    DatasetError: a line has other cells, or a number that is not finite; the message names file
-    and line.
+    DatasetError: a line does not hold four finite numbers; the message names file and line.
     """
     stamps_ns, rows = [], []
-    for where, (stamp, *cells) in parsing.read_cells(path, f'timestamp {names}'):
+    for where, (stamp, *cells) in parsing.read_cells(Path(path), 'timestamp ax ay az'):
         stamps_ns.append(parsing.parse_stamp_ns(stamp, where))
         rows.append(parsing.parse_all(cells, float, where))
         if not np.all(np.isfinite(rows[-1])):
             raise DatasetError(f'{where}: {" ".join(cells)!r} is not finite')
-    return stamps_ns, rows
+    return stamps_ns, np.array(rows).reshape(-1, 3)
 
 
 def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:

@@ -6,9 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 
 from cliploc_ros.core.geometry.camera import Camera
@@ -17,6 +15,7 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.storage import read_file
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagWriter
+from cliploc_ros.offline.datasets.frames import ImageFile, read_color
 from cliploc_ros.offline.datasets.parsing import Fields, naming, parse_stamp_ns
 from cliploc_ros.offline.datasets.tum import TumSequence, read_tum_accelerometer
 
@@ -104,8 +103,19 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
             bag.add_topic(boxes_topic, bag_messages.DETECTIONS)
         for stamp_ns, path in progress(
                 list(zip(sequence.stamps_ns, sequence.image_paths, strict=True))):
-            bag.write(image_topic, stamp_ns,
-                      _image_message(stamp_ns, frame, path, camera, is_compressed))
+            # decoded in any case, to refuse a damaged file before a node receives it
+            pixels_rgb, _ = read_color(ImageFile(stamp_ns, path, camera))
+            if is_compressed:
+                with naming(path, OSError, what='cannot be read: '):
+                    data = read_file(path)
+                codec = next((codec for magic, codec in _CODECS.items()
+                              if data.startswith(magic)), None)
+                if codec is None:
+                    raise DatasetError(f'{path}: is neither PNG nor JPEG; write raw images')
+                message = bag_messages.compressed_image_message(stamp_ns, frame, data, codec)
+            else:
+                message = bag_messages.image_message(stamp_ns, frame, pixels_rgb)
+            bag.write(image_topic, stamp_ns, message)
             bag.write(info_topic, stamp_ns,
                       bag_messages.camera_info_message(stamp_ns, frame, camera))
             if stamp_ns in recorded:
@@ -123,31 +133,6 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
                 bag.write(imu_topic, stamp_ns, bag_messages.imu_message(
                     stamp_ns, options.imu_frame, acceleration))
     return ConversionResult(len(sequence), poses, boxes, len(stamps_ns))
-
-
-def _image_message(stamp_ns: int, frame_id: str, path: Path, camera: Camera, is_compressed: bool
-                   ) -> Any:
-    """Make a message of an image file; DatasetError: it is damaged or has another size."""
-    with naming(path, OSError, what='cannot be read: '):
-        data = read_file(path)
-    # Compressed images are decoded too, to refuse a damaged file before a node receives it.
-    try:
-        pixels_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:
-        pixels_bgr = None  # OpenCV raises on an empty buffer, but returns None for a damaged image
-    if pixels_bgr is None:
-        raise DatasetError(f'{path}: cannot be decoded as an image')
-    height, width = pixels_bgr.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        raise DatasetError(f'{path}: has {width}x{height} px, but the intrinsics are for '
-                           f'{camera.width}x{camera.height} px')
-    if not is_compressed:
-        return bag_messages.image_message(stamp_ns, frame_id, np.asarray(
-            cv2.cvtColor(pixels_bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8))
-    for magic, codec in _CODECS.items():
-        if data.startswith(magic):
-            return bag_messages.compressed_image_message(stamp_ns, frame_id, data, codec)
-    raise DatasetError(f'{path}: is neither PNG nor JPEG; write raw images instead')
 
 
 def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | None = None
@@ -176,21 +161,19 @@ def read_recorded_detections(path: str | Path, image_size: tuple[int, int] | Non
         stamp_ns = parse_stamp_ns(timestamp, frame.where)
         if stamp_ns in detections:
             raise DatasetError(f'{frame.where}: timestamp {timestamp} is repeated')
-        found = [_parse_detection(Fields(detection, f'{frame.where}, detection {number}'))
-                 for number, detection in enumerate(frame.entries('detections'))]
+        boxes, class_ids, scores = [], [], []
+        for number, detection in enumerate(frame.entries('detections')):
+            fields = Fields(detection, f'{frame.where}, detection {number}')
+            class_ids.append(fields.text('class_id'))
+            scores.append(fields.number('score'))
+            boxes.append(fields.numbers('bbox_xyxy', (4,)).tolist())
+            if not 0 <= scores[-1] <= 1:
+                raise DatasetError(f'{fields.where}: score is {scores[-1]}, outside 0 to 1')
+            left, top, right, bottom = boxes[-1]
+            if left >= right or top >= bottom:
+                raise DatasetError(f'{fields.where}: bbox_xyxy {boxes[-1]} is not left, top, '
+                                   'right, bottom')
         detections[stamp_ns] = Detections(
-            np.array([box for box, _, _ in found], dtype=np.float64).reshape(-1, 4),
-            tuple(class_id for _, class_id, _ in found),
-            np.array([score for _, _, score in found], dtype=np.float64))
+            np.array(boxes, dtype=np.float64).reshape(-1, 4), tuple(class_ids),
+            np.array(scores, dtype=np.float64))
     return detections
-
-
-def _parse_detection(fields: Fields) -> tuple[list[float], str, float]:
-    """Return box, class and score."""
-    class_id, score = fields.text('class_id'), fields.number('score')
-    if not 0 <= score <= 1:
-        raise DatasetError(f'{fields.where}: score is {score}, outside 0 to 1')
-    left, top, right, bottom = box = fields.numbers('bbox_xyxy', (4,)).tolist()
-    if left >= right or top >= bottom:
-        raise DatasetError(f'{fields.where}: bbox_xyxy {box} is not left, top, right, bottom')
-    return box, class_id, score

@@ -21,7 +21,8 @@ from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.offline.datasets.frames import Frames, undistorted
-from cliploc_ros.offline.datasets.observations import Queries, Recorded
+from cliploc_ros.offline.datasets.observations import Queries
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.recorder import RecordingOptions, observation_file, record_once
 
@@ -53,12 +54,12 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
     return make_queries_of(recorded, landmark_map, labels)
 
 
-def make_queries_of(recorded: Recorded, landmark_map: LandmarkMap,
+def make_queries_of(detections: PosedDetections, landmark_map: LandmarkMap,
                     labels: LabelEmbeddings | None) -> Queries:
     """Return recorded frames as queries, each in its own group; true landmarks are unknown."""
-    detections = recorded.detections
     camera, frames = detections.cameras[0], []
-    for frame, stamp_ns in enumerate(recorded.stamps_ns):
+    assert detections.stamps_ns is not None
+    for frame, stamp_ns in enumerate(detections.stamps_ns):
         rows = slice(*map(int, detections.frame_offsets[frame:frame + 2]))
         boxes = detections.bboxes_xyxy[rows]
         if detections.camera_of(frame) != camera:  # all queries have the same camera

@@ -8,6 +8,7 @@ weighting crops by size or score, dropping the crops farthest from the mean, sub
 mean similarity to all crops or to the crops of its class.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -17,6 +18,10 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import MOST_MEDOIDS, LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.files.storage import resolve_cache_dir
+from cliploc_ros.models.clip_encoder import encode_labels
+from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
+from cliploc_ros.models.label_embeddings import LabelCache
 from cliploc_ros.offline.mapping.landmarks import classes_of, group_boxes
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.views import number_viewpoints
@@ -30,6 +35,11 @@ _CLIP_SCALE = 100.0
 _MOST_CROPS = 512
 # A further medoid has to raise the mean cosine of crops and nearest medoids by this. Chosen.
 _LEAST_MEDOID_GAIN = 0.005
+# Phrases are encoded once, and cached class by class: enough for the 80 COCO classes and as many
+# of the user; a file of ViT-L-14 takes at most 3 MB.
+_MOST_FILES = 200
+
+logger = logging.getLogger(__name__)
 
 
 def embed_landmarks(landmark_ids: Sequence[str], detections: PosedDetections,
@@ -112,3 +122,44 @@ def _unit_rows(rows: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray
     rows = rows.astype(np.float32)
     lengths = np.asarray(np.linalg.norm(rows, axis=1), dtype=np.float32)
     return np.asarray(rows / np.where(lengths > 0.0, lengths, 1.0)[:, None]), lengths
+
+
+def embed_phrases(weights: ClipWeights, options: ClipOptions,
+                  phrases: Mapping[str, Sequence[str]]) -> dict[str, NDArray[np.float32]]:
+    """Return the embeddings (P, d) of the P phrases of each class, as unit rows.
+
+    The text tower is loaded only if a class is missing in the cache, and only once.
+
+    ModelError, OptionsError: see cliploc_ros.models.clip_encoder.load_encoder.
+    """
+    cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'phrases', _MOST_FILES)
+    found, missing = {}, {}
+    for name, texts in phrases.items():
+        rows = cache.load(weights.key, texts, weights.embed_dim)
+        if rows is None:
+            missing[name] = texts
+        else:
+            found[name] = rows
+    if missing:
+        all_texts = [text for texts in missing.values() for text in texts]
+        logger.warning('CLIP encodes %d phrases of %d classes; later runs use the cache',
+                       len(all_texts), len(missing))
+        encoded = encode_labels(weights, all_texts, options)
+        ends = np.cumsum([len(texts) for texts in missing.values()])
+        for name, rows in zip(missing, np.split(encoded, ends[:-1]), strict=True):
+            cache.store(weights.key, missing[name], rows)
+            found[name] = rows
+    return {name: found[name] for name in phrases}
+
+
+def phrases_of_classes(weights: ClipWeights, options: ClipOptions,
+                       parts: Sequence[Mapping[str, Sequence[str]]]) -> dict[str, list[Phrases]]:
+    """Return the phrases of each class with their embeddings; errors as in embed_phrases.
+
+    Put phrases that change together into one part: the cache then keeps the other parts.
+    """
+    found: dict[str, list[Phrases]] = {}
+    for part in parts:
+        for name, rows in embed_phrases(weights, options, part).items():
+            found.setdefault(name, []).append(Phrases(tuple(part[name]), rows))
+    return found

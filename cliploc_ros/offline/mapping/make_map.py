@@ -28,8 +28,12 @@ from cliploc_ros.offline.datasets.map_recording import (
     recording_path,
     save_recording,
 )
-from cliploc_ros.offline.mapping.building import MappingReport, build_map
-from cliploc_ros.offline.mapping.labelling import embed_landmarks, label_landmarks
+from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map
+from cliploc_ros.offline.mapping.labelling import (
+    embed_landmarks,
+    label_landmarks,
+    phrases_of_classes,
+)
 from cliploc_ros.offline.mapping.landmarks import classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -37,7 +41,6 @@ from cliploc_ros.offline.mapping.systematic import MountCorrection
 from cliploc_ros.offline.mapping.update.updating import UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
 from cliploc_ros.offline.vocabulary.vocabulary import Vocabulary, load_vocabulary, shipped_phrases
 
 # A scale by objects of known size: greatest number of trial maps, and the relative change of the
@@ -54,6 +57,7 @@ class MadeMap:
     embeddings: LandmarkEmbeddings | None = None  #: Embeddings of the crops of each landmark
     layer: KeyframeLayer | None = None
     mount: MountCorrection | None = None  #: Correction of the mount, if requested
+    note: str = ''  #: The reason why the requested layer is missing
     removed: LandmarkMap | None = None  #: Landmarks that updates removed from the map
 
 
@@ -147,9 +151,11 @@ def _has_embeddings(detections: PosedDetections) -> bool:
 
 def make_map(detections: PosedDetections, labeller: Labeller,
              options: MappingOptions | None = None, frames: Frames | None = None,
-             layer: LayerOptions | None = None,
-             progress: Callable[[str, float], None] | None = None) -> MadeMap:
+             layer: LayerOptions | None = None, progress: Progress | None = None) -> MadeMap:
     """Make a map from a recording.
+
+    If no landmark is found, keyframes alone make a map. If the images give no keyframes,
+    landmarks alone do, and the map has a note.
 
     Parameters
     ----------
@@ -170,11 +176,23 @@ def make_map(detections: PosedDetections, labeller: Labeller,
     CliplocError
         The input does not allow a map; the message says what to correct.
     """
-    built = build_map(detections, options, progress)
-    landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
-    return MadeMap(landmark_map, built.report, embeddings,
-                   None if frames is None or layer is None
-                   else build_layer(frames, landmark_map, layer), built.mount)
+    options, failure = options or MappingOptions(), None
+    try:
+        built = build_map(detections, options, progress)
+        landmark_map, embeddings = labeller.describe(built.landmark_map, detections, built.shown)
+        made = MadeMap(landmark_map, built.report, embeddings, mount=built.mount)
+    except MappingError as error:
+        failure = error
+        made = MadeMap(LandmarkMap.empty(options.frame_id),
+                       MappingReport.of_nothing(detections, error))
+    try:
+        if frames is not None and layer is not None:
+            return replace(made, layer=build_layer(frames, made.landmark_map, layer))
+    except MappingError as error:
+        made = replace(made, note=f'no keyframes: {error}')
+    if failure is not None:
+        raise failure
+    return made
 
 
 def scale_of_objects(detections: PosedDetections, options: MappingOptions, class_name: str,

@@ -18,6 +18,8 @@ from cliploc_ros.core.observation import Detections
 _SAME_CAMERA = 0.02
 _PER_BOX = ('bboxes_xyxy', 'classes', 'scores', 'depths', 'depth_spreads', 'embeddings',
             'open_edges')
+_PER_FRAME = ('map_from_camera', 'stamps_s', 'odom_from_camera', 'camera_rows', 'stamps_ns',
+              'detector_ms', 'clip_ms')
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,14 @@ class PosedDetections:
     #: (F,): the row of each frame's camera in `cameras`; None: all frames are of the first one
     camera_rows: NDArray[np.int64] | None = None
     camera_names: tuple[str, ...] = ('',)  #: Of the cameras; '' for a single unnamed one
+    stamps_ns: NDArray[np.int64] | None = None  #: (F,): exact times of recorded images [ns]
+    #: (F,): run time of the networks [ms]; NaN where unknown
+    detector_ms: NDArray[np.float64] | None = None
+    clip_ms: NDArray[np.float64] | None = None
+    #: Number of images in the recording, and of images without a pose
+    images: int = 0
+    without_pose: int = 0
+    described: str = ''  #: All inputs and settings of the recording; '' where unknown
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -105,22 +115,19 @@ class PosedDetections:
         rows = [np.arange(start, end) for start, end in zip(starts, ends, strict=True)]
         boxes = np.concatenate([np.empty(0, dtype=np.int64), *rows])
         return replace(
-            self, map_from_camera=self.map_from_camera[frames], stamps_s=self.stamps_s[frames],
-            frame_offsets=np.cumsum(np.concatenate([[0], ends - starts])), **self._of(boxes),
-            odom_from_camera=(None if self.odom_from_camera is None
-                              else self.odom_from_camera[frames]),
-            camera_rows=None if self.camera_rows is None else self.camera_rows[frames])
+            self, frame_offsets=np.cumsum(np.concatenate([[0], ends - starts])),
+            **self._rows(_PER_BOX, boxes), **self._rows(_PER_FRAME, frames))
 
     def select_boxes(self, boxes: NDArray[np.bool_]) -> 'PosedDetections':
         """Return all frames with the boxes that a mask (n,) selects."""
         counts = np.bincount(self.frames[boxes], minlength=len(self))
-        return replace(
-            self, frame_offsets=np.cumsum(np.concatenate([[0], counts])), **self._of(boxes))
+        return replace(self, frame_offsets=np.cumsum(np.concatenate([[0], counts])),
+                       **self._rows(_PER_BOX, boxes))
 
-    def _of(self, boxes: NDArray[Any]) -> dict[str, Any]:
-        """Return the given rows of all arrays that have a row for each box."""
-        arrays = {name: getattr(self, name) for name in _PER_BOX}
-        return {name: None if array is None else array[boxes] for name, array in arrays.items()}
+    def _rows(self, names: Sequence[str], rows: NDArray[Any]) -> dict[str, Any]:
+        """Return the given rows of some arrays."""
+        arrays = {name: getattr(self, name) for name in names}
+        return {name: None if array is None else array[rows] for name, array in arrays.items()}
 
     def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'PosedDetections':
         """Return the same detections with other poses (F, 4, 4)."""

@@ -12,6 +12,7 @@ where g are the gradients J^T W r of single viewpoints. The errors of edges in o
 correlated, which the sum takes into account (the sandwich estimator, White 1980).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -93,26 +94,18 @@ class _Cause(NamedTuple):
 
     def apply(self, views: Views, values: NDArray[np.float64]) -> Views:
         """Return views with the numbers (G,) applied."""
-        if self.motions is not None:
-            return _move_map(views, self.motions @ values)
+        if self.motions is not None:  # translation, rotation
+            motions = self.motions @ values
+            turns = Rotation.from_rotvec(motions[:, 3:]).as_matrix()
+            return views._replace(
+                rotations=np.ascontiguousarray(turns @ views.rotations),
+                translations=np.einsum('fij,fj->fi', turns, views.translations) + motions[:, :3])
         scale = np.tile(1.0 + np.clip(values[:2], -_MAX_STRETCH, _MAX_STRETCH), 2)
         shift = np.tile(values[2:] / [self.camera.fx, self.camera.fy], 2)
         own = self.boxes[:, None]
         # deviations are in pixels: otherwise, a longer focal length would shrink all residuals
         return views._replace(edges=np.where(own, (views.edges - shift) / scale, views.edges),
                               stiffness=views.stiffness * np.where(own, scale, 1.0))
-
-
-class _Fit(NamedTuple):
-    """The best fit of a cause: its corrections, and the corrected views and landmarks."""
-
-    corrections: tuple[Correction, ...]
-    views: Views
-    landmarks: Landmarks
-
-    @property
-    def is_significant(self) -> bool:
-        return any(correction.is_significant for correction in self.corrections)
 
 
 def find_corrections(detections: PosedDetections, views: Views, landmarks: Landmarks,
@@ -129,16 +122,20 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
         name = f' of {detections.camera_names[number]}' if len(detections.cameras) > 1 else ''
         causes = _causes(camera, views, number)
         fits = [_fit(cause, views, landmarks, shown) for cause in causes]
-        best = max(fits, key=lambda fit: fit.is_significant * fit.corrections[0].explained)
-        for cause, fit in zip(causes, fits, strict=True):
+        best, state = max(fits, key=lambda fit: _is_significant(fit[0]) * fit[0][0].explained)
+        for cause, (corrections, _) in zip(causes, fits, strict=True):
             follows = False
-            if fit is not best and fit.is_significant:
-                again = _fit(cause, best.views, best.landmarks, shown)
-                more = again.corrections[0].explained * (1.0 - best.corrections[0].explained)
-                follows = not (again.is_significant and more > _MIN_EXPLAINED)
+            if corrections is not best and _is_significant(corrections):
+                again, _ = _fit(cause, state.views, state.landmarks, shown)
+                more = again[0].explained * (1.0 - best[0].explained)
+                follows = not (_is_significant(again) and more > _MIN_EXPLAINED)
             found += [replace(correction, name=correction.name + name, follows=follows)
-                      for correction in fit.corrections]
+                      for correction in corrections]
     return found
+
+
+def _is_significant(corrections: Sequence[Correction]) -> bool:
+    return any(correction.is_significant for correction in corrections)
 
 
 def _causes(camera: Camera, views: Views, number: int) -> tuple[_Cause, ...]:
@@ -176,14 +173,6 @@ def _twists(views: Views, is_own: NDArray[np.bool_]) -> NDArray[np.float64]:
     twists = np.concatenate([shifts, Rotation.from_matrix(turns).as_rotvec()], axis=1)
     smooth = (seconds > 0.0) & (seconds < 0.5)
     return np.where(smooth, twists / np.where(smooth, seconds, 1.0), 0.0)
-
-
-def _move_map(views: Views, motions: NDArray[np.float64]) -> Views:
-    """Return the views with the map moved in the cameras by (F, 6): translation, rotation."""
-    turns = Rotation.from_rotvec(motions[:, 3:]).as_matrix()
-    return views._replace(
-        rotations=np.ascontiguousarray(turns @ views.rotations),
-        translations=np.einsum('fij,fj->fi', turns, views.translations) + motions[:, :3])
 
 
 class _Descent(NamedTuple):
@@ -224,8 +213,9 @@ def _descend(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[n
     return _Descent(values, deviations, views, landmarks, linear)
 
 
-def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64]) -> _Fit:
-    """Return the best-fitting values of a cause."""
+def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64]
+         ) -> tuple[list[Correction], _Descent]:
+    """Return the best-fitting values of a cause as corrections, and the corrected state."""
     zeros = np.zeros(len(cause.names))
     found = _descend(cause, given, landmarks, shown, zeros, zeros, _STEPS, 0.2)
     own = cause.boxes[found.linear.rows]
@@ -240,7 +230,7 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.in
             cause.cause, name, unit, float(value) * factor, float(deviation) * abs(factor),
             effect_px, bool(abs(value) > _SIGNIFICANT * deviation and effect_px > _NOTABLE_PX
                             and explained > _MIN_EXPLAINED), explained))
-    return _Fit(tuple(corrections), found.views, found.landmarks)
+    return corrections, found
 
 
 def _cost_of(linear: Linear, rows: NDArray[np.bool_] | slice = slice(None)) -> float:

@@ -6,15 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.errors import DatasetError
+
 # Cameras look along the ground; one that only turns about its own x axis shows no vertical.
 _LEAST_SPREAD = np.sin(np.radians(8.0)) ** 2
 _MOST_SHARE = 0.25
 _LEAST_UPRIGHT = 0.5
 # Accuracy of a vertical that is estimated from the tilt of hand-held cameras.
 _MOST_TILT_DEG = 5.0
-#: Why a recording cannot be levelled.
-NO_VERTICAL = ('the vertical is unknown: the cameras turn too little, or were held on their side; '
-               'leave out `level`')
 
 
 def find_vertical(poses: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -67,3 +66,18 @@ def tilt_note(poses: NDArray[np.float64]) -> str:
     return '' if found is None or found[1] < _MOST_TILT_DEG else (
         f'z is {found[1]:.0f} degrees off the vertical of the cameras: heights and views from '
         'above are meaningless; build_map --level corrects it')
+
+
+def find_levelling(poses: NDArray[np.float64], is_wanted: bool
+                   ) -> tuple[NDArray[np.float64], str]:
+    """Return the rotation (3, 3) that turns z up, the identity unless it is wanted, and a note.
+
+    DatasetError: it is wanted, but the vertical of the poses (n, 4, 4) is unknown.
+    """
+    if not is_wanted:
+        return np.eye(3), tilt_note(poses)
+    found = find_tilt(poses)
+    if found is None:
+        raise DatasetError('the vertical is unknown: the cameras turn too little, or were held on '
+                           'their side; leave out `level`')
+    return found[0], f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z'

@@ -9,7 +9,6 @@ continues. Every box is the seed of some hypotheses, so that rarely detected obj
 too.
 """
 
-from dataclasses import replace
 from math import sqrt
 
 import numpy as np
@@ -26,7 +25,6 @@ from cliploc_ros.offline.mapping.landmarks import (
     group_boxes,
     project_box,
 )
-from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.sizes import log_sizes
 from cliploc_ros.offline.mapping.views import Views
@@ -45,10 +43,10 @@ _UNIT_FACTOR = 1.6
 # Smaller errors of scale are within the error of this estimate.
 _LEAST_CORRECTION = 0.02
 
-# Greatest deviation of a landmark with depth [m]; it lies along the rays, where boxes hardly
+#: Greatest deviation of a landmark with depth [m]; it lies along the rays, where boxes hardly
 # constrain it. Chosen on the kitchen's frames, where half this limit leaves out a sixth of the
 # explained boxes.
-_MAX_POSITION_SIGMA_M = 0.15
+MAX_SIGMA_WITH_DEPTH_M = 0.15
 # Range of the angle between the rays of a pair: below it, the depth is uncertain; above it, the
 # boxes show different sides of the object.
 _PARALLAX_DEG = (5.0, 75.0)
@@ -63,12 +61,6 @@ _MIN_DEPTH_M = 0.1
 _PAIRS_PER_BOX, _PAIR_STEPS = 3, 6
 #: A frame supports a landmark if one of its boxes overlaps it by more than this IoU.
 SUPPORT_IOU = 0.45
-
-
-def options_with_depth(options: MappingOptions) -> MappingOptions:
-    """Return options for boxes with depth: they limit the deviation, not the parallax."""
-    return replace(options, min_baseline_deg=0.0, max_position_sigma_m=max(
-        options.max_position_sigma_m, _MAX_POSITION_SIGMA_M))
 
 
 def add_depths(views: Views, detections: PosedDetections,

@@ -112,28 +112,47 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         No image has enough points.
     """
     seen = [_look(frame, options) for part in frames.each for frame in _chosen(part, options)]
-    images = [keyframe.posed for keyframe in seen]
-    has_depth = [bool(np.isfinite(keyframe.depths).any()) for keyframe in seen]
-    # points (n, 3) of each keyframe, in its camera's coordinate frame; NaN where unknown
-    points = [np.column_stack([image.bearings, np.ones(len(keyframe.depths))])
-              * keyframe.depths[:, None] if known else triangulate(images, row, options.kind)
-              for row, (keyframe, image, known) in enumerate(
-                  zip(seen, images, has_depth, strict=True))]
-    # the strongest features that have a point
-    kept = [np.nonzero(np.isfinite(found).all(axis=1))[0][:options.most_points]
-            for found in points]
-    rows = [row for row, found in enumerate(kept) if len(found) >= _LEAST_POINTS]
-    if not rows:
+    images, has_depth = [keyframe.posed for keyframe in seen], False
+    chosen = []  # keyframes, the points of their features, and the rows of these features
+    for number, keyframe in enumerate(seen):
+        # points (n, 3) in the camera's coordinate frame; NaN where unknown
+        if np.isfinite(keyframe.depths).any():
+            has_depth = True
+            points = np.column_stack([keyframe.posed.bearings, np.ones(len(keyframe.depths))]
+                                     ) * keyframe.depths[:, None]
+        else:
+            points = triangulate(images, number, options.kind)
+        # the strongest features that have a point
+        rows = np.nonzero(np.isfinite(points).all(axis=1))[0][:options.most_points]
+        if len(rows) >= _LEAST_POINTS:
+            chosen.append((keyframe, points[rows], rows))
+    if not chosen:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
                            f'{_LEAST_POINTS} features with a point in the map; record depth, or '
                            'overlapping images 5 cm or more apart')
-    layer = _assemble(landmark_map, [seen[row].camera for row in rows],
-                      [images[row] for row in rows],
-                      [points[row] for row in rows], [kept[row] for row in rows],
-                      FROM_DEPTH if any(has_depth) else TRIANGULATED, options.kind)
+    cameras, kind = [keyframe.camera for keyframe, _, _ in chosen], options.kind
+    descriptors = np.concatenate([keyframe.posed.descriptors[rows]
+                                  for keyframe, _, rows in chosen])
+    pixels = np.concatenate([
+        keyframe.posed.bearings[rows] * (keyframe.camera.fx, keyframe.camera.fy)
+        + (keyframe.camera.cx, keyframe.camera.cy) for keyframe, _, rows in chosen])
+    different = tuple(dict.fromkeys(cameras))
+    vocabulary = learn_words(descriptors, kind)
+    layer = KeyframeLayer(
+        landmark_map.frame_id, landmark_map.landmark_ids,
+        landmark_map.centers.astype(np.float32), different,
+        np.array([keyframe.posed.map_from_camera for keyframe, _, _ in chosen]),
+        np.cumsum([0, *(len(rows) for _, _, rows in chosen)]),
+        np.clip(np.round(pixels * PIXEL_SCALE), 0, 65535).astype(np.uint16),
+        np.concatenate([points for _, points, _ in chosen]).astype(np.float32),
+        descriptors, nearest_words(kind.units(descriptors), kind.units(vocabulary)
+                                   ).astype(np.uint16), vocabulary,
+        FROM_DEPTH if has_depth else TRIANGULATED,
+        camera_rows=None if len(different) == 1 else np.array(
+            [different.index(own) for own in cameras]), kind=kind)
     if not options.images:
         return layer
-    jpegs = [seen[row].jpeg for row in rows]
+    jpegs = [keyframe.jpeg for keyframe, _, _ in chosen]
     return replace(layer, images=np.frombuffer(b''.join(jpegs), dtype=np.uint8),
                    image_offsets=np.cumsum([0, *map(len, jpegs)]))
 
@@ -194,31 +213,6 @@ def _small_jpeg(frame: PosedImage) -> bytes:
     _, content = cv2.imencode('.jpg', np.ascontiguousarray(image[..., ::-1]),
                               [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return bytes(content)
-
-
-def _assemble(landmark_map: LandmarkMap, cameras: Sequence[Camera],
-              images: Sequence[PosedFeatures], points: Sequence[NDArray[np.float64]],
-              kept: Sequence[NDArray[np.int64]], deviation_per_metre: float, kind: FeatureKind
-              ) -> KeyframeLayer:
-    descriptors = np.concatenate([image.descriptors[rows]
-                                  for image, rows in zip(images, kept, strict=True)])
-    pixels = np.concatenate([
-        image.bearings[rows] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        for image, rows, camera in zip(images, kept, cameras, strict=True)])
-    different = tuple(dict.fromkeys(cameras))
-    vocabulary = learn_words(descriptors, kind)
-    return KeyframeLayer(
-        landmark_map.frame_id, landmark_map.landmark_ids,
-        landmark_map.centers.astype(np.float32), different,
-        np.array([image.map_from_camera for image in images]),
-        np.cumsum([0, *map(len, kept)]),
-        np.clip(np.round(pixels * PIXEL_SCALE), 0, 65535).astype(np.uint16),
-        np.concatenate([point[rows] for point, rows in zip(points, kept, strict=True)]
-                       ).astype(np.float32),
-        descriptors, nearest_words(kind.units(descriptors), kind.units(vocabulary)
-                                   ).astype(np.uint16), vocabulary, deviation_per_metre,
-        camera_rows=None if len(different) == 1 else np.array(
-            [different.index(own) for own in cameras]), kind=kind)
 
 
 def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = SIFT

@@ -6,7 +6,6 @@ import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,6 +39,7 @@ class SeenFrame:
     map_from_camera: NDArray[np.float64]  #: (4, 4)
     #: (6,): width, height, fx, fy, cx, cy of the undistorted image [px]
     camera_numbers: NDArray[np.float64]
+    bboxes_in_image: NDArray[np.float64]  #: (n, 4): in the image as it is, distorted [px]
     bboxes_xyxy: NDArray[np.float64]  #: (n, 4): undistorted [px]
     open_edges: NDArray[np.bool_]  #: (n, 4): see PosedDetections
     is_distorted: bool  #: Whether open edges cannot be computed from the undistorted boxes
@@ -91,16 +91,7 @@ class LoadNetworks:
             set_threads(self.threads)
         encoder = (None if self.clip is None
                    else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
-        return partial(_look_if_readable,
-                       RunNetworks(load_detector(self.detector).detect, encoder))
-
-
-def _look_if_readable(look: 'RunNetworks', raw: RawFrame) -> SeenFrame | str:
-    """Run the networks on a frame; return the reason instead if its images are unusable."""
-    try:
-        return look(raw)
-    except DatasetError as error:
-        return str(error)
+        return RunNetworks(load_detector(self.detector).detect, encoder)
 
 
 @dataclass(frozen=True)
@@ -111,12 +102,15 @@ class RunNetworks:
     detect: Callable[[NDArray[np.uint8]], Detections]
     encoder: ImageTextEncoder | None = None
 
-    def __call__(self, raw: RawFrame) -> SeenFrame:
+    def __call__(self, raw: RawFrame) -> SeenFrame | str:
         """Run the networks on a frame that has a pose.
 
-        DatasetError: the image or depth image cannot be used.
+        If the image or depth image cannot be used, return the reason.
         """
-        frame = raw.decode()
+        try:
+            frame = raw.decode()
+        except DatasetError as error:
+            return str(error)
         camera = frame.camera
         assert frame.map_from_camera is not None
         start = time.perf_counter()
@@ -137,8 +131,8 @@ class RunNetworks:
             depths, spreads = depths_of_boxes(frame.depth, camera, sound.bboxes_xyxy)
         return SeenFrame(
             raw.place, raw.camera, raw.stamp_ns, frame.map_from_camera,
-            np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), bboxes[rows],
-            open_edges[rows], not camera.is_pinhole,
+            np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), sound.bboxes_xyxy,
+            bboxes[rows], open_edges[rows], not camera.is_pinhole,
             np.array(sound.class_ids, dtype=np.str_), sound.scores,
             embeddings.astype(np.float16), depths, spreads,
             (detected - start) * 1e3, (embedded - detected) * 1e3)

@@ -2,15 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Record observations once, in an observation file next to the recording.
 
-The file is named after a hash of all that determines its content: source, networks, keyframes. An
-interrupted run keeps its partial results next to the file, and the next run continues.
+The file is named after a hash of all that determines its content: source, networks, keyframes.
+The outputs of the networks are also kept next to it, in a file named after a hash of images and
+networks. A run takes them from there, whatever the poses, keyframes and depth are, and also after
+an interrupted run.
 """
 
 import base64
-import glob
 import hashlib
 import json
 import logging
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -25,7 +27,7 @@ from tqdm import tqdm
 from cliploc_ros.core.depth_image import PLAUSIBLE_DEPTH_M, depths_of_boxes
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
+from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import parse_json
@@ -33,14 +35,13 @@ from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.bags import MOST_LEFT_OUT
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
-from cliploc_ros.offline.datasets.observations import Recorded, load_recorded, save_recorded
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.datasets.poses import Poses
 from cliploc_ros.offline.mapping.posed_detections import (
     PosedDetections,
     group_cameras,
     names_of_group,
 )
-from cliploc_ros.offline.mapping.views import at_border
 from cliploc_ros.offline.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S
 
@@ -77,7 +78,7 @@ class KeyframeFilter:
     def __init__(self, options: KeyframeOptions) -> None:
         self._options = options
         self._last: NDArray[np.float64] | None = None
-        self.asked = self.without_pose = self.keyframes = 0
+        self.asked = self.without_pose = 0
 
     def __call__(self, place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
         """Return whether the frame with this pose is a keyframe."""
@@ -90,7 +91,6 @@ class KeyframeFilter:
             if distance < self._options.distance_m and angle < self._options.angle_deg:
                 return False
         self._last = pose
-        self.keyframes += 1
         return True
 
 
@@ -123,8 +123,12 @@ class RecordingOptions:
 def observation_file(frames: Frames, options: RecordingOptions) -> Path:
     """Return the path of the observation file next to a source; see `describe`."""
     source = frames.source.resolve()
-    digest = hashlib.sha256(describe(frames, options).encode()).hexdigest()[:12]
-    return source.with_name(f'{source.name}{_BESIDE}{digest}.npz')
+    return source.with_name(
+        f'{source.name}{_BESIDE}{_digest(describe(frames, options))}.npz')
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def source_of(observations: Path) -> Path | None:
@@ -152,7 +156,7 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
 
 
 def record_once(frames: Frames, options: RecordingOptions, file: Path | None = None,
-                odometry: Mapping[str, Poses] | None = None) -> Recorded:
+                odometry: Mapping[str, Poses] | None = None) -> PosedDetections:
     """Return the observations of a source; record them unless an earlier run did.
 
     The networks do not depend on odometry, so that an earlier run without odometry is used too.
@@ -173,39 +177,38 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
     file = file or observation_file(frames, options)
     if file.exists():
         try:
-            recorded = load_recorded(file)
+            recorded = load_observations(file)
             if recorded.described == described:
                 logger.warning('using the observations of an earlier run: %s', file)
                 linked = _with_odometry(recorded, odometry)
-                old = recorded.detections.odom_from_camera
-                new = linked.detections.odom_from_camera
+                old, new = recorded.odom_from_camera, linked.odom_from_camera
                 if new is not None and (old is None or not np.array_equal(old, new, True)):
-                    save_recorded(file, linked)
+                    save_observations(file, linked)
                 return linked
             logger.warning('recording again, because the options changed: %s', file)
         except DatasetError as error:
             logger.warning('recording again: %s', error)
-    with closing(Log(file.with_name(f'.{file.name}.unfinished'), DatasetError,
-                     'make room or name another file with `record_to`, then run again: it '
-                     'continues from here', _parse_entry)) as log:
-        recorded = _with_odometry(_record(frames, options, described, log, file), odometry)
-        save_recorded(file, recorded)
-        log.remove()
+    with closing(_open_outputs(file.with_name(outputs_name(frames, described)))) as outputs:
+        recorded = _with_odometry(_record(frames, options, described, outputs), odometry)
+    save_observations(file, recorded)
     logger.warning('wrote %s', file)
     return recorded
 
 
-def _with_odometry(recorded: Recorded, odometry: Mapping[str, Poses] | None) -> Recorded:
+def _with_odometry(recorded: PosedDetections, odometry: Mapping[str, Poses] | None
+                   ) -> PosedDetections:
     """Return observations with the odometry at their stamps; earlier odometry is replaced."""
     placed = None
     if odometry is not None:
-        poses = [odometry[recorded.detections.name_of(frame)].pose_at(int(stamp_ns))
+        assert recorded.stamps_ns is not None
+        poses = [odometry[recorded.name_of(frame)].pose_at(int(stamp_ns))
                  for frame, stamp_ns in enumerate(recorded.stamps_ns)]
         placed = np.array([_UNKNOWN if pose is None else pose for pose in poses])
-    return replace(recorded, detections=replace(recorded.detections, odom_from_camera=placed))
+    return replace(recorded, odom_from_camera=placed)
 
 
-def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | str]) -> Recorded:
+def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | str]
+                       ) -> PosedDetections:
     """Run given networks on every frame with a pose; write no file.
 
     Frames that cannot be decoded are left out: for these, `look` returns the reason.
@@ -215,135 +218,90 @@ def record_every_frame(frames: Frames, look: Callable[[RawFrame], SeenFrame | st
     return _assemble(seen, frames, filters, '', '')
 
 
-def _earlier(frames: Frames, described: str, file: Path) -> dict[tuple[str, int], SeenFrame]:
-    """Return earlier outputs of the same networks for these images, by camera and stamp.
+def outputs_name(frames: Frames, described: str) -> str:
+    """Return the name of the file with the networks' outputs for the images of a source.
 
-    Boxes do not depend on poses, whose scale may have changed, nor on the choice of keyframes.
+    Boxes do not depend on poses, whose scale may change, nor on the choice of keyframes.
     """
-    def networks(described: str) -> dict[str, Any]:
-        tree = parse_json(described.encode())
-        *source, digest = [*tree['source'], ''][:4]
-        return tree | {'source': [*source, digest.partition(' ')[0]], 'keyframes': None}
-
-    source = frames.source.resolve()
-    found: dict[tuple[str, int], SeenFrame] = {}
-    for path in {file, *source.parent.glob(f'{glob.escape(source.name)}{_BESIDE}*.npz')}:
-        try:
-            recorded = load_recorded(path)
-            is_same = recorded.described != described and (
-                networks(recorded.described) == networks(described))
-        except (DatasetError, ValueError, KeyError, TypeError):
-            continue
-        if is_same:
-            logger.warning('using the boxes of an earlier run with other poses or keyframes: %s',
-                           path)
-            found |= {(frame.camera, frame.stamp_ns): frame
-                      for frame in _seen_frames(recorded, frames)}
-    return found
+    content = parse_json(described.encode()) | {
+        'keyframes': None, 'fields': list(SeenFrame.__dataclass_fields__)}  # of this release
+    if frames.digest:  # of images with cameras, and of poses
+        content |= {'source': [*content['source'][:3], frames.digest.partition(' ')[0]],
+                    'reading': None}
+    return f'.{frames.source.resolve().name}{_BESIDE}{_digest(json.dumps(content))}.outputs'
 
 
-def _seen_frames(recorded: Recorded, frames: Frames) -> Iterator[SeenFrame]:
-    """Yield the outputs of the networks for recorded frames, without depth."""
-    all_boxes = recorded.detections
-    for frame, stamp_ns in enumerate(recorded.stamps_ns.tolist()):
-        rows = slice(*all_boxes.frame_offsets[frame:frame + 2].tolist())
-        camera, boxes = all_boxes.camera_of(frame), all_boxes.bboxes_xyxy[rows]
-        size = [camera.width, camera.height]
-        unknown = np.full(len(boxes), np.nan, dtype=np.float32)
-        yield SeenFrame(
-            frame, '' if frames.varies else all_boxes.name_of(frame), stamp_ns,
-            all_boxes.map_from_camera[frame],
-            np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), boxes,
-            at_border(boxes, np.array(size * 2)) if all_boxes.open_edges is None
-            else all_boxes.open_edges[rows], all_boxes.open_edges is not None,
-            np.array(all_boxes.class_names, dtype=np.str_)[all_boxes.classes[rows]],
-            all_boxes.scores[rows], np.empty((len(boxes), 0), dtype=np.float16)
-            if all_boxes.embeddings is None else all_boxes.embeddings[rows], unknown, unknown,
-            float(recorded.detector_ms[frame]), float(recorded.clip_ms[frame]))
+def _open_outputs(path: Path) -> Log:
+    """Open a file of outputs; while another run adds to it, another file beside it."""
+    try:
+        return Log(path, DatasetError, 'make room or name another file with `record_to`, then run '
+                   'again: it continues from here', lambda line: SeenFrame.from_bytes(
+                       base64.b64decode(parse_json(line))))
+    except DatasetError as error:
+        if not isinstance(error.__cause__, BlockingIOError):
+            raise
+        return _open_outputs(path.with_suffix(f'.{os.getpid()}.outputs'))
 
 
-def _seen_again(raw: RawFrame, earlier: Mapping[tuple[str, int], SeenFrame]) -> SeenFrame | None:
-    """Return the earlier output for an image with its present pose and depth; None if unusable."""
-    found = earlier.get((raw.camera, raw.stamp_ns))
-    if found is None or raw.map_from_camera is None:
-        return None
-    found = replace(found, place=raw.place, map_from_camera=raw.map_from_camera)
-    if raw.depth is None:
-        return found
-    frame = raw.decode()
-    if frame.camera != found.pinhole or frame.depth is None:  # boxes are those of a pinhole
-        return None
-    depths, spreads = depths_of_boxes(frame.depth, frame.camera, found.bboxes_xyxy)
-    return replace(found, depths=depths, depth_spreads=spreads)
+def _again(seen: SeenFrame, raw: RawFrame) -> SeenFrame:
+    """Return an earlier output for an image with its present pose and depth."""
+    unknown = np.full(len(seen.scores), np.nan, dtype=np.float32)
+    depths = unknown, unknown
+    if raw.depth is not None:
+        frame = raw.decode()
+        assert frame.depth is not None
+        depths = depths_of_boxes(frame.depth, frame.camera, seen.bboxes_in_image)
+    assert raw.map_from_camera is not None
+    return replace(seen, map_from_camera=raw.map_from_camera, depths=depths[0],
+                   depth_spreads=depths[1])
 
 
-def _unseen(raws: Iterator[RawFrame], seen: dict[int, SeenFrame],
-            earlier: Mapping[tuple[str, int], SeenFrame]) -> Iterator[RawFrame]:
-    """Yield the frames without an output, and add the outputs of an earlier run to `seen`."""
-    for raw in raws:
-        if raw.place not in seen:
-            again = _seen_again(raw, earlier)
-            if again is None:
+def _record(frames: Frames, options: RecordingOptions, described: str, outputs: Log
+            ) -> PosedDetections:
+    """Run the networks on all keyframes without an earlier output."""
+    earlier = {(entry.camera, entry.place, entry.stamp_ns): entry for entry in outputs.read()[0]}
+    if earlier:
+        logger.warning('using the boxes of %d images of earlier runs: %s', len(earlier),
+                       outputs.path)
+    seen, unusable, is_kept = list[SeenFrame](), list[str](), bool(earlier)
+
+    def unseen(raws: Iterator[RawFrame]) -> Iterator[RawFrame]:
+        for raw in raws:
+            if (found := earlier.get((raw.camera, raw.place, raw.stamp_ns))) is None:
                 yield raw
             else:
-                seen[raw.place] = again
-
-
-def _record(frames: Frames, options: RecordingOptions, described: str, log: Log, file: Path
-            ) -> Recorded:
-    """Run the networks on all keyframes without an output of an unfinished or earlier run."""
-    # the fields may differ between releases
-    run = {'run': described, 'fields': list(SeenFrame.__dataclass_fields__)}
-    entries, _ = log.read()
-    seen: dict[int, SeenFrame] = {}
-    if entries[:1] == [run]:
-        seen = {entry.place: entry for entry in entries[1:] if isinstance(entry, SeenFrame)}
-    else:
-        log.restart([run])
-    unusable: list[str] = []
-    if seen:
-        logger.warning('continuing after %d frames of an unfinished run', len(seen))
+                seen.append(_again(found, raw))
     try:
         with _read_keyframes(frames, options.keyframes) as (raws, filters):
-            tasks = _unseen(raws, seen, _earlier(frames, described, file))
-            for _, result in run_tasks(options.networks, tasks, workers=options.workers,
+            for _, result in run_tasks(options.networks, unseen(raws), workers=options.workers,
                                        scheduler=options.scheduler):
                 if isinstance(result, str):
                     unusable.append(result)
                     if len(unusable) > MOST_LEFT_OUT * frames.count:
                         break
                 else:
-                    log.append({'frame': base64.b64encode(result.to_bytes()).decode()})
-                    seen[result.place] = result
+                    outputs.append(base64.b64encode(result.to_bytes()).decode())
+                    seen.append(result)
+                    is_kept = True
                     # refuse an implausible unit at once, not after hours of work
                     if len(seen) <= _FRAMES_FOR_UNIT:
-                        check_depth_unit(np.concatenate([frame.depths for frame in seen.values()]),
+                        check_depth_unit(np.concatenate([frame.depths for frame in seen]),
                                          str(frames.source))
     except BaseException:
-        if seen:
-            logger.warning('%d frames are kept in %s: run again to continue from there, or delete '
-                           'it', len(seen), log.path)
-        else:
-            log.remove()
+        if is_kept:
+            logger.warning('the boxes of this run are kept in %s: run again to continue from '
+                           'there, or delete it', outputs.path)
         raise
+    finally:
+        if not is_kept:
+            outputs.remove()
     if unusable:
         if len(unusable) > MOST_LEFT_OUT * (len(seen) + len(unusable)):
-            log.remove()
             raise DatasetError(unusable[0])
         logger.warning('left out: %d images that cannot be used, such as %s', len(unusable),
                        unusable[0])
     encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
-    try:
-        return _assemble(list(seen.values()), frames, filters, encoder_key, described)
-    except CliplocError:
-        log.remove()  # the same frames fail again
-        raise
-
-
-def _parse_entry(line: bytes) -> Any:
-    """Parse an entry of the log: the description of the run, or a frame."""
-    entry = parse_json(line)
-    return entry if 'run' in entry else SeenFrame.from_bytes(base64.b64decode(entry['frame']))
+    return _assemble(seen, frames, filters, encoder_key, described)
 
 
 @contextmanager
@@ -361,7 +319,7 @@ def _read_keyframes(frames: Frames, options: KeyframeOptions
 
 
 def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, KeyframeFilter],
-              encoder_key: str, described: str) -> Recorded:
+              encoder_key: str, described: str) -> PosedDetections:
     """Return the observations of frames, in order of time.
 
     DatasetError: a camera has no frames, or its intrinsics change.
@@ -376,13 +334,17 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
     if frames.varies:
         cameras, rows = group_cameras([frame.pinhole for frame in seen])
         camera_names = names_of_group(cameras)
-        seen = [_seen_by(frame, cameras[row]) for frame, row in zip(seen, rows, strict=True)]
+        # boxes as the merged pinhole camera at the same pose would see them
+        seen = [frame if frame.pinhole == cameras[row] else replace(
+            frame, is_distorted=True, bboxes_xyxy=cameras[row].bboxes_in_pixels(
+                frame.pinhole.normalize_bboxes(frame.bboxes_xyxy)))
+            for frame, row in zip(seen, rows, strict=True)]
     names = np.concatenate([frame.class_ids for frame in seen])
     class_names, classes = np.unique(names, return_inverse=True)
     depths = np.concatenate([frame.depths for frame in seen])
     has_depth = bool(np.isfinite(depths).any())
     needs_edges = len(names) > 0 and any(frame.is_distorted for frame in seen)
-    detections = PosedDetections(
+    return PosedDetections(
         cameras=cameras,
         map_from_camera=np.array([frame.map_from_camera for frame in seen]),
         stamps_s=np.array([frame.stamp_ns / NS_PER_S for frame in seen]),
@@ -398,21 +360,13 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
         encoder_key=encoder_key,
         open_edges=np.concatenate([frame.open_edges for frame in seen]) if needs_edges else None,
         camera_rows=None if camera_names == ('',) else rows,
-        camera_names=camera_names)
-    return Recorded(
-        detections, np.array([frame.stamp_ns for frame in seen], dtype=np.int64),
-        np.array([frame.detector_ms for frame in seen]),
-        np.array([frame.clip_ms for frame in seen]),
-        sum(keyframes.asked for keyframes in filters.values()),
-        sum(keyframes.without_pose for keyframes in filters.values()), described)
-
-
-def _seen_by(seen: SeenFrame, other: Camera) -> SeenFrame:
-    """Return a frame with the boxes that another pinhole camera at the same pose would see."""
-    if seen.pinhole == other:
-        return seen
-    rays = seen.pinhole.normalize_bboxes(seen.bboxes_xyxy)
-    return replace(seen, bboxes_xyxy=other.bboxes_in_pixels(rays), is_distorted=True)
+        camera_names=camera_names,
+        stamps_ns=np.array([frame.stamp_ns for frame in seen], dtype=np.int64),
+        detector_ms=np.array([frame.detector_ms for frame in seen]),
+        clip_ms=np.array([frame.clip_ms for frame in seen]),
+        images=sum(keyframes.asked for keyframes in filters.values()),
+        without_pose=sum(keyframes.without_pose for keyframes in filters.values()),
+        described=described)
 
 
 def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> Camera:
@@ -461,4 +415,4 @@ def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:
     if not least < median < greatest:
         raise DatasetError(
             f'{where}: the median depth of the boxes is {median:.4g} m, expected {least} to '
-            f'{greatest:.0f} m: wrong unit? give --depth-unit (0.001 for mm, 0.0002 for TUM)')
+            f'{greatest:.0f} m: wrong unit? give `depth_unit` (0.001 for mm, 0.0002 for TUM)')

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
-from cliploc_ros.offline.mapping.labelling import best_phrases
+from cliploc_ros.offline.mapping.labelling import best_phrases, phrases_of_classes
 from cliploc_ros.offline.mapping.landmarks import classes_of
 from cliploc_ros.offline.studio.landmark import Landmarks, map_of
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.vocabulary.phrase_embeddings import phrases_of_classes
 from cliploc_ros.offline.vocabulary.vocabulary import Vocabulary, shipped_phrases
 
 _PHRASES = 5

@@ -21,6 +21,7 @@ from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.association import associate
+from cliploc_ros.offline.mapping.building import refit_map
 from cliploc_ros.offline.mapping.check.landmark_faults import Witness, hear_witness
 from cliploc_ros.offline.mapping.check.relocalization import (
     RecordedKeyframes,
@@ -34,7 +35,6 @@ from cliploc_ros.offline.mapping.labelling import embed_landmarks
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.refit import refit_map
 from cliploc_ros.offline.mapping.sightings import Sighting, find_sightings, outlines_in_view
 from cliploc_ros.offline.mapping.views import Views, make_views
 from cliploc_ros.offline.simulation import LabelModel

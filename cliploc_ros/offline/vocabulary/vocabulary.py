@@ -167,19 +167,13 @@ def _phrases_of(name: str, entry: Any, where: str) -> tuple[str, ...]:
              if rule != 'grammar'}
     # a detector's class may be named tv_monitor; braces would be read as symbols
     plain = ' '.join(re.sub(r'[_{}]', ' ', name).split()) or 'object'
-    grammar = _grammar(entry.get('grammar', _GENERAL), where)
-    try:
-        return expand_phrases({'kind': [plain]} | grammar | rules)
+    grammars, chosen = _shipped('grammars.yaml'), entry.get('grammar', _GENERAL)
+    if not isinstance(chosen, str) or chosen not in grammars:
+        raise OptionsError(f'{where}: grammar: {chosen!r:.60} is not one of {", ".join(grammars)}')
+    try:  # missing rules are those of the general grammar
+        return expand_phrases({'kind': [plain], **grammars[_GENERAL], **grammars[chosen], **rules})
     except OptionsError as error:
         raise OptionsError(f'{where}: {error}') from error
-
-
-def _grammar(name: Any, where: str) -> dict[str, list[str]]:
-    """Return the rules of a grammar; missing rules are those of the general grammar."""
-    grammars = _shipped('grammars.yaml')
-    if not isinstance(name, str) or name not in grammars:
-        raise OptionsError(f'{where}: grammar: {name!r:.60} is not one of {", ".join(grammars)}')
-    return {**grammars[_GENERAL], **grammars[name]}
 
 
 def _words(words: Any, where: str) -> list[str]:

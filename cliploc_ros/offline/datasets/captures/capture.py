@@ -57,7 +57,7 @@ class Capture:
     """Images in order of time, with their poses as stored."""
 
     files: tuple[ImageFile, ...]
-    axes: str = 'opencv'  #: Convention of the stored poses: one of placing.AXES
+    axes: str = 'opencv'  #: Convention of the stored poses: one of agreement.AXES
     depth: DepthFormat = _AS_USUAL
     #: Axis of the poses' coordinate frame that the layout defines as up: 'y' or 'z'; '' if it
     #: defines none

@@ -181,7 +181,18 @@ def _images(model: Path, kind: str = '') -> Iterator[_Posed]:
     """Yield the images of a model; see _cameras for the kind."""
     binary = model / 'images.bin'
     if kind == 'txt' or not _has(model, 'bin'):
-        yield from _text_images(model / 'images.txt')
+        # each image has two lines, and the second may be empty
+        path = model / 'images.txt'
+        lines = [line for line in parsing.read_text(path).split('\n') if not line.startswith('#')]
+        for number, line in enumerate(lines[::2]):
+            cells, where = line.strip().split(maxsplit=9), f'{path}: image {number}'
+            if not cells and 2 * number + 2 >= len(lines):
+                continue
+            if len(cells) != 10:
+                raise DatasetError(f'{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID '
+                                   f'NAME, got {line[:60]!r}')
+            yield _posed(cells[9], parsing.parse_all(cells[8:9], int, where)[0],
+                         parsing.parse_all(cells[1:8], float, where), where)
         return
     with _Bytes(binary) as data:
         for _ in range(data.count(73)):
@@ -189,21 +200,6 @@ def _images(model: Path, kind: str = '') -> Iterator[_Posed]:
             name = data.name()
             data.skip(24 * data.take('<Q')[0])
             yield _posed(name, camera_id, numbers, f'{binary}: image {name}')
-
-
-def _text_images(path: Path) -> Iterator[_Posed]:
-    """Yield the images of a text file; each has two lines, and the second may be empty."""
-    lines = [line for line in parsing.read_text(path).split('\n') if not line.startswith('#')]
-    for number, line in enumerate(lines[::2]):
-        cells = line.strip().split(maxsplit=9)
-        where = f'{path}: image {number}'
-        if not cells and 2 * number + 2 >= len(lines):
-            continue
-        if len(cells) != 10:
-            raise DatasetError(f'{where}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, '
-                               f'got {line[:60]!r}')
-        yield _posed(cells[9], parsing.parse_all(cells[8:9], int, where)[0],
-                     parsing.parse_all(cells[1:8], float, where), where)
 
 
 def _posed(name: str, camera_id: int, numbers: Sequence[float], where: str) -> _Posed:
