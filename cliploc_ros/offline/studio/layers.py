@@ -18,11 +18,10 @@ from scipy.stats import chi2
 
 from cliploc_ros.core.geometry.camera import frusta
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.offline.evaluation.map_check.page import LOOK_ALIKE
 from cliploc_ros.offline.mapping.check.places import RADIUS_M
 from cliploc_ros.offline.mapping.check.relocalization import Trial
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.page import MISLED
+from cliploc_ros.offline.page import LOOK_ALIKE, MISLED
 from cliploc_ros.offline.studio.places import Coverage
 from cliploc_ros.offline.studio.viewpoint import wxyz_of
 

@@ -4,11 +4,11 @@
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.offline import page as html
 from cliploc_ros.offline.studio.desk import Desk
 from cliploc_ros.offline.studio.landmark import Landmark, shape_fields
 from cliploc_ros.offline.studio.layers import LEGEND
@@ -17,7 +17,7 @@ from cliploc_ros.offline.studio.web import Content
 
 # Greatest number of outlines: more hide the image and delay a drag.
 _MAX_OUTLINES = 200
-_CROP_PX, _QUALITY = 160, 88
+_CROP_PX = 160
 # Greatest number of answers in the list after a run over the recording.
 _MAX_ANSWERS = 100
 
@@ -122,9 +122,4 @@ def picture_of(studio: Studio, path: str) -> Content | None:
         return None
     if image is None:
         return None
-    if kind == 'crop' and (large := max(image.shape) / _CROP_PX) > 1.0:
-        height, width = (max(1, round(side / large)) for side in image.shape[:2])
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    done, content = cv2.imencode('.jpg', image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    assert done
-    return Content(content.tobytes(), '.jpg', True)
+    return Content(html.jpeg_of(image, _CROP_PX if kind == 'crop' else None), '.jpg', True)

@@ -26,8 +26,8 @@ from cliploc_ros.offline.mapping.check.relocalization import (
 from cliploc_ros.offline.mapping.check.report import (
     GridCheck,
     KeyframeCheck,
-    carried_positions,
     check_keyframes,
+    tell_positions,
 )
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.simulation import DetectorModel, guess_detector
@@ -53,7 +53,7 @@ class Coverage(NamedTuple):
     def figures(self) -> dict[str, str]:
         """The results by name."""
         verdicts, views = count_verdicts(self.check.trials), len(self.check.trials)
-        return {'where a robot is localized': str(carried_positions(self.check, self.keyframes)),
+        return {'where a robot is localized': tell_positions(self.check, self.keyframes),
                 'views accepted by objects': f'{verdicts["accepted"]} of {views}',
                 'views misled': f'{verdicts["misled"]} of {views}',
                 'pairs of places that look alike': str(len(self.look_alikes))}

@@ -35,7 +35,12 @@ from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.refit import refit_map
-from cliploc_ros.offline.mapping.sightings import Sighting, find_sightings, outlines_in_view
+from cliploc_ros.offline.mapping.sightings import (
+    Sighting,
+    crop_around,
+    find_sightings,
+    outlines_in_view,
+)
 from cliploc_ros.offline.mapping.views import Views, make_views
 from cliploc_ros.offline.simulation import LabelModel
 from cliploc_ros.offline.studio import edits
@@ -145,12 +150,7 @@ class Recording:
         image = self.image(view)
         if image is None or not np.isfinite(box).all():
             return None
-        around = _MARGIN * (box[2:] - box[:2]).max()
-        height, width = image.shape[:2]
-        left, top = np.clip(np.floor(box[:2] - around), 0, (width - 1, height - 1)).astype(int)
-        right, bottom = np.clip(np.ceil(box[2:] + around), (left + 1, top + 1), (width, height)
-                                ).astype(int)
-        return image[top:bottom, left:right]
+        return crop_around(image, box, _MARGIN)
 
     def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Encoded | None:
         """Return the look by an encoder of the boxes `rows`; None without their embeddings."""
