@@ -47,7 +47,7 @@ _MARKERS = {'accepted': (html.ACCEPTED, 'o'), 'refused': (html.REFUSED, 's'),
             'misled': (html.MISLED, 'X')}
 _MOST_NAMES, _MOST_LOOK_ALIKES, _MOST_TIMES = 30, 6, 8
 # Margin of a picture around a landmark, in sizes of the landmark.
-_AROUND = 1.5
+_AROUND = 3.0
 # Angle that makes a view as different as 1 m does [deg]; greatest difference of a view that is
 # shown for another one [m].
 _DEGREES_PER_M, _MOST_DIFFERENT = 30.0, 3.0
@@ -61,10 +61,11 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
                   ) -> Iterator[tuple[str, str, bytes]]:
     """Yield the name, the caption and the PNG of each picture."""
     yield ('grid', 'Expected relocalization, top view. Outlines are landmarks, a cell is a camera '
-           'position. Its shade shows the share of headings with a correct, accepted pose, among the headings with '
-           'three or more detectable landmarks; it is grey if no heading shows three. Ticks show '
-           'the headings at which a wrong pose was accepted. Positions inside landmarks are '
-           'omitted. Numbers refer to the advice.', _drawn(_draw_grid, landmark_map, report))
+           'position. Its shade shows the share of headings with a correct, accepted pose, among '
+           'the headings with three or more detectable landmarks; it is grey if no heading shows '
+           'three. Ticks show the headings at which a wrong pose was accepted. Positions inside '
+           'landmarks are omitted. Numbers refer to the advice.',
+           _drawn(_draw_grid, landmark_map, report))
     yield ('landmarks', 'Top view of the landmarks. Landmarks with a fault are named; if there '
            'are many, only those with a serious fault. Arrows are recorded frames, each '
            'relocalized in a map that was fitted without the frames of that time; a line leads to '
@@ -220,7 +221,7 @@ class ViewPainter:
             cv2.rectangle(drawn, first, second, _BOX_RGB, thin, cv2.LINE_AA)
         for outline in outlines[np.isfinite(outlines).all(axis=1)]:
             points = np.rint(outline_points(outline)).clip(-9999, 9999).astype(np.int32)
-            cv2.polylines(drawn, [points], True, _OUTLINE_RGB, 3 * thin, cv2.LINE_AA)
+            cv2.polylines(drawn, [points], True, _OUTLINE_RGB, 2 * thin, cv2.LINE_AA)
         # a crop, so that a small landmark is visible
         return html.jpeg_of(crop_around(drawn, ellipse_bboxes(outlines[:1])[0], _AROUND)
                             if rows else drawn, _WIDTH_PX)
