@@ -158,8 +158,9 @@ def _draw_landmarks(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) 
     for run in [run for run in refused_spans(trials) if len(run) > 1][:_MOST_TIMES]:
         middle = run[len(run) // 2]
         axes.annotate(f'{(middle.stamp_s or 0.0) - (trials[0].stamp_s or 0.0):.0f} s',
-                      middle.position[:2], -14.0 * middle.forward[:2], ha='center', va='center',
-                      textcoords='offset points', fontsize=8, path_effects=EDGED, zorder=9)
+                      tuple(middle.position[:2]), tuple(-14.0 * middle.forward[:2]),
+                      textcoords='offset points', ha='center', va='center', fontsize=8,
+                      path_effects=EDGED, zorder=9)
     for number, pair in enumerate(report.look_alikes[:_MOST_LOOK_ALIKES], start=1):
         for x, y, _ in (pair.first, pair.second):
             axes.add_patch(Circle((x, y), RADIUS_M, fill=False, edgecolor=html.LOOK_ALIKE,

@@ -160,7 +160,7 @@ class Page:
         self._selected.show(chosen, lambda class_id: _SELECTED_RGB)
         self._labels.show(shown if is_on('Labels') else {}, list(chosen))
         selected = None if document.selected is None else document.selected[1]
-        self._gizmo.show(None if selected is None or selected.marks.is_locked else selected)
+        self._gizmo.show(None if selected is None or selected.is_locked else selected)
         recording = None if studio.recording is None else studio.recording.detections
         show('Surfaces', self._cloud, draw_cloud, is_on('Surfaces', True))
         show('Walls', studio.walls, draw_walls, is_on('Walls', True))

@@ -30,13 +30,13 @@ def parts_of(desk: Desk) -> dict[str, Any]:
         'file': {
             'name': document.path.name, 'frame': document.frame_id, 'is_saved': document.is_saved,
             'notes': document.notes, 'undo': document.to_undo, 'redo': document.to_redo,
-            'conflict': bool(document.foreign), 'views': studio.views,
+            'conflict': document.has_conflict, 'views': studio.views,
             'step': 1 if studio.recording is None else studio.recording.film_step,
             'has_boxes': review.has_boxes, 'images': studio.recording is not None
             and studio.recording.images is not None,
             'classes': sorted({landmark.class_id for landmark in document.landmarks.values()})},
-        'rows': [[key, one.label, one.class_id, one.marks.is_locked, one.marks.is_hidden,
-                  review.severity(key), one.marks.decision,
+        'rows': [[key, one.label, one.class_id, one.is_locked, one.is_hidden,
+                  review.severity(key), one.decision,
                   '#{:02x}{:02x}{:02x}'.format(*studio.color_of(one.class_id))]
                  for key in review.order if (one := document.landmarks.get(key))],
         'selection': {'ids': document.selection, 'one': _selected_part(studio)},
@@ -61,15 +61,14 @@ def _selected_part(studio: Studio) -> dict[str, Any] | None:
     if studio.document.selected is None:
         return None
     key, one = studio.document.selected
-    check, phrases = studio.review.check_of(key), studio.phrases(key)
-    sightings = studio.sightings(key)
+    check, sightings = studio.review.check_of(key), studio.sightings(key)
     return {
         'id': key, 'label': one.label, 'class_id': one.class_id,
-        'is_locked': one.marks.is_locked, 'decision': one.marks.decision,
+        'is_locked': one.is_locked, 'decision': one.decision,
         'center': one.center.tolist(), 'semi_axes': one.semi_axes.tolist(),
         'angles': [round(float(angle), 3) + 0.0 for angle in Rotation.from_quat(
             one.quat_xyzw).as_euler('xyz', degrees=True)],
-        'phrases': phrases.phrases, 'note': phrases.note, 'is_checked': check is not None,
+        'phrases': studio.phrases(key), 'is_checked': check is not None,
         'faults': () if check is None else check.faults,
         'support': None if check is None else check.support,
         'ratio': None if check is None else check.seen_ratio,

@@ -212,7 +212,6 @@ function showCard() {
     field('Label', [one.label], set('label'), {isText: true, ...off}),
     mode === 'edit' && one.phrases.length ? el('div', {className: 'chips'}, ...one.phrases.map(
       text => button(text, () => set('label')(text), {off: one.is_locked, hint: text}))) : null,
-    note(one.note),
     field('Class', [one.class_id], set('class_id'), {isText: true, list: 'classes', ...off}),
     ...(mode !== 'edit' ? [] : [
       field('Position', one.center, set('center'), off),
