@@ -140,7 +140,7 @@ def check(options: argparse.Namespace) -> int:
         report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
                            layer, None if options.observations else image_of)
         pages.write_check(out, options.map.name, report, draw_pictures(landmark_map, report),
-                          *(() if painter is None else (painter.of,)))
+                          None if painter is None else painter.of)
     print('\n'.join([f'verdict: {report.verdict}', *report.localized,
                      *pages.summary_lines(report)]))
     print('what to do:')

@@ -9,16 +9,19 @@ import urllib.request
 import cv2
 import numpy as np
 import pytest
-from studio_map import ASSETS, demo_studio, open_page
+from studio_map import ASSETS, demo_studio, open_page, write_two_rooms
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.offline.datasets.images import views_of_folder
 from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.parts import picture_of
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.web import Gate, once
@@ -164,6 +167,27 @@ def test_other_labels_of_the_class_are_offered(studio):
     assert 1 <= len(offered) <= 5 and own not in offered and 'something' not in offered
     assert set(offered) <= {one.label for one in document.landmarks.values()
                             if one.class_id == 'mug'}
+
+
+def test_the_check_of_the_edited_map_is_stopped_and_grows_old(tmp_path):
+    write_two_rooms(tmp_path / 'map.yaml')
+    studio = Studio(Document(tmp_path / 'map.yaml'))
+    studio.CHECK = CheckOptions(max_positions=4, headings=2)
+    studio.stop_check()
+    with pytest.raises(CliplocError, match='stopped'):
+        studio.check_map()
+    assert not studio.check_page and not studio.is_stale
+    studio.allow_check()
+    assert ' positions: ' in studio.check_map()
+    assert '1 pairs of places that look alike' in studio.check_page and not studio.is_stale
+    assert picture_of(studio, '/check').content.decode() == studio.check_page
+    studio.document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
+    assert not studio.is_stale, 'a lock changes nothing'
+    studio.document.edit(edits.delete, ['cup_0'])
+    assert studio.is_stale
+    studio.document.undo()
+    assert not studio.is_stale, 'the map is unchanged'
+    studio.document.close()
 
 
 # ---- who may open the page

@@ -41,6 +41,8 @@ CAPTIONS = {
     'precision_over_recall': 'Precision and recall for all thresholds of the confidence.',
     'best_iteration': 'Iteration that found the best pose.',
     'success_over_iterations': 'Success over the number of iterations.'}
+#: Returns the JPEG and the caption of the image beside a piece of advice.
+ViewOf = Callable[[Advice], tuple[bytes, str] | None]
 #: Words and colour of each grade of a landmark.
 GRADES = {'faulty': ('serious fault', html.MISLED), 'minor': ('minor fault', html.REFUSED),
           'sound': ('sound', '#009E73')}
@@ -87,17 +89,15 @@ def write_comparison(folder: Path, summaries: Sequence[Summary], rows: Sequence[
 
 def write_check(folder: Path, name: str, report: CheckReport,
                 pictures: Iterable[tuple[str, str, bytes]],
-                view_of: Callable[[Advice], tuple[bytes, str] | None] = lambda advice: None
-                ) -> None:
+                view_of: ViewOf | None = None) -> None:
     """Write the page and the JSON file of the check of a map, each atomically.
 
     `pictures` have a name, a caption and a PNG. The first picture is on the first screen.
-    `view_of` returns the JPEG and the caption of the image beside a piece of advice. OptionsError:
-    a file cannot be written; the old file stays.
+    OptionsError: a file cannot be written; the old file stays.
     """
     write_text(folder / CHECK_DATA, json.dumps(_plain({'map': name, **_data(report)}), indent=1,
                                                allow_nan=False))
-    write_text(folder / CHECK, _check_page(name, report, pictures, view_of))
+    write_text(folder / CHECK, check_page(name, report, pictures, view_of))
 
 
 def _data(report: CheckReport) -> dict[str, Any]:
@@ -152,8 +152,9 @@ def grade(landmark: LandmarkCheck) -> str:
     return 'minor' if landmark.faults else 'sound'
 
 
-def _check_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]],
-                view_of: Callable[[Advice], tuple[bytes, str] | None]) -> str:
+def check_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]],
+               view_of: ViewOf | None = None) -> str:
+    """Return the page of the check of a map, see write_check."""
     missed = len(report.failures)
     said = html.verdict('The map reaches all thresholds.' if report.passed else
                         'Keyframes only: the map misses the threshold for objects alone.'
@@ -164,7 +165,7 @@ def _check_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, st
     told = [measure for name in _TELLING for measure in report.measures
             if measure.name.startswith(name)][:_NUMBERS]
     first, *others = (html.figure(png, caption, picture) for picture, caption, png in pictures)
-    cards = [html.card(f'{number}. {advice.text}', *(view_of(advice) or ()))
+    cards = [html.card(f'{number}. {advice.text}', *((view_of and view_of(advice)) or ()))
              for number, advice in enumerate(report.to_do, start=1)]
     parts = [html.first_screen(
         [said, html.tiles((measure.show(measure.value), measure.name, not measure.is_missed)

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.offline import page as html
 from cliploc_ros.offline.studio.desk import Desk
 from cliploc_ros.offline.studio.landmark import Landmark, shape_fields
-from cliploc_ros.offline.studio.layers import LEGEND
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.web import Content
 
@@ -25,7 +24,7 @@ _MAX_ANSWERS = 100
 def parts_of(desk: Desk) -> dict[str, Any]:
     """Return the parts of the page by name."""
     studio, document = desk.studio, desk.studio.document
-    review, places = studio.review, studio.places
+    review = studio.review
     found = {
         'file': {
             'name': document.path.name, 'frame': document.frame_id, 'is_saved': document.is_saved,
@@ -46,9 +45,7 @@ def parts_of(desk: Desk) -> dict[str, Any]:
         'layers': desk.layers,
         'test': {
             'share': round(studio.share, 2), 'running': list(desk.running),
-            'is_stale': studio.is_stale,
-            'lines': [] if places is None else places.lines(studio.places_before),
-            'legend': [] if places is None else LEGEND,
+            'is_stale': studio.is_stale, 'has_page': bool(studio.check_page),
             'answers': [[view, one.verdict, None if one.error_m is None else round(one.error_m, 2),
                          one.reason] for view, one in list(studio.answers.items())[:_MAX_ANSWERS]],
             'robot': None if studio.live is None else studio.live.lines(document)}}
@@ -106,11 +103,13 @@ def _axes_of(ellipse: NDArray[np.float64]) -> list[float]:
 
 
 def picture_of(studio: Studio, path: str) -> Content | None:
-    """Return the image of a view, or a crop: /image/ANY/VIEW, /crop/ANY/VIEW/X,Y,X,Y.
+    """Return an image, a crop or the last check: /image/ANY/VIEW, /crop/ANY/VIEW/X,Y,X,Y, /check.
 
     CliplocError: an image cannot be read.
     """
     kind, *words = path.strip('/').split('/')
+    if kind == 'check' and studio.check_page:
+        return Content(studio.check_page.encode(), '.html', False)
     if studio.recording is None or kind not in ('image', 'crop'):
         return None
     try:

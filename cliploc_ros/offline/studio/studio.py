@@ -17,14 +17,16 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.offline.evaluation.pages import check_page
+from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts, sample_frames
+from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.sightings import Sighting
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.landmark import Landmark, fields_of
+from cliploc_ros.offline.studio.landmark import Landmark, Landmarks, fields_of
 from cliploc_ros.offline.studio.new_landmark import NewLandmark
-from cliploc_ros.offline.studio.places import Coverage, find_places
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.review import ReviewQueue
 from cliploc_ros.offline.studio.walls import Walls
@@ -58,17 +60,20 @@ class Studio:
         The selected view.
     answers : dict of int to Trial
         The relocalizer's answers that are shown, by view. Edits do not change them.
-    places, places_before : Coverage
-        Results of the last two searches of places.
+    check_page : str
+        The HTML page of the last check, '' without one.
     share : float
-        Completed share of a search of places, 0 to 1.
+        Completed share of a stage of the check, 0 to 1.
     """
 
     ACTIONS = ('select', 'edit', 'lock', 'hide', 'delete', 'split', 'merge', 'refit', 'refit_all',
-               'show_view', 'next_view', 'stop_search')
+               'show_view', 'next_view', 'stop_check')
     #: Slow actions, which lock the document only while they need it.
-    SLOW_ACTIONS = ('relocalize_here', 'relocalize_all', 'search_places', 'relocalize_robot',
+    SLOW_ACTIONS = ('relocalize_here', 'relocalize_all', 'check_map', 'relocalize_robot',
                     'reload_robot')
+
+    #: Options of the check, which then takes about a minute.
+    CHECK = CheckOptions(max_positions=100, headings=8, frames=60)
 
     def __init__(self, document: Document, recording: Recording | None = None,
                  layer: KeyframeLayer | None = None, walls: Walls | None = None):
@@ -82,9 +87,8 @@ class Studio:
         self.answers: dict[int, Trial] = {}
         # counts of the last run over the whole recording, by verdict
         self._counts: dict[str, int] = {}
-        self.places: Coverage | None = None
-        self.places_before: Coverage | None = None
-        self.share = 0.0
+        self.check_page, self.share = '', 0.0
+        self._checked: Landmarks = {}
         self._stopped = threading.Event()
         self._searcher = ThreadPoolExecutor(1)
         # the last search of sightings: id and fields of its landmark; the last result
@@ -283,37 +287,47 @@ class Studio:
                            for verdict, count in self._counts.items())
         return f'{len(answers)} views: {counts}; similarities are simulated'
 
-    def search_places(self) -> None:
-        """Find where a robot would be accepted in the map, and places that look alike.
+    def check_map(self) -> str:
+        """Check the map as the program check_map does, at fewer positions; make its page.
 
-        CliplocError: the map is empty, or the search was stopped; the last result is kept. After
-        a stop, call ``allow_search`` before the next search.
+        CliplocError: the map is empty, or the check was stopped; the last page is kept. After a
+        stop, call ``allow_check`` before the next check.
         """
-        self.share = 0.0
+        # imported late, since matplotlib takes a second
+        from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
 
-        def tell(share: float) -> None:
+        def tell(stage: str, share: float) -> None:
             if self._stopped.is_set():
-                raise CliplocError('the search was stopped')
-            if share - self.share >= 0.01:
-                self.share = share
-                self.changed.set()
+                raise CliplocError('the check was stopped')
+            self.share = share
+            self.changed.set()
 
-        found = find_places(self.document.landmarks, self.recording, self.places, tell,
-                            layer=self.layer)
-        self.places_before, self.places = self.places, found
+        tell('', 0.0)
+        with self.document.lock:
+            landmarks, landmark_map = self.document.landmarks, self.document.to_map()
+        detections, view_of = None, None
+        if self.recording is not None and self.review.has_boxes:
+            detections = self.recording.detections
+            view_of = ViewPainter(landmark_map, detections, self.recording.image).of
+        report = check_map(landmark_map, detections, options=self.CHECK, progress=tell,
+                           layer=self.layer)
+        self.check_page = check_page(self.document.path.name, report,
+                                     draw_pictures(landmark_map, report), view_of)
+        self._checked = landmarks
+        return '; '.join([f'checked the map: {report.verdict}', *report.localized])
 
-    def stop_search(self) -> None:
-        """Stop the search of places."""
+    def stop_check(self) -> None:
+        """Stop the check of the map."""
         self._stopped.set()
 
-    def allow_search(self) -> None:
-        """Allow the next search of places; only later calls of ``stop_search`` stop it."""
+    def allow_check(self) -> None:
+        """Allow the next check of the map; only later calls of ``stop_check`` stop it."""
         self._stopped.clear()
 
     @property
     def is_stale(self) -> bool:
-        """Return whether the map was edited since the last search of places."""
-        return self.places is not None and fields_of(self.places.landmarks) != fields_of(
+        """Return whether the map was edited since the last check."""
+        return bool(self.check_page) and fields_of(self._checked) != fields_of(
             self.document.landmarks)
 
     def relocalize_robot(self) -> str:
