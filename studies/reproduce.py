@@ -44,7 +44,7 @@ from cliploc_ros.offline import page as html
 from cliploc_ros.offline.datasets.folders import find_layout, read_sequence
 from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
 from cliploc_ros.offline.evaluation import summary
-from cliploc_ros.offline.evaluation.report import CAPTIONS, PAGE
+from cliploc_ros.offline.evaluation.pages import CAPTIONS, COMPARISON
 from cliploc_ros.offline.evaluation.trials import Result
 
 _SOURCES = Path(__file__).with_suffix('.yaml')
@@ -264,7 +264,7 @@ def _reproduce(name: str, sources: Sources, networks: Sequence[str],
                 '--no-keyframe-layer', *networks, *sources.mapping])):
             raise MappingError(f'{name}: no map was built, see above: attach that text to an '
                                'issue')
-    if not (evaluation / PAGE).exists():
+    if not (evaluation / COMPARISON).exists():
         print(f'{name}: the queries', flush=True)
         evaluate.evaluate(evaluate.make_parser().parse_args([
             '--bag', str(folder / _ASKED), '--map', str(landmark_map), '--out', str(evaluation),

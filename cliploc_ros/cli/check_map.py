@@ -106,8 +106,8 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.datasets.observations import load_queries
-    from cliploc_ros.offline.evaluation.map_check import page
-    from cliploc_ros.offline.evaluation.map_check.pictures import draw_pictures
+    from cliploc_ros.offline.evaluation import pages
+    from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
     from cliploc_ros.offline.evaluation.trials import make_queries
     from cliploc_ros.offline.mapping.check.checking import check_map
     from cliploc_ros.offline.mapping.tilt import tilt_note
@@ -123,11 +123,10 @@ def check(options: argparse.Namespace) -> int:
     thresholds = Thresholds(**{field.name: getattr(options, field.name)
                                for field in fields(Thresholds)})
     detections, images = _read_recording(options) or (None, None)
-    image_of = views = None
+    image_of = painter = None
     if detections is not None and images is not None:
-        views = page.ViewPainter(landmark_map, detections, images.near)
-        if options.observations is None:  # keyframes of nearly the same time are excluded
-            image_of = partial(images.of, detections)
+        image_of = partial(images.of, detections)
+        painter = ViewPainter(landmark_map, detections, image_of)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):
         print(f'note: {note}', flush=True)
     layer = read_layer(options.map, landmark_map, options.keyframes)
@@ -139,16 +138,16 @@ def check(options: argparse.Namespace) -> int:
     make_folder(out)
     with command.StageBar() as bar:
         report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
-                           layer, image_of)
-        page.write_report(out, options.map.name, report, draw_pictures(landmark_map, report),
-                          views)
-    print('\n'.join([f'verdict: {report.verdict}', *map(str, report.carried),
-                     *page.summary_lines(report)]))
+                           layer, None if options.observations else image_of)
+        pages.write_check(out, options.map.name, report, draw_pictures(landmark_map, report),
+                          None if painter is None else painter.of)
+    print('\n'.join([f'verdict: {report.verdict}', *report.localized,
+                     *pages.summary_lines(report)]))
     print('what to do:')
     print('\n'.join(f'  {command.printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
     for failure in report.failures:
         print(f'fails: {failure}')
-    print(f'wrote {out / page.PAGE} in {time.monotonic() - begin:.1f} s: '
+    print(f'wrote {out / pages.CHECK} in {time.monotonic() - begin:.1f} s: '
           f'{report.verdict}')
     return 0 if report.passed else 1
 

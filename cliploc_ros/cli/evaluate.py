@@ -30,11 +30,10 @@ from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.offline.datasets.frames import Frames
-    from cliploc_ros.offline.datasets.observations import Queries
     from cliploc_ros.offline.evaluation.methods import Method
     from cliploc_ros.offline.posed_query import PosedQuery
 
+_CORES = len(os.sched_getaffinity(0))  # that this process may use
 EPILOG = f"""\
 methods: {', '.join(PAPER_METHODS)}: the paper's ten;
   '{AUTO}': the relocalizer's defaults; '{ALL}': these eleven;
@@ -87,7 +86,7 @@ def make_parser() -> argparse.ArgumentParser:
            lambda text: text.replace('-', '_'), RelocalizerOptions.crops, choices=CROPS)
     option(parser, '--out DIR', default=Path('evaluation'))
     option(parser, '--workers N',
-           f'number of local processes ({_cores()} for searches, 1 for networks)', positive_int)
+           f'number of local processes ({_CORES} for searches, 1 for networks)', positive_int)
     option(parser, '--no-figures', dest='figures', action='store_false')
     add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does, on "
                    'the images of --bag or a folder')
@@ -103,8 +102,6 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--iterations', '(%(default)s)', positive_int, 500)
     option(group, '--k', '(%(default)s)', positive_int, 3)
     option(group, '--iou-threshold', '(%(default)s)', within(0.0, 1.0), 0.2)
-    option(group, '--time-budget-ms MS', 'time limit of each search (none); with a limit, results '
-           'vary', limit, float('inf'))
     option(group, '--sweep N', 'numbers of iterations to compare in a figure (50 100 200 1000)',
            positive_int, [50, 100, 200, 1000], nargs='*')
 
@@ -147,23 +144,14 @@ def evaluate(options: argparse.Namespace) -> int:
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.evaluation import trials
     from cliploc_ros.offline.evaluation.methods import parse_methods
-    from cliploc_ros.offline.evaluation.recording import with_images
     from cliploc_ros.offline.evaluation.run import compare_methods
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     parser = make_parser()
     given = given_options(options, {name: parser.get_default(name) for name in vars(options)
                                     if name != 'ros_args'})
-    if options.queries is not None:
-        _refuse_image_options(options)
-    if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
-        raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
-    check_folder_options(options)
-    if options.level and folder_of(options) is None:
-        raise OptionsError('--level is for folders of images only')
+    _check_options(options)
     of_case = options.bag is not None and options.bag.suffix == '.npz'
-    if of_case and options.poses:
-        raise OptionsError('--poses: no effect on a stored request, which is answered again')
     if options.queries is None and not of_case:
         from cliploc_ros.cli.sources import find_topics
 
@@ -175,50 +163,53 @@ def evaluate(options: argparse.Namespace) -> int:
     paper = RelocalizerOptions(
         matching=RelocalizerOptions.matching if options.clip else 'class',
         iterations=options.iterations, k=options.k, iou_threshold=options.iou_threshold,
-        random_seed=options.seed, time_budget_s=options.time_budget_ms / 1e3,
+        random_seed=options.seed,
         height_range_m=tuple(options.height_range),
         tilt_deviation_deg=options.tilt_deviation,
         vertical_deviation_deg=max(1.0, options.gravity_noise_deg), crops=options.crops)
     methods = parse_methods(options.methods, paper, len(landmark_map))
     others = trials.read_given_poses(options.poses, methods)
-    options.clip = len(landmark_map) > 0 and _needs_clip(options, methods)
+    comparing = [f"method '{method.name}'" for method in methods
+                 if method.options.needs_similarities]
+    comparing += ['--save-queries'] if options.save_queries else []
+    if len(landmark_map) and comparing and not options.clip:
+        raise OptionsError(f'--no-clip: {comparing[0]} compares crops with labels; give --methods '
+                           f"class_bf or {AUTO}, or 'matching: class' in a file of methods")
+    options.clip = options.clip and len(landmark_map) > 0 and bool(comparing)
     layer = _read_layer(options, landmark_map, methods)
     if not len(landmark_map) and layer is None:
         raise OptionsError(f'{options.map[0]} has no landmarks, and no keyframes are used')
     make_folder(options.out)
-    images = {} if options.queries is not None else _read_images(options)
-    asked = {camera: trials.make_queries(_read_queries(
-        options, landmark_map, camera, images.get(camera)), landmark_map, every_frame=True)
-        for camera in images or ('',)}
-    queries = next(iter(asked.values()))
-    if len(asked) > 1:
-        queries = trials.join_cameras(asked, options.sync_tolerance)
-    if layer is not None:
-        queries = with_images(queries, next(iter(images.values())))
-        notes = {layer.camera_note(query.observation.camera)
-                 for query in queries if query.image is not None}
-        print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
-
+    queries = _read_queries(options, landmark_map, layer)
     draws = _with_sensors(options, queries)
     compare_methods(landmark_map, draws[0], methods, options.out, trials=options.trials,
-                    workers=options.workers or _cores(), scheduler=options.scheduler,
+                    workers=options.workers or _CORES, scheduler=options.scheduler,
                     layer=layer, noisy=draws if len(draws) > 1 else (),
                     sweep=options.sweep if options.figures else None,
                     given=others, about=_describe(options, given, layer is not None),
-                    remarks=[*_notes_on_maps(options), *_notes_on_detector(queries, landmark_map)])
+                    remarks=_notes(options, queries, landmark_map))
     return 0
 
 
-def _refuse_image_options(options: argparse.Namespace) -> None:
-    """Refuse options of images and networks beside a query file; OptionsError names them."""
-    of_images = argparse.ArgumentParser()
-    _add_recording_options(of_images)
-    add_reading_options(of_images)
-    defaults = vars(of_images.parse_args([]))
-    del defaults['scheduler']  # searches use it, too
-    if given := given_options(options, defaults):
-        raise OptionsError(f'{", ".join(given)}: no effect on --queries, whose boxes and '
-                           'similarities are recorded; remove them, or give --bag or a folder')
+def _check_options(options: argparse.Namespace) -> None:
+    """Refuse options that exclude each other or have no effect; OptionsError names them."""
+    if options.queries is not None:
+        of_images = argparse.ArgumentParser()
+        _add_recording_options(of_images)
+        add_reading_options(of_images)
+        defaults = vars(of_images.parse_args([]))
+        del defaults['scheduler']  # searches use it, too
+        if idle := given_options(options, defaults):
+            raise OptionsError(
+                f'{", ".join(idle)}: no effect on --queries, whose boxes and similarities are '
+                'recorded; remove them, or give --bag or a folder')
+    if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
+        raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
+    check_folder_options(options)
+    if options.level and folder_of(options) is None:
+        raise OptionsError('--level is for folders of images only')
+    if options.poses and options.bag is not None and options.bag.suffix == '.npz':
+        raise OptionsError('--poses: no effect on a stored request, which is answered again')
 
 
 def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]'
@@ -269,55 +260,33 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
     for name, value in given.items():
         values = value if isinstance(value, list) else [value]
         words += [name, *(str(each) for each in values if not isinstance(each, bool))]
-    return {'sha256': {str(file): _hash(file) for file in files if file and Path(file).exists()},
-            'detector': detector, 'similarities': similarities, 'options': shlex.join(words)}
+    hashes = {}
+    for file in files:
+        if file and Path(file).is_file():
+            with Path(file).open('rb') as content:
+                hashes[str(file)] = hashlib.file_digest(content, 'sha256').hexdigest()[:12]
+    return {'sha256': hashes, 'detector': detector, 'similarities': similarities,
+            'options': shlex.join(words)}
 
 
-def _hash(path: str | Path) -> str:
-    """Return 12 digits of the SHA-256 of a file; of a folder, of the names and sizes in it."""
-    path = Path(path)
-    if path.is_file():
-        with path.open('rb') as content:
-            return hashlib.file_digest(content, 'sha256').hexdigest()[:12]
-    listing = ''.join(sorted(f'{file.relative_to(path)} {file.stat().st_size}\n'
-                             for file in path.rglob('*') if file.is_file()))
-    return hashlib.sha256(listing.encode()).hexdigest()[:12]
-
-
-def _notes_on_detector(queries: 'Sequence[PosedQuery]', landmark_map: 'LandmarkMap') -> list[str]:
-    """Return a note if the detections cannot match the map in any query."""
+def _notes(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
+           landmark_map: 'LandmarkMap') -> list[str]:
+    """Return notes on a detector that cannot match the map, and on maps of these images."""
+    from cliploc_ros.cli.sources import source_of
     from cliploc_ros.core.detector_check import DetectorCheck
+    from cliploc_ros.offline.datasets.map_recording import load_recording
 
     check = DetectorCheck(landmark_map, True, frames=None)
     for query in queries:
         check.add(query.observation.detections, query.observation.detections)
-    return [f'note: the detector: {fault.text}' for fault in check.faults]
-
-
-def _notes_on_maps(options: argparse.Namespace) -> list[str]:
-    """Return a note on each map that was built from the images of this evaluation."""
-    from cliploc_ros.cli.sources import source_of
-    from cliploc_ros.offline.datasets.map_recording import load_recording
-
-    if options.queries is not None:
-        return []
-    images = source_of(options).resolve()
-    return [f'note: {file} was built from these images ({images}): results are optimistic'
-            for file in options.map
-            if (recording := load_recording(file)) is not None
-            and recording.source is not None and recording.source.resolve() == images]
-
-
-def _needs_clip(options: argparse.Namespace, methods: 'Sequence[Method]') -> bool:
-    """Return whether CLIP is needed; OptionsError: it is, but --no-clip excludes it."""
-    comparing = [method.name for method in methods if method.options.needs_similarities]
-    if options.clip:
-        return bool(comparing or options.save_queries)
-    if comparing or options.save_queries:
-        what = f"method '{comparing[0]}'" if comparing else '--save-queries'
-        raise OptionsError(f"--no-clip: {what} compares crops with labels; give --methods "
-                           f"class_bf or {AUTO}, or 'matching: class' in a file of methods")
-    return False
+    notes = [f'note: the detector: {fault.text}' for fault in check.faults]
+    if options.queries is None:
+        images = source_of(options).resolve()
+        notes += [f'note: {file} was built from these images ({images}): results are optimistic'
+                  for file in options.map
+                  if (recording := load_recording(file)) is not None
+                  and recording.source is not None and recording.source.resolve() == images]
+    return notes
 
 
 def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
@@ -326,21 +295,14 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
 
     CliplocError: keyframes are requested, but cannot be used.
     """
-    from cliploc_ros.core.keyframes.layer import layer_path
-
-    wanted, problem = options.keyframes, ''
-    if not any(method.keyframes for method in methods):
-        problem = f"no method uses them: add '{AUTO}'"
-    elif len(options.map) > 1:
-        problem = 'several maps are searched by objects only'
-    elif options.queries is not None:
-        problem = '--queries has no images: give --bag or a folder'
+    problem = (
+        f"no method uses them: add '{AUTO}'" if not any(method.keyframes for method in methods)
+        else 'several maps are searched by objects only' if len(options.map) > 1
+        else '--queries has no images: give --bag or a folder' if options.queries else '')
     if not problem:
-        return read_layer(options.map[0], landmark_map, wanted)
-    if wanted:
+        return read_layer(options.map[0], landmark_map, options.keyframes)
+    if options.keyframes:
         raise OptionsError(f'--keyframes: {problem}')
-    if wanted is None and layer_path(options.map[0]).exists():
-        print(f'without keyframes: {problem}', flush=True)
     return None
 
 
@@ -373,43 +335,43 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     return 0 if is_same else 1
 
 
-def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap', camera: str,
-                  frames: 'Frames | None') -> 'Queries':
-    """Return the queries of a file, or of the images of a camera. Networks run once."""
+def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap',
+                  layer: 'KeyframeLayer | None') -> 'tuple[PosedQuery, ...]':
+    """Return the queries of a file, or of the images of all cameras; networks run once."""
     from cliploc_ros.offline.datasets.observations import load_queries, save_queries
-    from cliploc_ros.offline.evaluation.recording import recorded_queries
+    from cliploc_ros.offline.evaluation.trials import join_cameras, make_queries
+
+    if options.queries is not None:
+        return make_queries(load_queries(options.queries, landmark_map.landmark_ids),
+                            landmark_map, every_frame=True)
+    from cliploc_ros.cli.sources import read_cameras_of_map, recording_options
+    from cliploc_ros.offline.evaluation.recording import recorded_queries, with_images
     from cliploc_ros.offline.recording.recorder import EVERY_FRAME
 
-    if frames is None:
-        return load_queries(options.queries, landmark_map.landmark_ids)
-    from cliploc_ros.cli.sources import recording_options
-
-    print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
-    recording = recording_options(options, EVERY_FRAME, options.every, camera)
-    queries = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
-                               options.landmark_embeddings)
-    if without := frames.count - len(queries):
-        print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',
-              flush=True)
-    if options.save_queries is not None:
-        save_queries(options.save_queries, queries)
-        print(f'wrote {options.save_queries}', flush=True)
+    asked, images = {}, read_cameras_of_map(options, Path(options.map[0]))
+    for camera, frames in images.items():
+        if options.bag is None:
+            frames = images[camera] = frames.select(range(0, frames.count, options.every))
+        print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
+        recording = recording_options(options, EVERY_FRAME, options.every, camera)
+        found = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
+                                 options.landmark_embeddings)
+        if without := frames.count - len(found):
+            print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',
+                  flush=True)
+        if options.save_queries is not None:
+            save_queries(options.save_queries, found)
+            print(f'wrote {options.save_queries}', flush=True)
+        asked[camera] = make_queries(found, landmark_map, every_frame=True)
+    queries = next(iter(asked.values()))
+    if len(asked) > 1:
+        queries = join_cameras(asked, options.sync_tolerance)
+    if layer is not None:
+        queries = with_images(queries, next(iter(images.values())))
+        notes = {layer.camera_note(query.observation.camera)
+                 for query in queries if query.image is not None}
+        print(''.join(f'note: {note}\n' for note in sorted(notes) if note), end='', flush=True)
     return queries
-
-
-def _read_images(options: argparse.Namespace) -> 'dict[str, Frames]':
-    """Return the images of each camera with their true poses, every N-th image of a folder."""
-    from cliploc_ros.cli.sources import read_cameras_of_map
-
-    images = read_cameras_of_map(options, Path(options.map[0]))
-    return images if options.bag is not None else {
-        name: frames.select(range(0, frames.count, options.every))
-        for name, frames in images.items()}
-
-
-def _cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 if __name__ == '__main__':

@@ -20,8 +20,6 @@ from cliploc_ros.errors import OptionsError
 if TYPE_CHECKING:
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
     from cliploc_ros.offline.studio.live import LiveRelocalizer
-    from cliploc_ros.offline.studio.phrases import PhraseFinder
-    from cliploc_ros.offline.studio.recording import Recording
     from cliploc_ros.offline.studio.studio import Studio
 
 _LOOPBACK = '127.0.0.1'
@@ -54,11 +52,6 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--images BAG|DIR', 'a rosbag2 recording, or a folder as for build_map '
            '--folder, with the images of the views')
     add_topic_options(parser)
-    option(parser, '--clip-pretrained NAME', 'offer the five phrases that this CLIP finds best: a '
-           'folder or OWNER/NAME with ONNX files, or a tag or file of open_clip, as for build_map')
-    option(parser, '--clip-model NAME', 'the architecture of a tag or file (%(default)s)')
-    option(parser, '--device', 'of CLIP (%(default)s)', default='auto')
-    option(parser, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--occupancy-grid FILE', 'show the walls: the YAML file of nav2_map_server, in '
            "the map's coordinate frame")
     option(parser, '--port N', 'the first port to try; if it is in use, the next free one '
@@ -145,14 +138,13 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     if detections is None and options.images is not None:
         detections = views_of_folder(options.images)
     recording = None if detections is None else Recording(detections, images)
-    finder = _phrase_finder(options, recording)
     # a new map gets the first unused name
     names = itertools.chain(['map.yaml'], (f'map-{number}.yaml' for number in itertools.count(2)))
     document = Document(options.map or next(
         path for path in map(Path, names) if not path.exists()))
     layer = read_layer(document.path, document.to_map(), None)
     walls = None if options.occupancy_grid is None else read_walls(options.occupancy_grid)
-    return Studio(document, recording, finder, layer, walls)
+    return Studio(document, recording, layer, walls)
 
 
 def _cameras(options: argparse.Namespace, detections: 'PosedDetections | None') -> list[str]:
@@ -164,22 +156,6 @@ def _cameras(options: argparse.Namespace, detections: 'PosedDetections | None') 
         raise OptionsError(f"--cameras: the observations have no camera '{unknown[0]}'; they have "
                            f'{", ".join(filter(None, known)) or "one without a name"}')
     return list(dict.fromkeys(options.cameras))
-
-
-def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None'
-                   ) -> 'PhraseFinder | None':
-    from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.offline.studio.phrases import PhraseFinder
-    from cliploc_ros.offline.vocabulary.vocabulary import load_vocabulary
-
-    if options.clip_pretrained is None:
-        if options.clip_model is not None or options.vocabulary is not None:
-            raise OptionsError('--clip-model and --vocabulary are for a CLIP: also give '
-                               '--clip-pretrained')
-        return None
-    clip = ClipOptions(model=options.clip_model or ClipOptions.model,
-                       pretrained=options.clip_pretrained, device=options.device)
-    return PhraseFinder(clip, load_vocabulary(options.vocabulary), recording)
 
 
 if __name__ == '__main__':

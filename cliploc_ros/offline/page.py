@@ -10,9 +10,14 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import NamedTuple
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 #: Colours of Okabe and Ito, which colour-blind readers can distinguish.
 ACCEPTED, REFUSED, MISLED = '#0072B2', '#E69F00', '#D55E00'
-GOOD, BAD, FAINT = ACCEPTED, MISLED, '#999999'
+LOOK_ALIKE, GOOD, BAD = '#CC79A7', ACCEPTED, MISLED
+_QUALITY = 85
 _TYPES = {b'\x89PNG': 'png', b'\xff\xd8\xff\xe0': 'jpeg'}
 _STYLE = f"""\
 body {{ font: 15px/1.45 system-ui, sans-serif; color: #222; margin: 0 auto; max-width: 1480px;
@@ -128,6 +133,15 @@ def figure(image: bytes | str, caption: str, name: str = '') -> str:
 
 def _embedded(image: bytes) -> str:
     return f'data:image/{_TYPES[image[:4]]};base64,{b64encode(image).decode("ascii")}'
+
+
+def jpeg_of(image_rgb: NDArray[np.uint8], most_px: int | None = None) -> bytes:
+    """Return an image (h, w, 3) as JPEG, made smaller if a side is longer than a limit."""
+    if most_px is not None and (large := max(image_rgb.shape) / most_px) > 1.0:
+        height, width = (max(1, round(side / large)) for side in image_rgb.shape[:2])
+        image_rgb = cv2.resize(image_rgb, (width, height), interpolation=cv2.INTER_AREA)
+    return cv2.imencode('.jpg', image_rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+                        )[1].tobytes()
 
 
 def side_by_side(parts: Iterable[str]) -> str:

@@ -10,7 +10,7 @@ import pytest
 PROGRAMS = ('build_map', 'check_map', 'demo', 'doctor', 'evaluate', 'import_map', 'prepare',
             'replay', 'studio', 'tum_to_bag', 'wake_up')
 #: Options without a limit may accept infinity.
-MAY_BE_INFINITE = {'--time-budget-ms', '--height-range'}
+MAY_BE_INFINITE = {'--height-range'}
 
 
 def options_of(program):

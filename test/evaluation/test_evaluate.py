@@ -206,10 +206,6 @@ def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag, 
     about = json.loads((walk / 'from_tum/run.json').read_text())
     assert about['detector'] == str(ASSETS / 'yolo.onnx')
     assert about['similarities'] == f'CLIP {ASSETS / "clip"}'
-    listing = ''.join(sorted(f'{file.relative_to(walk / "tum")} {file.stat().st_size}\n'
-                             for file in (walk / 'tum').rglob('*') if file.is_file()))
-    of_folder = hashlib.sha256(listing.encode())
-    assert about['sha256'][str(walk / 'tum')] == of_folder.hexdigest()[:12]
     # a bag's quaternions are rounded once more
     for result, other in zip(results, results_of(walk / 'from_tum'), strict=True):
         for name in ('error_m', 'error_deg', 'nees', 'confidence'):

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The layers of the page: coverage, places that look alike, and keyframes."""
-
+"""The check of the map, and the layers of the scene, in a real browser."""
 
 import pytest
 from browser import wait_for
 from studio_map import person_at, write_two_rooms
 
+from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.studio import Studio
@@ -15,28 +15,25 @@ pytestmark = [pytest.mark.full, pytest.mark.clock,
               pytest.mark.needs('viser', 'playwright', 'chromium')]
 
 
-def test_coverage_and_look_alikes(chromium, path):
-    """They are found, become outdated by an edit, and are found again with the changes."""
+def test_the_check_becomes_outdated_by_an_edit_and_opens_as_a_page(chromium, path):
     write_two_rooms(path)
     document = Document(path)
-    with person_at(chromium, Studio(document)) as (person, server):
+    studio = Studio(document)
+    studio.CHECK = CheckOptions(max_positions=9, headings=4)
+    with person_at(chromium, studio) as (person, _):
         page = person.page
         person.mode('Test')
         person.click('Coverage and look-alikes')
         person.row('cup_0').click()
         wait_for(lambda: document.selection == ('cup_0',), 'the page stays responsive')
-        page.get_by_text('pairs of places that look alike: 1').wait_for()
+        page.get_by_text('checked the map').first.wait_for()
+        with page.context.expect_page() as opened:
+            person.click('Open the check')
+        opened.value.get_by_text('places that look alike').first.wait_for()
         person.picture('places')
-        tiles = server.scene._handle_from_node_name['/coverage/tiles']
-        for mode, is_shown in (('Edit', False), ('Test', True)):
-            person.mode(mode)
-            wait_for(lambda is_shown=is_shown: tiles.visible == is_shown, 'the tiles')
         with document.lock:
             document.edit(edits.delete, ['cup_0'])
         page.get_by_text('of the map before the last edits').wait_for()
-        person.click('Coverage and look-alikes')
-        page.get_by_text('(was 1)').wait_for()
-        assert page.get_by_text('of the map before the last edits').count() == 0
 
 
 def test_layers_film_and_a_click_on_the_image(person, studio):

@@ -9,16 +9,23 @@ import urllib.request
 import cv2
 import numpy as np
 import pytest
-from studio_map import demo_studio, open_page
+from studio_map import ASSETS, demo_studio, open_page, write_two_rooms
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
+from cliploc_ros.errors import CliplocError
+from cliploc_ros.offline.datasets.images import views_of_folder
 from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.mapping.options import CheckOptions
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.parts import picture_of
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.web import Gate, once
+from demo.truth import read_frames
 
 
 @pytest.fixture
@@ -126,6 +133,61 @@ def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     assert f'(was {accepted})' in after
     assert sum(answer.verdict == 'accepted' for answer in office.answers.values()) < accepted
     print(f'as given: {before}; every other landmark deleted: {after}')
+
+
+def test_a_new_landmark_has_the_class_and_the_mean_embedding_of_its_boxes(tmp_path):
+    """Its file is new, too."""
+    rng, rows = np.random.default_rng(0), read_frames(ASSETS / 'mapping')
+    views = views_of_folder(ASSETS / 'mapping')
+    boxes = [[box.bbox_xyxy for box in frame.boxes if box.object_id == 'bowl_1'] for frame in rows]
+    count = sum(map(len, boxes))
+    embeddings = np.ones((count, 8)) + rng.normal(0.0, 0.1, (count, 8))
+    embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
+    studio = Studio(Document(tmp_path / 'new.yaml'), Recording(PosedDetections(
+        views.cameras, views.map_from_camera, views.stamps_s, np.cumsum([0, *map(len, boxes)]),
+        np.concatenate([box for box in boxes if box]), ('bowl',), np.zeros(count, dtype=np.int64),
+        np.ones(count), embeddings=embeddings.astype(np.float16), encoder_key='key')))
+    for view in np.flatnonzero(np.diff(studio.recording.detections.frame_offsets)).tolist():
+        box = studio.recording.detections.detections_of(view).bboxes_xyxy[0]
+        studio.new.draw(view, box[:2], box[2:])
+    assert studio.new.class_id == 'bowl', 'the class of the detected box there'
+    studio.new.create('a blue bowl', 'bowl')
+    studio.document.save()
+    stored = load_landmark_embeddings(embeddings_path(tmp_path / 'new.yaml'))
+    assert stored.landmark_ids == ('bowl_1',) and 1 <= len(stored.medoids) <= 5
+    assert stored.means[0] @ (mean := embeddings.mean(axis=0)) / np.linalg.norm(mean) > 0.99
+    studio.document.close()
+
+
+def test_other_labels_of_the_class_are_offered(studio):
+    document = studio.document
+    own = document.landmarks['mug_1'].label
+    document.edit(edits.set_fields, ['mug_1'], label='something')
+    offered = studio.phrases('mug_1')
+    assert 1 <= len(offered) <= 5 and own not in offered and 'something' not in offered
+    assert set(offered) <= {one.label for one in document.landmarks.values()
+                            if one.class_id == 'mug'}
+
+
+def test_the_check_of_the_edited_map_is_stopped_and_grows_old(tmp_path):
+    write_two_rooms(tmp_path / 'map.yaml')
+    studio = Studio(Document(tmp_path / 'map.yaml'))
+    studio.CHECK = CheckOptions(max_positions=4, headings=2)
+    studio.stop_check()
+    with pytest.raises(CliplocError, match='stopped'):
+        studio.check_map()
+    assert not studio.check_page and not studio.is_stale
+    studio.allow_check()
+    assert ' positions: ' in studio.check_map()
+    assert '1 pairs of places that look alike' in studio.check_page and not studio.is_stale
+    assert picture_of(studio, '/check').content.decode() == studio.check_page
+    studio.document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
+    assert not studio.is_stale, 'a lock changes nothing'
+    studio.document.edit(edits.delete, ['cup_0'])
+    assert studio.is_stale
+    studio.document.undo()
+    assert not studio.is_stale, 'the map is unchanged'
+    studio.document.close()
 
 
 # ---- who may open the page

@@ -52,7 +52,7 @@ def test_a_killed_studio_loses_nothing(path):
     editor.wait()
     document = Document(path)
     assert document.landmarks['cup_1'].center[0] >= last
-    assert document.landmarks['book_1'].marks.is_locked and 'plant_1' not in document.landmarks
+    assert 'plant_1' not in document.landmarks
     assert any('restored' in note for note in document.notes)
     document.undo()
     assert document.is_saved, 'the drag is one edit'
@@ -67,7 +67,6 @@ def test_replay_between_announcing_and_writing(path):
     """The studio was killed while saving: either content has the correct edits."""
     document = Document(path)
     document.edit(edits.set_fields, ['cup_1'], label='first')
-    document.edit(edits.mark, ['book_1'], 'lock', is_locked=True)
     document._journal.append({'writing': document._file.with_landmarks(
         document.landmarks).digest})
     written = document._file.with_landmarks(document.landmarks).text
@@ -78,7 +77,6 @@ def test_replay_between_announcing_and_writing(path):
     path.write_text(written)
     again = Document(path)
     assert again.landmarks['cup_1'].label == 'first' and again.is_saved
-    assert again.landmarks['book_1'].marks.is_locked
     assert not journal_of(path).with_name(f'{journal_of(path).name}.1').exists(), 'set aside'
 
 
@@ -96,11 +94,10 @@ def test_edits_of_another_content_are_set_aside(path):
 
 @pytest.mark.parametrize('tail', [
     b'{"do": "edit", "what": "cu', b'\xff\xfe\n', b'{}\n',
-    b'{"do": "edit", "what": "x", "before": {"a": null}, '
-                                  b'"after": {"a": {"fields": {"label": NaN}, "locked": 1}}}\n',
-    b'{"do": "edit", "what": "x", "after": {"cup_1": {"marks": {}, "fields": {"label": "a", '
-    b'"class_id": "a", "orientation": [0, 0, 0, 1], "semi_axes": [1, 1, 1], '
-    b'"center": [1' + b'0' * 400 + b', 0, 0]}}}}\n'])
+    b'{"do": "edit", "what": "x", "after": {"a": {"label": NaN}}}\n',
+    b'{"do": "edit", "what": "x", "after": {"cup_1": {"label": "a", "class_id": "a", '
+    b'"orientation": [0, 0, 0, 1], "semi_axes": [1, 1, 1], '
+    b'"center": [1' + b'0' * 400 + b', 0, 0]}}}\n'])
 def test_a_broken_journal_loses_its_end_only(path, tail):
     document = Document(path)
     document.edit(edits.set_fields, ['cup_1'], label='mine')

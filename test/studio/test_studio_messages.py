@@ -54,7 +54,7 @@ def page(tmp_path):
       for name in ('lock', 'hide')),
     ('flatten', [{'is_flat': NAN}, {'client': 1}]), ('fly', [{'name': 1, 'is_flat': True}]),
     ('mode', [{'mode': {}}, {}]),
-    ('relocalize_robot', [{}]), ('reload_robot', [{}]), ('search_places', [{'limit_s': NAN}]),
+    ('relocalize_robot', [{}]), ('reload_robot', [{}]), ('check_map', [{'limit_s': NAN}]),
     ({'x': []}, [{}]), ('x' * 100_000, [{}]), ('_start', [{'name': 'save', 'values': {}}])],
     ids=lambda value: '' if isinstance(value, list) else str(value)[:20])
 def test_hostile_messages_are_refused(page, caplog, action, hostile):

@@ -127,7 +127,8 @@ _STYLES = {'bf': ('-', 'o'), 'ransac': ((0, (1, 1.2)), '^'), 'prosac': ((0, (5, 
 _SIZE = (6.4, 4.0)
 _MAX_ERROR_M = 2.0
 _SUCCESS_M = 1.0
-_MARGIN_M = 0.5
+# Margin around the points of a map from above [m], and its longer side [in].
+_MARGIN_M, _LARGEST_IN = 0.5, 7.0
 #: Colours of curves, for colour-blind readers.
 JUDGED_COLORS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 
@@ -202,6 +203,20 @@ def new_axes(xlabel: str, ylabel: str) -> tuple[Figure, Axes]:
     axes.set_prop_cycle(color=JUDGED_COLORS)
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
+    return figure, axes
+
+
+def new_top_view(points: NDArray[np.float64], frame_id: str) -> tuple[Figure, Axes]:
+    """Return a figure of the map from above with room for points (n, 2), and equal scales."""
+    low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+    width, height = (high - low) * _LARGEST_IN / (high - low).max()
+    figure = Figure(figsize=(max(4.5, width) + 2.0, max(3.0, height) + 1.3),
+                    layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
+    axes = figure.add_subplot(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal')
+    axes.set_axisbelow(True)
+    # a frame_id may be text that mathtext refuses
+    axes.set_xlabel(f'x in {frame_id} [m]', parse_math=False)
+    axes.set_ylabel(f'y in {frame_id} [m]', parse_math=False)
     return figure, axes
 
 
@@ -299,17 +314,9 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results:
     truth = {query.number: query.map_from_camera for query in queries}
     first = [result for result in results if result.trial == 0]
     positions = np.array([pose[:2, 3] for pose in truth.values()])
-    points = np.concatenate([landmark_map.centers[:, :2], positions])
-    low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
-    width, height = high - low
-    scale = min(8.0 / width, 8.0 / height)
-    figure = Figure(figsize=(max(3.0, width * scale) + 2.6, max(3.0, height * scale) + 1.0),
-                    layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
-    axes = figure.add_subplot()
-    frame = landmark_map.frame_id
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal',
-             xlabel=f'x in {frame} [m]', ylabel=f'y in {frame} [m]',
-             title=f'{method}: estimates joined to the true poses')
+    figure, axes = new_top_view(np.concatenate([landmark_map.centers[:, :2], positions]),
+                                landmark_map.frame_id)
+    axes.set_title(f'{method}: estimates joined to the true poses', parse_math=False)
     draw_map(axes, landmark_map)
     axes.plot(positions[:, 0], positions[:, 1], 'o', markersize=6, markerfacecolor='none',
               color='#222222', label='true pose', zorder=6)

@@ -29,7 +29,7 @@ from cliploc_ros.files.storage import make_folder, write_text
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.methods import Method
-from cliploc_ros.offline.evaluation.report import PAGE, write_report
+from cliploc_ros.offline.evaluation.pages import COMPARISON, write_comparison
 from cliploc_ros.offline.evaluation.trials import Result, given_results, run_trial
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
@@ -185,8 +185,8 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         shown, {query.number: query.map_from_camera for query in queries})))
     pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
                      summaries, methods) if sweep is not None else []
-    write_report(out, summaries, rows, remarks, pictures, facts)
-    print(f'results: {out.resolve() / PAGE}', flush=True)
+    write_comparison(out, summaries, rows, remarks, pictures, facts)
+    print(f'results: {out.resolve() / COMPARISON}', flush=True)
     return summaries
 
 

@@ -45,6 +45,20 @@ def outlines_in_view(detections: PosedDetections, view: int, centers: NDArray[np
         detections.camera_of(view))
 
 
+def crop_around(image: NDArray[np.uint8], box: NDArray[np.float64], margin: float
+                ) -> NDArray[np.uint8]:
+    """Return the part of an image (h, w, 3) around a box (4,) [px].
+
+    The margin is a multiple of the longer side of the box.
+    """
+    around = margin * (box[2:] - box[:2]).max()
+    height, width = image.shape[:2]
+    left, top = np.clip(np.floor(box[:2] - around), 0, (width - 1, height - 1)).astype(int)
+    right, bottom = np.clip(np.ceil(box[2:] + around), (left + 1, top + 1), (width, height)
+                            ).astype(int)
+    return image[top:bottom, left:right]
+
+
 def find_sightings(detections: PosedDetections, rows: NDArray[np.int64],
                    center: NDArray[np.float64], shape: NDArray[np.float64], limit: int = 6,
                    sharpness: Callable[[Sighting], float] | None = None) -> list[Sighting]:

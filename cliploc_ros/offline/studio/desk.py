@@ -107,8 +107,8 @@ class Desk:
                 return action(**values)
             if name in self.running:
                 raise EditError(f"'{name.replace('_', ' ')}' is already running")
-            if name == 'search_places':
-                studio.allow_search()  # before the thread starts, which may be stopped at once
+            if name == 'check_map':
+                studio.allow_check()  # before the thread starts, which may be stopped at once
             thread = threading.Thread(target=self._run, args=(name, action), daemon=True)
             with self._lock:
                 self.running = {**self.running, name: thread}

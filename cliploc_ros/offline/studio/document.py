@@ -7,7 +7,7 @@ atomic hold it, too.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, RLock
 from typing import Any
@@ -19,18 +19,17 @@ from cliploc_ros.files.storage import parse_json
 from cliploc_ros.offline.studio.edits import Change, EditError, change_from_json
 from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
-    Encoded,
     Landmark,
     Landmarks,
-    Marks,
     fields_of,
     map_of,
 )
 from cliploc_ros.offline.studio.map_file import (
-    NO_FILE,
     LookFile,
+    MapFile,
     read_look_file,
     read_map_file,
+    text_on_disk,
 )
 
 _MAX_HISTORY = 10_000
@@ -57,9 +56,8 @@ class Document:
         self.lock = RLock()
         self.changed = Event()
         self.notes: tuple[str, ...] = ()
-        #: Digest of the file after another program changed it, until the user decides
-        self.foreign = ''
-        self._accepted = ''
+        #: Whether another program changed the file, until the user decides
+        self.has_conflict = False
         self.selection: tuple[str, ...] = ()
         self._done: list[Change] = []
         self._undone: list[Change] = []
@@ -103,8 +101,8 @@ class Document:
     def take_encoder(self, encoder_key: str) -> None:
         """Set the encoder of the embeddings of a new, empty map; ignored for other maps."""
         with self.lock:
-            if not self._file.landmarks and self._look_file.state is None:
-                self._look_file = self._look_file._replace(encoder_key=encoder_key)
+            if not self._file.landmarks and not self._look_file.path.exists():
+                self._look_file = replace(self._look_file, encoder_key=encoder_key)
 
     @property
     def selected(self) -> tuple[str, Landmark] | None:
@@ -200,7 +198,7 @@ class Document:
             self.changed.set()
 
     def _do(self, kind: str, change: Change) -> None:
-        self._journal.append({'do': kind, **change.to_json(self.landmarks)})
+        self._journal.append({'do': kind, **change.to_json()})
         self._take(kind, change)
         self.changed.set()
 
@@ -227,40 +225,26 @@ class Document:
         written. The file is then unchanged.
         """
         with self.lock:
+            if text_on_disk(self.path) not in ('', self._file.text):
+                self.has_conflict = True
+                raise MapError(f'{self.path}: another program changed this file after the studio '
+                               'read it; overwrite it, or reload it')
+            return self.overwrite()
+
+    def overwrite(self) -> str:
+        """Save the map over the content of another program."""
+        with self.lock:
             if not self.landmarks:
                 raise EditError(f'{self.path}: a map without landmarks is not saved; create one, '
                                 'or delete the file')
             self.to_map()
-            found = self._file.digest_on_disk()
-            if found not in (NO_FILE, self._file.digest, self._accepted):
-                self.foreign = found
-                raise MapError(f'{self.path}: another program changed this file after the studio '
-                               'read it; overwrite it, or reload it')
             file = self._file.with_landmarks(self.landmarks)
-            looks = self._look_file.looks
-            self._journal.append({'writing': file.digest, 'looks': {
-                key: look.to_json() for key, look in looks.items()
-                if key not in self.landmarks or self.landmarks[key].look is not look}})
+            self._journal.append({'writing': file.digest})
             # the map is written last: its new content marks a complete save
-            self._look_file, fault = self._look_file.write(self.landmarks)
-            self.notes += (fault,) if fault and fault not in self.notes else ()
+            self._look_file = self._look_file.write(self.landmarks)
             file.write()
-            self._file = file
-            self._saved = self.landmarks
-            self._gesture = None
-            self.foreign = ''
-            self._journal.restart([self._header()])
-            self.changed.set()
+            self._take_file(file, self.landmarks)
             return f'saved {self.path.name}'
-
-    def overwrite(self) -> str:
-        """Save the map over the content of another program that `save` found."""
-        with self.lock:
-            self._accepted = self.foreign
-            try:
-                return self.save()
-            finally:
-                self._accepted = ''
 
     def reload(self) -> str:
         """Read the map from the file again, as an edit that can be undone.
@@ -269,26 +253,29 @@ class Document:
         """
         with self.lock:
             file = read_map_file(self.path)
-            if file.digest == NO_FILE:
+            if not file.text:
                 raise MapError(f'{self.path}: no such file; saving writes it')
             self._file = file
             self._look_file = self._read_looks()
             before = self.landmarks
-            found = {key: replace(landmark, marks=before[key].marks if key in before else Marks())
-                     for key, landmark in self._landmarks_of_file().items()}
+            found = {key: replace(before.get(key, one), fields=one.fields, look=one.look)
+                     for key, one in self._landmarks_of_file().items()}
             self._take('edit', Change('reload the file', {**dict.fromkeys(before), **found}))
-            self._saved = found
-            self.foreign = ''
-            self._journal.restart([self._header()])
+            self._take_file(file, found)
             self._note_unknown_fields()
-            self.changed.set()
             return f'reloaded {self.path.name}; undo reverts this'
 
+    def _take_file(self, file: MapFile, landmarks: Landmarks) -> None:
+        """Note that a file contains the landmarks, and begin a new journal."""
+        self._file, self._saved = file, landmarks
+        self._gesture, self.has_conflict = None, False
+        self._journal.restart([{'base': file.digest}])
+        self.changed.set()
+
     def close(self) -> None:
-        """Close the journal; remove it if it has neither edits nor marks."""
+        """Close the journal; remove it if the file contains all edits."""
         with self.lock:
-            is_needed = not self.is_saved or self._marks()
-            self._journal.close() if is_needed else self._journal.remove()
+            self._journal.remove() if self.is_saved else self._journal.close()
 
     def _landmarks_of_file(self) -> dict[str, Landmark]:
         return {key: replace(landmark, look=self._look_file.looks.get(key))
@@ -306,57 +293,25 @@ class Document:
         self.notes += (fault,) if fault else ()
         return found
 
-    # ---- the journal ----------------------------------------------------------------------------
-
-    def _header(self) -> dict[str, Any]:
-        return {'base': self._file.digest, 'marks': self._marks()}
-
-    def _marks(self) -> dict[str, Any]:
-        return {key: asdict(landmark.marks) for key, landmark in self.landmarks.items()
-                if landmark.marks != Marks()}
-
     def _replay(self, entries: list[dict[str, Any]]) -> None:
         """Repeat the edits of the journal that are not in the file."""
-        digest = self._file.digest
+        digest, done = self._file.digest, list[dict[str, Any]]()
         starts = [row for row, entry in enumerate(entries)
                   if digest in (entry.get('base'), entry.get('writing'))]
-        start = starts[-1] if starts else -1
-        edits = [entry for entry in entries[start + 1:] if 'do' in entry]
-        header, done = self._header(), list[dict[str, Any]]()
+        edits = [entry for entry in entries[starts[-1] + 1 if starts else 0:] if 'do' in entry]
+        is_whole = bool(starts)
         try:
             if edits and not starts:
                 raise EditError('another program changed the file, so they do not match it')
-            self._restore(entries[:start + 1], entries[-1:])
-            header = self._header()
             for entry in edits:
                 self._take(str(entry['do']), change_from_json(entry, self.landmarks))
                 done.append(entry)
         except (LookupError, TypeError, AttributeError, ValueError, CliplocError) as error:
-            aside = self._journal.set_aside()
+            is_whole, aside = False, self._journal.set_aside()
             self.notes += (f'could not restore the last {len(edits) - len(done)} edits of an '
                            f'earlier session ({error}); they are kept in {aside.name}',)
-            self._journal.restart([header, *done])
-        if not starts:
-            self._journal.restart([header])
+        if not is_whole:
+            self._journal.restart([{'base': digest}, *done])
         if done and not self.is_saved:
             self.notes += (f'restored {len(done)} edits that were not saved; undo reverts '
                            'them',)
-
-    def _restore(self, entries: list[dict[str, Any]], last: list[dict[str, Any]]) -> None:
-        """Restore the marks and embeddings that belong to the content of the file.
-
-        Marks come from the header and, if the file was written since, from the edits before that.
-        If a save was interrupted after it had replaced embeddings, the old embeddings come from
-        the last entry. Entries of earlier versions contain only their ids.
-        """
-        marks: dict[str, Any] = {}
-        for entry in entries:
-            marks |= entry.get('marks', {})
-            marks |= {key: fields['marks'] for key, fields in entry.get('after', {}).items()
-                      if fields}
-        looks = {} if last == entries[-1:] else last[0].get('looks', {})
-        self.landmarks = self._saved = {
-            key: replace(landmark, marks=Marks(**marks.get(key, {})),
-                         look=(Encoded.from_json(looks[key]) if isinstance(looks.get(key), dict)
-                               else landmark.look))
-            for key, landmark in self.landmarks.items()}

@@ -7,22 +7,21 @@ before the edit.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import join_details
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.offline.mapping.landmarks import unused_ids
 from cliploc_ros.offline.studio.landmark import (
     LEAST_SEMI_AXIS_M,
-    Encoded,
     Landmark,
     Landmarks,
-    Marks,
     map_of,
     merge_looks,
     rounded,
@@ -59,29 +58,20 @@ class Change(NamedTuple):
         """Return the change that undoes this change of the landmarks."""
         return Change(self.what, {key: landmarks.get(key) for key in self.after})
 
-    def to_json(self, landmarks: Landmarks) -> dict[str, Any]:
-        """Return the change of the landmarks as JSON, with embeddings only if they change."""
-        return {'what': self.what, 'after': {key: one and {
-            'fields': one.fields, 'marks': asdict(one.marks),
-            **({} if key in landmarks and one.look is landmarks[key].look else
-               {'look': one.look and one.look.to_json()})} for key, one in self.after.items()}}
+    def to_json(self) -> dict[str, Any]:
+        """Return the change as JSON, without looks and marks."""
+        return {'what': self.what, 'after': {key: one and one.fields
+                                             for key, one in self.after.items()}}
 
 
 def change_from_json(tree: Mapping[str, Any], landmarks: Landmarks) -> Change:
-    """Return a change of the landmarks from JSON.
+    """Return a change of the landmarks from JSON; their looks and marks stay.
 
     LookupError, TypeError, AttributeError, ValueError or MapError: it is not a change, or a
     landmark is invalid.
     """
-    def look_of(key: str, look: Any) -> Encoded | None:
-        if isinstance(look, str):
-            return landmarks[key].look if key in landmarks else None
-        return look and Encoded.from_json(look)
-
-    # earlier versions wrote a key of the embeddings, or nothing: keep the current embeddings
-    after = {key: one and Landmark(one['fields'], Marks(**one['marks']),
-                                   look_of(key, one.get('look', '')))
-             for key, one in tree['after'].items()}
+    after = {key: fields and replace(landmarks.get(key, Landmark({})), fields=fields)
+             for key, fields in tree['after'].items()}
     if valid := {key: landmark for key, landmark in after.items() if landmark is not None}:
         map_of(valid)
     return Change(str(tree['what']), after)
@@ -92,7 +82,7 @@ def _change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | N
     changed = {key: landmark for key, landmark in after.items() if landmark != landmarks.get(key)}
     for landmark_id, landmark in changed.items():
         old = landmarks.get(landmark_id)
-        if old is not None and old.marks.is_locked and (
+        if old is not None and old.is_locked and (
                 landmark is None or landmark.fields != old.fields):
             raise EditError(f"landmark '{landmark_id}' is locked: unlock it first")
         if landmark is not None:
@@ -155,12 +145,11 @@ def mark(landmarks: Landmarks, landmark_ids: Iterable[str], what: str, **marks: 
     """Set marks of landmarks, also of locked landmarks."""
     chosen = {key: _get(landmarks, key) for key in landmark_ids}
     return _change_of(f'{what} {", ".join(chosen)}', landmarks, {
-        key: replace(landmark, marks=replace(landmark.marks, **marks))
-        for key, landmark in chosen.items()})
+        key: replace(landmark, **marks) for key, landmark in chosen.items()})
 
 
 def create(landmarks: Landmarks, label: str, class_id: str, center: NDArray[np.float64],
-           basis: NDArray[np.float64], look: Encoded | None = None) -> Change:
+           basis: NDArray[np.float64], look: LandmarkEmbeddings | None = None) -> Change:
     """Add a landmark with a centre (3,) and a basis (3, 3), whose columns are the semi-axes [m].
 
     The change contains only the new landmark.

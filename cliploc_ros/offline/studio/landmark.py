@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A landmark of the studio: its fields of the map file, and its look.
+"""A landmark of the studio: its fields of the map file, its look, and its marks.
 
 The relocalizer refuses a map with unknown fields, because a misspelled field would silently have
 no effect. The studio opens such a map, keeps the fields, and notes that they are refused.
@@ -9,7 +9,6 @@ A look is the image embeddings of a landmark. It is a part of the landmark, so t
 delete, undo and redo apply to it, too.
 """
 
-import base64
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -32,76 +31,35 @@ DECIMALS = 6
 LEAST_SEMI_AXIS_M = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class Encoded:
-    """The image embeddings of one landmark."""
+def merge_looks(looks: Sequence[LandmarkEmbeddings | None], weights: Sequence[float]
+                ) -> LandmarkEmbeddings | None:
+    """Merge the looks of several landmarks, of one encoder; None if no look is known.
 
-    mean: NDArray[np.float16]  #: (d,): the mean direction of its crops, of unit length
-    #: (m, d): unit rows, embeddings of at most five representative crops
-    medoids: NDArray[np.float16]
-    encoder_key: str
-
-    def to_json(self) -> dict[str, str]:
-        """Return the look as JSON."""
-        return {'encoder': self.encoder_key,
-                'mean': base64.b64encode(self.mean.tobytes()).decode(),
-                'medoids': base64.b64encode(self.medoids.tobytes()).decode()}
-
-    @classmethod
-    def from_json(cls, tree: Mapping[str, str]) -> 'Encoded':
-        """Return a look from JSON; LookupError, TypeError or ValueError: it is damaged."""
-        mean, medoids = (np.frombuffer(base64.b64decode(tree[name], validate=True), np.float16)
-                         for name in ('mean', 'medoids'))
-        return cls(mean, medoids.reshape(-1, len(mean)), tree['encoder'])
-
-
-def merge_looks(looks: Sequence[Encoded | None], weights: Sequence[float]) -> Encoded | None:
-    """Merge the looks of several landmarks; None if no look is known.
-
-    The weights are, for example, the numbers of boxes. Looks whose encoder differs from that of
-    the first known look are ignored.
+    The weights are, for example, the numbers of boxes.
     """
     known = [(look, weight) for look, weight in zip(looks, weights, strict=True)
              if look is not None]
-    known = [(look, weight) for look, weight in known
-             if look.encoder_key == known[0][0].encoder_key]
     if len(known) < 2:
         return known[0][0] if known else None
-    mean = np.sum([weight * look.mean.astype(np.float32) for look, weight in known], axis=0)
+    mean = np.sum([weight * look.means.astype(np.float32) for look, weight in known], axis=0)
     crops = np.concatenate([look.medoids for look, _ in known]).astype(np.float32)
     shares = np.concatenate([np.full(len(look.medoids), weight / max(1, len(look.medoids)))
                              for look, weight in known])
-    return Encoded((mean / max(float(np.linalg.norm(mean)), 1e-9)).astype(np.float16),
-                   crops[choose_medoids(crops, shares)].astype(np.float16),
-                   known[0][0].encoder_key)
-
-
-def looks_of(embeddings: LandmarkEmbeddings) -> dict[str, Encoded]:
-    """Return the known looks by landmark id."""
-    offsets = embeddings.medoid_offsets
-    return {landmark_id: Encoded(embeddings.means[row],
-                                 embeddings.medoids[offsets[row]:offsets[row + 1]],
-                                 embeddings.encoder_key)
-            for row, landmark_id in enumerate(embeddings.landmark_ids)
-            if embeddings.is_known[row]}
-
-
-@dataclass(frozen=True)
-class Marks:
-    """The state of a landmark in the studio, which is not stored in the map file."""
-
-    is_locked: bool = False  #: Edits are refused
-    is_hidden: bool = False  #: The landmark is not shown in the scene and the views
-    decision: str = ''  #: Decision in the review: accepted, fixed; '' without a decision
+    chosen = crops[choose_medoids(crops, shares)].astype(np.float16)
+    return replace(known[0][0], medoids=chosen, medoid_offsets=np.array([0, len(chosen)]), means=(
+        mean / max(float(np.linalg.norm(mean)), 1e-9)).astype(np.float16))
 
 
 @dataclass(frozen=True)
 class Landmark:
-    """A landmark of the edited map."""
+    """A landmark of the edited map. No file stores the marks."""
 
     fields: Mapping[str, Any]  #: As in the map file, below the landmark's id
-    marks: Marks = Marks()
-    look: Encoded | None = field(default=None, compare=False)  #: From the file next to the map
+    #: From the file next to the map: the embeddings of this landmark alone
+    look: LandmarkEmbeddings | None = field(default=None, compare=False)
+    is_locked: bool = False  #: Edits are refused
+    is_hidden: bool = False  #: The landmark is not shown in the scene and the views
+    decision: str = ''  #: Decision in the review: accepted, fixed; '' without a decision
 
     @cached_property
     def details(self) -> LandmarkDetails:

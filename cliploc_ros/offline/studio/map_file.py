@@ -14,15 +14,16 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
 
 from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
+    concatenated,
     embeddings_path,
     load_landmark_embeddings,
     save_landmark_embeddings,
@@ -37,22 +38,13 @@ from cliploc_ros.core.map.parameter_file import (
     set_of,
 )
 from cliploc_ros.errors import MapError
-from cliploc_ros.files.storage import MAKE_ROOM, finish_set, read_file, replace_file
-from cliploc_ros.offline.studio.landmark import (
-    KNOWN_FIELDS,
-    Encoded,
-    Landmark,
-    Landmarks,
-    looks_of,
-    map_of,
-)
+from cliploc_ros.files.storage import finish_set, write_file
+from cliploc_ros.offline.studio.landmark import KNOWN_FIELDS, Landmark, Landmarks, map_of
 
 _PARAMETERS = 'ros__parameters'
 _GEOMETRY = ('center', 'semi_axes', 'orientation')
 _PLAIN = {*KNOWN_FIELDS, 'text', 'weight', '/**', _PARAMETERS, 'map', 'frame_id', 'landmarks'}
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-#: The digest of a file that does not exist.
-NO_FILE = ''
 
 
 @dataclass(frozen=True)
@@ -69,8 +61,8 @@ class MapFile:
 
     @property
     def digest(self) -> str:
-        """The digest of the text; NO_FILE without a file."""
-        return _digest_of(self.text.encode()) if self.text else NO_FILE
+        """The digest of the text; '' without a file."""
+        return hashlib.sha256(self.text.encode()).hexdigest() if self.text else ''
 
     @property
     def map_set(self) -> MapSet:
@@ -116,22 +108,13 @@ class MapFile:
                        'changed')
 
     def write(self) -> None:
-        """Write the file atomically; MapError: it cannot be written and is unchanged."""
-        try:
-            with replace_file(self.path) as partial:
-                partial.write_bytes(self.text.encode())
-        except OSError as error:
-            raise MapError(f'{self.path}: cannot be written: {error.strerror}; the file was not '
-                           f'changed: {MAKE_ROOM}') from error
+        """Write the file atomically; OptionsError: it cannot be written and is unchanged."""
+        write_file(self.path, lambda partial: partial.write_bytes(self.text.encode()))
 
-    def digest_on_disk(self) -> str:
-        """Return the digest of the current file on disk; NO_FILE without a file."""
-        try:
-            return _digest_of(read_file(self.path))
-        except FileNotFoundError:
-            return NO_FILE
-        except OSError as error:
-            raise MapError(f'{self.path}: {error.strerror}') from error
+
+def text_on_disk(path: Path) -> str:
+    """Return the text of a map file, '' if it does not exist; MapError: it cannot be read."""
+    return read_text(path) if os.path.exists(path) else ''  # noqa: PTH110 - never raises
 
 
 def read_map_file(path: Path) -> MapFile:
@@ -141,10 +124,9 @@ def read_map_file(path: Path) -> MapFile:
     accepted.
     """
     path = path.resolve()
-    if not os.path.exists(path):  # noqa: PTH110 - never raises
+    if not (text := text_on_disk(path)):
         return MapFile(path, '', '/**', {'/**': {_PARAMETERS: {'map': {
             'frame_id': 'map', 'landmarks': {}}}}})
-    text = read_text(path)
     finish_set(path, set_of(text).digest)
     tree = parse_parameters(text, path)
     node = find_map_node(tree, path)
@@ -158,10 +140,6 @@ def read_map_file(path: Path) -> MapFile:
     file = MapFile(path, text, node, tree)
     map_of(file.landmarks, found.get('frame_id') or '', str(path))
     return file
-
-
-def _digest_of(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
 
 
 def _says(text: str, tree: Mapping[str, Any]) -> bool:
@@ -271,62 +249,52 @@ def _flow(name: str, value: Any) -> str:
 
 # ---- the image embeddings -----------------------------------------------------------------------
 
-class LookFile(NamedTuple):
+@dataclass(frozen=True)
+class LookFile:
     """The file of image embeddings next to a map, with the looks by landmark id.
 
-    ``encoder_key`` is '' if the file is missing or unusable. ``state`` is the file's time and
-    size, to detect changes by other programs; None without a file.
+    ``encoder_key`` is '' if the file is missing or unusable.
     """
 
     path: Path
     encoder_key: str
-    looks: Mapping[str, Encoded]
-    state: tuple[int, int] | None
+    looks: Mapping[str, LandmarkEmbeddings]
     set_digest: str = ''  #: The digest in the head of the map, which edits keep
 
-    def write(self, landmarks: Landmarks) -> tuple['LookFile', str]:
-        """Write the looks of all landmarks of the map atomically.
+    def write(self, landmarks: Landmarks) -> 'LookFile':
+        """Write the looks of all landmarks of the map atomically, if they changed.
 
-        Looks of another encoder are left out. An unchanged file is not rewritten, and changes by
-        another program are not overwritten. Return the new file, and the reason if the looks were
-        not written, else ''. MapError: the file cannot be written.
+        Return the new file; MapError: it cannot be written.
         """
         known = {key: landmark.look for key, landmark in landmarks.items()
-                 if landmark.look is not None and landmark.look.encoder_key == self.encoder_key}
-        if not self.encoder_key or known == self.looks:
-            return self, ''
-        if _state_of(self.path) != self.state:
-            return self, (f'{self.path.name}: another program changed this file, so the studio '
-                          'does not write it; rebuild the map, or remove the file')
-        size = len(next(iter((*self.looks.values(), *known.values()))).mean)
-        nothing = Encoded(np.zeros(size, np.float16), np.empty((0, size), np.float16), '')
-        rows = [known.get(key, nothing) for key in landmarks]
-        save_landmark_embeddings(self.path, LandmarkEmbeddings(
-            self.encoder_key, tuple(landmarks), np.array([row.mean for row in rows]),
-            np.concatenate([row.medoids for row in rows]),
-            np.cumsum([0, *(len(row.medoids) for row in rows)]), self.set_digest))
-        return self._replace(looks=known, state=_state_of(self.path)), ''
+                 if landmark.look is not None}
+        is_same = known.keys() == self.looks.keys() and all(
+            known[key] is self.looks[key] for key in known)
+        if not self.encoder_key or is_same:
+            return self
+        size = next(iter((*self.looks.values(), *known.values()))).means.shape[1]
+        nothing = LandmarkEmbeddings(self.encoder_key, ('',), np.zeros((1, size), np.float16),
+                                     np.empty((0, size), np.float16), np.zeros(2, np.int64))
+        save_landmark_embeddings(self.path, replace(concatenated(
+            [known.get(key, nothing) for key in landmarks], list(landmarks)),
+            set_digest=self.set_digest))
+        return replace(self, looks=known)
 
 
 def read_look_file(file: MapFile) -> tuple[LookFile, str]:
     """Read the image embeddings next to a map; return also their fault, '' if they are valid."""
     path = embeddings_path(file.path)
-    nothing = LookFile(path, '', {}, _state_of(path))
-    if nothing.state is None:
-        return nothing, ''
+    if not os.path.exists(path):  # noqa: PTH110 - never raises
+        return LookFile(path, '', {}), ''
     try:
-        embeddings = load_landmark_embeddings(path)
-        check_set(embeddings.set_digest, file.map_set.digest)
-    except MapError as error:
-        return nothing, f'{error}. The studio does not change this file'
-    except ValueError as error:
-        return nothing, f'{path}: {error}. The studio does not change this file'
-    return nothing._replace(encoder_key=embeddings.encoder_key, looks=looks_of(embeddings),
-                            set_digest=embeddings.set_digest), ''
-
-
-def _state_of(path: Path) -> tuple[int, int] | None:
-    with suppress(OSError):
-        found = path.stat()
-        return found.st_mtime_ns, found.st_size
-    return None
+        found = load_landmark_embeddings(path)
+        check_set(found.set_digest, file.map_set.digest)
+    except (MapError, ValueError) as error:
+        text = str(error).removeprefix(f'{path}: ')
+        return LookFile(path, '', {}), f'{path}: {text}. The studio does not change this file'
+    offsets = found.medoid_offsets
+    looks = {key: LandmarkEmbeddings(
+        found.encoder_key, (key,), found.means[row:row + 1],
+        found.medoids[offsets[row]:offsets[row + 1]], offsets[row:row + 2] - offsets[row])
+        for row, key in enumerate(found.landmark_ids) if found.is_known[row]}
+    return LookFile(path, found.encoder_key, looks, found.set_digest), ''

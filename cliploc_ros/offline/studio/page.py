@@ -28,9 +28,7 @@ from cliploc_ros.offline.studio.layers import (
     Layers,
     draw_answers,
     draw_cameras,
-    draw_coverage,
     draw_keyframes,
-    draw_look_alikes,
     draw_robot,
 )
 from cliploc_ros.offline.studio.parts import parts_of, picture_of
@@ -86,7 +84,6 @@ class Page:
             self.desk.log('done', note)
         self._draw_cameras = draw_cameras(lambda view: self.desk.act(
             lambda: studio.show_view(view)))
-        self._draw_coverage = draw_coverage(lambda text: self.desk.log('done', text))
         self._redrawer = threading.Thread(target=self._redraw_always, daemon=True)
         self._redrawer.start()
         threading.Thread(target=self._load_cloud, args=(extent,), daemon=True).start()
@@ -160,19 +157,13 @@ class Page:
         self._selected.show(chosen, lambda class_id: _SELECTED_RGB)
         self._labels.show(shown if is_on('Labels') else {}, list(chosen))
         selected = None if document.selected is None else document.selected[1]
-        self._gizmo.show(None if selected is None or selected.marks.is_locked else selected)
+        self._gizmo.show(None if selected is None or selected.is_locked else selected)
         recording = None if studio.recording is None else studio.recording.detections
         show('Surfaces', self._cloud, draw_cloud, is_on('Surfaces', True))
         show('Walls', studio.walls, draw_walls, is_on('Walls', True))
         show('Cameras', recording, self._draw_cameras, is_on('Cameras', True))
         show('Keyframes', studio.layer, draw_keyframes, is_on('Keyframes', True))
         show('Answers', studio.answers or None, draw_answers)
-        # these layers are shown only in test mode
-        is_testing = 'test' in self.desk.modes.values()
-        if studio.places is not None:
-            self.desk.layers = {'Coverage': True, 'Look-alikes': True} | self.desk.layers
-        for name, draw in (('Coverage', self._draw_coverage), ('Look-alikes', draw_look_alikes)):
-            show(name, studio.places, draw, is_testing and is_on(name, True))
         if studio.live is not None:
             state = studio.live.state
             self._missing.show({key: document.landmarks[key] for key in state.missing

@@ -4,20 +4,19 @@
 
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.offline import page as html
 from cliploc_ros.offline.studio.desk import Desk
 from cliploc_ros.offline.studio.landmark import Landmark, shape_fields
-from cliploc_ros.offline.studio.layers import LEGEND
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.web import Content
 
 # Greatest number of outlines: more hide the image and delay a drag.
 _MAX_OUTLINES = 200
-_CROP_PX, _QUALITY = 160, 88
+_CROP_PX = 160
 # Greatest number of answers in the list after a run over the recording.
 _MAX_ANSWERS = 100
 
@@ -25,18 +24,18 @@ _MAX_ANSWERS = 100
 def parts_of(desk: Desk) -> dict[str, Any]:
     """Return the parts of the page by name."""
     studio, document = desk.studio, desk.studio.document
-    review, places = studio.review, studio.places
+    review = studio.review
     found = {
         'file': {
             'name': document.path.name, 'frame': document.frame_id, 'is_saved': document.is_saved,
             'notes': document.notes, 'undo': document.to_undo, 'redo': document.to_redo,
-            'conflict': bool(document.foreign), 'views': studio.views,
+            'conflict': document.has_conflict, 'views': studio.views,
             'step': 1 if studio.recording is None else studio.recording.film_step,
             'has_boxes': review.has_boxes, 'images': studio.recording is not None
             and studio.recording.images is not None,
             'classes': sorted({landmark.class_id for landmark in document.landmarks.values()})},
-        'rows': [[key, one.label, one.class_id, one.marks.is_locked, one.marks.is_hidden,
-                  review.severity(key), one.marks.decision,
+        'rows': [[key, one.label, one.class_id, one.is_locked, one.is_hidden,
+                  review.severity(key), one.decision,
                   '#{:02x}{:02x}{:02x}'.format(*studio.color_of(one.class_id))]
                  for key in review.order if (one := document.landmarks.get(key))],
         'selection': {'ids': document.selection, 'one': _selected_part(studio)},
@@ -46,9 +45,7 @@ def parts_of(desk: Desk) -> dict[str, Any]:
         'layers': desk.layers,
         'test': {
             'share': round(studio.share, 2), 'running': list(desk.running),
-            'is_stale': studio.is_stale,
-            'lines': [] if places is None else places.lines(studio.places_before),
-            'legend': [] if places is None else LEGEND,
+            'is_stale': studio.is_stale, 'has_page': bool(studio.check_page),
             'answers': [[view, one.verdict, None if one.error_m is None else round(one.error_m, 2),
                          one.reason] for view, one in list(studio.answers.items())[:_MAX_ANSWERS]],
             'robot': None if studio.live is None else studio.live.lines(document)}}
@@ -61,15 +58,14 @@ def _selected_part(studio: Studio) -> dict[str, Any] | None:
     if studio.document.selected is None:
         return None
     key, one = studio.document.selected
-    check, phrases = studio.review.check_of(key), studio.phrases(key)
-    sightings = studio.sightings(key)
+    check, sightings = studio.review.check_of(key), studio.sightings(key)
     return {
         'id': key, 'label': one.label, 'class_id': one.class_id,
-        'is_locked': one.marks.is_locked, 'decision': one.marks.decision,
+        'is_locked': one.is_locked, 'decision': one.decision,
         'center': one.center.tolist(), 'semi_axes': one.semi_axes.tolist(),
         'angles': [round(float(angle), 3) + 0.0 for angle in Rotation.from_quat(
             one.quat_xyzw).as_euler('xyz', degrees=True)],
-        'phrases': phrases.phrases, 'note': phrases.note, 'is_checked': check is not None,
+        'phrases': studio.phrases(key), 'is_checked': check is not None,
         'faults': () if check is None else check.faults,
         'support': None if check is None else check.support,
         'ratio': None if check is None else check.seen_ratio,
@@ -107,11 +103,13 @@ def _axes_of(ellipse: NDArray[np.float64]) -> list[float]:
 
 
 def picture_of(studio: Studio, path: str) -> Content | None:
-    """Return the image of a view, or a crop: /image/ANY/VIEW, /crop/ANY/VIEW/X,Y,X,Y.
+    """Return an image, a crop or the last check: /image/ANY/VIEW, /crop/ANY/VIEW/X,Y,X,Y, /check.
 
     CliplocError: an image cannot be read.
     """
     kind, *words = path.strip('/').split('/')
+    if kind == 'check' and studio.check_page:
+        return Content(studio.check_page.encode(), '.html', False)
     if studio.recording is None or kind not in ('image', 'crop'):
         return None
     try:
@@ -122,9 +120,4 @@ def picture_of(studio: Studio, path: str) -> Content | None:
         return None
     if image is None:
         return None
-    if kind == 'crop' and (large := max(image.shape) / _CROP_PX) > 1.0:
-        height, width = (max(1, round(side / large)) for side in image.shape[:2])
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    done, content = cv2.imencode('.jpg', image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    assert done
-    return Content(content.tobytes(), '.jpg', True)
+    return Content(html.jpeg_of(image, _CROP_PX if kind == 'crop' else None), '.jpg', True)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, shape_matrices
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.localizer import Localizer
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.association import associate
@@ -35,12 +36,17 @@ from cliploc_ros.offline.mapping.labelling import embed_landmarks
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.sightings import Sighting, find_sightings, outlines_in_view
+from cliploc_ros.offline.mapping.sightings import (
+    Sighting,
+    crop_around,
+    find_sightings,
+    outlines_in_view,
+)
 from cliploc_ros.offline.mapping.views import Views, make_views
 from cliploc_ros.offline.simulation import LabelModel
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.edits import Change, EditError
-from cliploc_ros.offline.studio.landmark import Encoded, Landmarks, looks_of, map_of
+from cliploc_ros.offline.studio.landmark import Landmarks, map_of
 
 #: Least number of boxes that determine an ellipsoid.
 LEAST_BOXES = 3
@@ -145,21 +151,17 @@ class Recording:
         image = self.image(view)
         if image is None or not np.isfinite(box).all():
             return None
-        around = _MARGIN * (box[2:] - box[:2]).max()
-        height, width = image.shape[:2]
-        left, top = np.clip(np.floor(box[:2] - around), 0, (width - 1, height - 1)).astype(int)
-        right, bottom = np.clip(np.ceil(box[2:] + around), (left + 1, top + 1), (width, height)
-                                ).astype(int)
-        return image[top:bottom, left:right]
+        return crop_around(image, box, _MARGIN)
 
-    def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> Encoded | None:
+    def look_of(self, rows: NDArray[np.int64], encoder_key: str) -> LandmarkEmbeddings | None:
         """Return the look by an encoder of the boxes `rows`; None without their embeddings."""
         detections = self.detections
-        if detections.encoder_key != encoder_key or detections.embeddings is None or not len(rows):
+        if detections.encoder_key != encoder_key or detections.embeddings is None:
             return None
         shown = np.full(len(detections.classes), -1, dtype=np.int64)
         shown[rows] = 0
-        return looks_of(embed_landmarks([''], detections, shown)).get('')
+        found = embed_landmarks([''], detections, shown)
+        return found if found.is_known.all() else None
 
     def refitted(self, landmarks: Landmarks, landmark_ids: Sequence[str]
                  ) -> tuple[Change, dict[str, str]]:
@@ -167,7 +169,7 @@ class Recording:
 
         EditError: a landmark is locked. MappingError: no landmark can be fitted.
         """
-        if locked := [key for key in landmark_ids if landmarks[key].marks.is_locked]:
+        if locked := [key for key in landmark_ids if landmarks[key].is_locked]:
             raise EditError(f"landmark '{locked[0]}' is locked: unlock it first")
         chosen = np.array([key in set(landmark_ids) for key in landmarks])
         # all landmarks take part, so that none gets the boxes of its neighbour

@@ -53,7 +53,7 @@ class ReviewQueue:
     def decision(self, landmark_id: str) -> str:
         """Return the decision on a landmark; '' without one, or after an undone deletion."""
         landmark = self._document.landmarks.get(landmark_id)
-        return 'deleted' if landmark is None else landmark.marks.decision
+        return 'deleted' if landmark is None else landmark.decision
 
     def severity(self, landmark_id: str) -> float:
         """Return the severity of the faults of a landmark; 0 after a decision on it."""

@@ -7,6 +7,7 @@ Every action returns a line with its result, or raises a CliplocError.
 
 import threading
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,16 +17,16 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.offline.evaluation.pages import check_page
+from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts, sample_frames
+from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.sightings import Sighting
 from cliploc_ros.offline.studio import edits
-from cliploc_ros.offline.studio.background import Background
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.landmark import Landmark, fields_of
+from cliploc_ros.offline.studio.landmark import Landmark, Landmarks, fields_of
 from cliploc_ros.offline.studio.new_landmark import NewLandmark
-from cliploc_ros.offline.studio.phrases import FoundPhrases, PhraseFinder
-from cliploc_ros.offline.studio.places import Coverage, find_places
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.review import ReviewQueue
 from cliploc_ros.offline.studio.walls import Walls
@@ -42,7 +43,7 @@ _PALETTE: tuple[Rgb, ...] = (
     (0, 190, 190), (255, 110, 130), (120, 190, 32), (70, 90, 255), (0, 105, 92), (128, 0, 40),
     (190, 140, 255), (90, 70, 0), (120, 200, 255), (20, 40, 110), (255, 170, 120), (0, 220, 130),
     (110, 110, 110), (180, 70, 0))
-_PENDING = FoundPhrases((), 'CLIP is searching for phrases; these are from the map')
+_MAX_PHRASES = 5
 
 
 class Studio:
@@ -59,22 +60,24 @@ class Studio:
         The selected view.
     answers : dict of int to Trial
         The relocalizer's answers that are shown, by view. Edits do not change them.
-    places, places_before : Coverage
-        Results of the last two searches of places.
+    check_page : str
+        The HTML page of the last check, '' without one.
     share : float
-        Completed share of a search of places, 0 to 1.
+        Completed share of a stage of the check, 0 to 1.
     """
 
     ACTIONS = ('select', 'edit', 'lock', 'hide', 'delete', 'split', 'merge', 'refit', 'refit_all',
-               'show_view', 'next_view', 'stop_search')
+               'show_view', 'next_view', 'stop_check')
     #: Slow actions, which lock the document only while they need it.
-    SLOW_ACTIONS = ('relocalize_here', 'relocalize_all', 'search_places', 'relocalize_robot',
+    SLOW_ACTIONS = ('relocalize_here', 'relocalize_all', 'check_map', 'relocalize_robot',
                     'reload_robot')
 
+    #: Options of the check, which then takes about a minute.
+    CHECK = CheckOptions(max_positions=100, headings=8, frames=60)
+
     def __init__(self, document: Document, recording: Recording | None = None,
-                 finder: PhraseFinder | None = None, layer: KeyframeLayer | None = None,
-                 walls: Walls | None = None):
-        self.document, self.recording, self.finder = document, recording, finder
+                 layer: KeyframeLayer | None = None, walls: Walls | None = None):
+        self.document, self.recording = document, recording
         self.layer, self.walls = layer, walls
         self.live: LiveRelocalizer | None = None
         self.changed = document.changed
@@ -84,13 +87,14 @@ class Studio:
         self.answers: dict[int, Trial] = {}
         # counts of the last run over the whole recording, by verdict
         self._counts: dict[str, int] = {}
-        self.places: Coverage | None = None
-        self.places_before: Coverage | None = None
-        self.share = 0.0
+        self.check_page, self.share = '', 0.0
+        self._checked: Landmarks = {}
         self._stopped = threading.Event()
-        self._found_phrases = Background[FoundPhrases](self.changed.set)
-        self._found_sightings = Background[list[Sighting]](self.changed.set)
-        self._sightings: tuple[str, list[Sighting] | None] = '', None
+        self._searcher = ThreadPoolExecutor(1)
+        # the last search of sightings: id and fields of its landmark; the last result
+        self._search: Future[None] | None = None
+        self._wanted: tuple[str, str] = '', ''
+        self._sightings: tuple[str, list[Sighting]] = '', []
         self._colors: dict[str, Rgb] = {}
         for class_id in sorted({landmark.class_id for landmark in document.landmarks.values()}):
             self.color_of(class_id)
@@ -100,8 +104,7 @@ class Studio:
     def stop(self) -> None:
         """Stop the searches."""
         self._stopped.set()
-        self._found_phrases.stop()
-        self._found_sightings.stop()
+        self._searcher.shutdown(cancel_futures=True)
 
     # ---- views ----------------------------------------------------------------------------------
 
@@ -141,23 +144,25 @@ class Studio:
         self.show_view(self.new.next_view())
 
     def sightings(self, landmark_id: str) -> list[Sighting] | None:
-        """Return the best views of a landmark; None while they are computed."""
+        """Return the best views of a landmark; None until a thread has found any."""
         recording, landmarks = self.recording, self.document.landmarks
-        known = self._sightings[1] if landmark_id == self._sightings[0] else None
+        wanted = landmark_id, str(landmarks[landmark_id].fields)
+
+        def find() -> None:
+            try:
+                found = recording.sightings(landmarks, landmark_id) if recording else []
+            except CliplocError:  # an image cannot be read; the view reports it
+                found = []
+            self._sightings = landmark_id, found
+            self.changed.set()
+
         # during a drag, the views are not updated
-        if recording is not None and (known is None or not self.document.is_in_gesture):
-
-            def find() -> list[Sighting]:
-                try:
-                    return recording.sightings(landmarks, landmark_id)
-                except CliplocError:  # an image cannot be read; the view reports it
-                    return []
-
-            found = self._found_sightings.ask(
-                (landmark_id, str(landmarks[landmark_id].fields)), find)
-            known = known if found is None else found
-            self._sightings = landmark_id, known
-        return known
+        is_dragged = self.document.is_in_gesture and self._wanted[0] == landmark_id
+        if recording is not None and wanted != self._wanted and not is_dragged:
+            if self._search is not None:
+                self._search.cancel()  # unless it has begun
+            self._wanted, self._search = wanted, self._searcher.submit(find)
+        return self._sightings[1] if self._sightings[0] == landmark_id else None
 
     def color_of(self, class_id: str) -> Rgb:
         """Return the colour of a class. The first twenty classes of a map differ in colour."""
@@ -168,7 +173,7 @@ class Studio:
     def shown(self) -> dict[str, Landmark]:
         """Return the landmarks that are not hidden."""
         return {key: landmark for key, landmark in self.document.landmarks.items()
-                if not landmark.marks.is_hidden}
+                if not landmark.is_hidden}
 
     def select(self, id: str, joins: bool = False) -> None:
         """Select a landmark, or toggle it in the selection."""
@@ -217,7 +222,7 @@ class Studio:
                                     and all(isinstance(key, str) for key in ids)):
             raise EditError(f'{on[0]}: expected a list of ids, not {ids!r:.60}')
         ids, landmarks = ids or self.document.chosen(), self.document.landmarks
-        have_it = all(getattr(landmarks[key].marks, name) for key in ids if key in landmarks)
+        have_it = all(getattr(landmarks[key], name) for key in ids if key in landmarks)
         what, past = off if have_it else on
         self.document.edit(edits.mark, ids, what, **{name: not have_it})
         return f'{past} {", ".join(ids)}'
@@ -245,7 +250,7 @@ class Studio:
     def refit_all(self) -> str:
         """Fit all unlocked landmarks to their boxes."""
         return self._refit([key for key, landmark in self.document.landmarks.items()
-                            if not landmark.marks.is_locked])
+                            if not landmark.is_locked])
 
     def _refit(self, landmark_ids: Sequence[str]) -> str:
         change, reasons = self.seen().refitted(self.document.landmarks, landmark_ids)
@@ -282,37 +287,47 @@ class Studio:
                            for verdict, count in self._counts.items())
         return f'{len(answers)} views: {counts}; similarities are simulated'
 
-    def search_places(self) -> None:
-        """Find where a robot would be accepted in the map, and places that look alike.
+    def check_map(self) -> str:
+        """Check the map as the program check_map does, at fewer positions; make its page.
 
-        CliplocError: the map is empty, or the search was stopped; the last result is kept. After
-        a stop, call ``allow_search`` before the next search.
+        CliplocError: the map is empty, or the check was stopped; the last page is kept. After a
+        stop, call ``allow_check`` before the next check.
         """
-        self.share = 0.0
+        # imported late, since matplotlib takes a second
+        from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
 
-        def tell(share: float) -> None:
+        def tell(stage: str, share: float) -> None:
             if self._stopped.is_set():
-                raise CliplocError('the search was stopped')
-            if share - self.share >= 0.01:
-                self.share = share
-                self.changed.set()
+                raise CliplocError('the check was stopped')
+            self.share = share
+            self.changed.set()
 
-        found = find_places(self.document.landmarks, self.recording, self.places, tell,
-                            layer=self.layer)
-        self.places_before, self.places = self.places, found
+        tell('', 0.0)
+        with self.document.lock:
+            landmarks, landmark_map = self.document.landmarks, self.document.to_map()
+        detections, view_of = None, None
+        if self.recording is not None and self.review.has_boxes:
+            detections = self.recording.detections
+            view_of = ViewPainter(landmark_map, detections, self.recording.image).of
+        report = check_map(landmark_map, detections, options=self.CHECK, progress=tell,
+                           layer=self.layer)
+        self.check_page = check_page(self.document.path.name, report,
+                                     draw_pictures(landmark_map, report), view_of)
+        self._checked = landmarks
+        return '; '.join([f'checked the map: {report.verdict}', *report.localized])
 
-    def stop_search(self) -> None:
-        """Stop the search of places."""
+    def stop_check(self) -> None:
+        """Stop the check of the map."""
         self._stopped.set()
 
-    def allow_search(self) -> None:
-        """Allow the next search of places; only later calls of ``stop_search`` stop it."""
+    def allow_check(self) -> None:
+        """Allow the next check of the map; only later calls of ``stop_check`` stop it."""
         self._stopped.clear()
 
     @property
     def is_stale(self) -> bool:
-        """Return whether the map was edited since the last search of places."""
-        return self.places is not None and fields_of(self.places.landmarks) != fields_of(
+        """Return whether the map was edited since the last check."""
+        return bool(self.check_page) and fields_of(self._checked) != fields_of(
             self.document.landmarks)
 
     def relocalize_robot(self) -> str:
@@ -329,15 +344,10 @@ class Studio:
             raise EditError('no relocalizer is connected: start the studio with --ros')
         return self.live
 
-    def phrases(self, landmark_id: str) -> FoundPhrases:
-        """Return up to five phrases for a landmark, of CLIP, or without CLIP, of the map."""
-        landmarks, finder = self.document.landmarks, self.finder
-        landmark = landmarks[landmark_id]
-        found = FoundPhrases((), '') if finder is None else self._found_phrases.ask(
-            (landmark_id, landmark.class_id, landmark.details.class_weights, landmark.look),
-            lambda: finder.find(landmarks, landmark_id)) or _PENDING
+    def phrases(self, landmark_id: str) -> list[str]:
+        """Return up to five labels for a landmark: its own, and those of its class in the map."""
+        landmarks, landmark = self.document.landmarks, self.document.landmarks[landmark_id]
         own = sorted(landmark.details.labels or (), key=lambda pair: -pair[1])
         alike = [other.label for other in landmarks.values()
                  if other.class_id == landmark.class_id and other.label != landmark.label]
-        return found if found.phrases else found._replace(
-            phrases=tuple(dict.fromkeys([text for text, _ in own] + alike))[:5])
+        return list(dict.fromkeys([text for text, _ in own] + alike))[:_MAX_PHRASES]

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
-from scipy.spatial.transform import Rotation
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from cliploc_ros.offline.mapping.check.places import RADIUS_M, LookAlike
 from cliploc_ros.offline.mapping.check.relocalization import Trial, refused_spans
@@ -26,9 +26,8 @@ _FEW_LANDMARKS = 3
 # More views are needed if landmarks have fewer frames (median) and more than this share of the
 # boxes belongs to none. Chosen, between maps of fr3 from every 10th and from every 30th frame.
 _FEW_FRAMES, _MANY_UNEXPLAINED = 12, 0.12
-# A wrong pose within this distance of the pose that a look-alike implies is due to the look-alike
-# [m]. Chosen.
-_SAME_POSE_M = 1.0
+# Places nearer to each other are one place that looks the same from two sides [m]. Chosen.
+_SAME_PLACE_M = 1.0
 # The remedy for each cause of a systematic error of the boxes.
 _REMEDIES = {
     'intrinsics': 'calibrate the camera and map again',
@@ -40,17 +39,18 @@ _SIGHT_M = 2.0 * RADIUS_M
 
 def give_advice(report: CheckReport) -> list[Advice]:
     """Return pieces of advice, each of one or two sentences."""
-    advice = [*_on_scale(report), *_on_look_alikes(report), *_on_landmarks(report),
-              *_on_corrections(report), *_on_misled(report), *_on_spans(report),
-              *_on_grid(report)]
+    recorded = report.recording.trials if report.recording else ()
+    misled = [trial for trial in (*recorded, *report.queries, *report.grid.trials)
+              if trial.verdict == 'misled']
+    advice = [] if report.scale is None else [Advice(
+        f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
+        f'{"large" if report.scale > 1.0 else "small"} by the sizes of its objects: '
+        'check the unit of the poses, then the intrinsics')]
+    advice += _some([_on_look_alike(pair, misled) for pair in report.look_alikes],
+                    'pairs of places that look alike')
+    advice += [*_on_landmarks(report), *_on_corrections(report), *_on_misled(report, misled),
+               *_on_spans(report, recorded), *_on_grid(report)]
     return advice or [Advice('nothing to do: the map reaches all thresholds that were checked')]
-
-
-def _on_scale(report: CheckReport) -> Iterator[Advice]:
-    if report.scale is not None:
-        yield Advice(f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
-                     f'{"large" if report.scale > 1.0 else "small"} by the sizes of its objects: '
-                     'check the unit of the poses, then the intrinsics')
 
 
 def _some(advice: Sequence[Advice], what: str) -> list[Advice]:
@@ -59,22 +59,19 @@ def _some(advice: Sequence[Advice], what: str) -> list[Advice]:
     return [*advice[:_MOST_OF_A_KIND], *[Advice(f'and {more} more {what}')] * (more > 0)]
 
 
-def _on_look_alikes(report: CheckReport) -> list[Advice]:
-    texts = []
-    for pair in report.look_alikes:
-        matched = len(pair.matched)
-        what_to_do = ('their labels are equal, so nothing tells them apart: map an object that '
-                      'only one of them has') if pair.same_labels == matched else (
-            f'{matched - pair.same_labels} labels differ: make sure that they are right')
-        mistaken = sum(_takes_for(trial, pair) for trial in _misled(report))
-        distance_m = np.hypot(pair.first[0] - pair.second[0], pair.first[1] - pair.second[1])
-        alike = (f'the place around {_place(pair.first)} looks the same when turned by '
-                 f'{abs(pair.turn_deg):.0f} degrees') if distance_m < _SAME_POSE_M else (
-            f'the places around {_place(pair.first)} and {_place(pair.second)} look alike')
-        views = f', {mistaken} views are accepted in the wrong one' if mistaken else ''
-        texts.append(Advice(f'{alike} ({matched} of {pair.landmarks} landmarks){views}: '
-                            f'{what_to_do}', pair.matched[0] if pair.matched else ()))
-    return _some(texts, 'pairs of places that look alike')
+def _on_look_alike(pair: LookAlike, misled: Sequence[Trial]) -> Advice:
+    matched = len(pair.matched)
+    what_to_do = ('their labels are equal, so nothing tells them apart: map an object that '
+                  'only one of them has') if pair.same_labels == matched else (
+        f'{matched - pair.same_labels} labels differ: make sure that they are right')
+    mistaken = sum(_sees_double(trial.position, [pair]) for trial in misled)
+    alike = (f'the place around {_place(pair.first)} looks the same when turned by '
+             f'{abs(pair.turn_deg):.0f} degrees'
+             if np.hypot(*np.subtract(pair.first, pair.second)[:2]) < _SAME_PLACE_M else
+             f'the places around {_place(pair.first)} and {_place(pair.second)} look alike')
+    return Advice(f'{alike} ({matched} of {pair.landmarks} landmarks)'
+                  + (f', {mistaken} views near them are misled' if mistaken else '')
+                  + f': {what_to_do}', pair.matched[0] if pair.matched else ())
 
 
 def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
@@ -114,9 +111,8 @@ def _on_corrections(report: CheckReport) -> Iterator[Advice]:
     yield Advice(f'{_REMEDIES[best.cause]}: the boxes fit better if you change {changes}{then}')
 
 
-def _on_misled(report: CheckReport) -> Iterator[Advice]:
-    wrong = [trial for trial in _misled(report)
-             if not any(_takes_for(trial, pair) for pair in report.look_alikes)]
+def _on_misled(report: CheckReport, misled: Sequence[Trial]) -> Iterator[Advice]:
+    wrong = [trial for trial in misled if not _sees_double(trial.position, report.look_alikes)]
     for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))[:_MOST_MISLED]:
         yield Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be '
                      f'misled by {trial.error_m:.1f} m: raise the parameter min_confidence, or '
@@ -125,9 +121,8 @@ def _on_misled(report: CheckReport) -> Iterator[Advice]:
         yield Advice(f'and {len(wrong) - _MOST_MISLED} more views that mislead a robot')
 
 
-def _on_spans(report: CheckReport) -> Iterator[Advice]:
+def _on_spans(report: CheckReport, trials: Sequence[Trial]) -> Iterator[Advice]:
     """Yield advice on runs of refused frames, once for each side of a place."""
-    trials = report.recording.trials if report.recording else ()
     middles: list[Trial] = []
     for run in refused_spans(trials):
         middle, seen = run[len(run) // 2], int(np.median([trial.landmarks for trial in run]))
@@ -138,7 +133,7 @@ def _on_spans(report: CheckReport) -> Iterator[Advice]:
         middles.append(middle)
         if len(middles) > _MOST_OF_A_KIND:
             return
-        if seen <= _FEW_LANDMARKS or not _sees_double(middle.position, report):
+        if seen <= _FEW_LANDMARKS or not _sees_double(middle.position, report.look_alikes):
             what = 'record this side' if seen <= _FEW_LANDMARKS else (
                 'describe these objects better in their labels, or record this side again')
             yield Advice(
@@ -151,7 +146,8 @@ def _on_grid(report: CheckReport) -> Iterator[Advice]:
     """Yield advice on areas without an accepted heading, and on those without a keyframe."""
     grid, keyframes = report.grid, report.keyframes
     for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
-        if np.mean([_sees_double(position, report) for position in grid.positions[rows]]) <= 0.5:
+        if np.mean([_sees_double(position, report.look_alikes)
+                    for position in grid.positions[rows]]) <= 0.5:
             reached = keyframes is not None and (keyframes.headings[rows] > 0).all()
             yield Advice(
                 f'no heading is accepted by objects at {_area(grid, rows)}'
@@ -166,41 +162,19 @@ def _on_grid(report: CheckReport) -> Iterator[Advice]:
             for rows in _areas(grid, keyframes.without)], 'areas that no keyframe reaches')
 
 
-def _misled(report: CheckReport) -> list[Trial]:
-    trials = [*(report.recording.trials if report.recording else ()), *report.queries,
-              *report.grid.trials]
-    return [trial for trial in trials if trial.verdict == 'misled']
-
-
-def _takes_for(trial: Trial, pair: LookAlike) -> bool:
-    """Return whether a wrong pose confuses two places that look alike."""
-    if trial.estimate is None:
-        return False
-    for here, there, turn_deg in ((pair.first, pair.second, pair.turn_deg),
-                                  (pair.second, pair.first, -pair.turn_deg)):
-        turn = Rotation.from_euler('z', turn_deg, degrees=True)
-        mistaken = turn.apply(trial.position - np.array(here)) + np.array(there)
-        if np.linalg.norm(mistaken - trial.estimate) < _SAME_POSE_M:
-            return True
-    return False
-
-
-def _sees_double(position: NDArray[np.float64], report: CheckReport) -> bool:
+def _sees_double(position: NDArray[np.float64], pairs: Sequence[LookAlike]) -> bool:
     """Return whether a camera is near a place that looks like another one."""
     return any(np.hypot(position[0] - place[0], position[1] - place[1]) < _SIGHT_M
-               for pair in report.look_alikes for place in (pair.first, pair.second))
+               for pair in pairs for place in (pair.first, pair.second))
 
 
 def _areas(grid: GridCheck, dead: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Group rows of a grid into areas of neighbours, the largest first."""
-    if len(dead) == 0:
+    if not len(dead):
         return []
-    cells = np.round((grid.positions[:, :2] - grid.positions[:, :2].min(axis=0))
-                     / grid.spacing_m).astype(np.int64)
-    picture = np.zeros(cells.max(axis=0) + 1, dtype=np.bool_)
-    picture[cells[dead, 0], cells[dead, 1]] = True
-    areas, count = label(picture)
-    found = [dead[areas[cells[dead, 0], cells[dead, 1]] == number + 1] for number in range(count)]
+    tree = cKDTree(grid.positions[dead])
+    count, areas = connected_components(tree.sparse_distance_matrix(tree, 1.2 * grid.spacing_m))
+    found = [dead[areas == number] for number in range(count)]
     return sorted((rows for rows in found if len(rows) >= _MIN_SPAN), key=len, reverse=True)
 
 

@@ -9,9 +9,9 @@ independent question to a new localizer, such as that of a robot that wakes up t
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,12 +176,6 @@ class Trial:
     by_objects: Verdict | None = None
     is_judged: bool = True
     result: Relocalization | None = None  #: The complete result
-    def as_dict(self) -> dict[str, Any]:
-        """Return the trial as plain values, for JSON, without the complete result."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)
-                  if field.name != 'result'}
-        return {name: value.round(4).tolist() if isinstance(value, np.ndarray) else value
-                for name, value in values.items()}
 
 
 def simulated(detections: PosedDetections, frame: int, shown: NDArray[np.int64],

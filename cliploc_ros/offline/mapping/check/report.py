@@ -3,8 +3,8 @@
 """The result of a check: figures, verdict and advice."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,19 +101,6 @@ class RecordingCheck:
         """Return whether other parts of the recording show the landmarks of most boxes, too."""
         return 2 * self.held_out.boxes >= self.as_given.boxes
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the check as plain values, for JSON."""
-        return {
-            'frames': self.frames, 'boxes': self.boxes, 'duration_s': self.duration_s,
-            'as_given': asdict(self.as_given), 'held_out': asdict(self.held_out),
-            'folds': [asdict(fold) for fold in self.folds], 'edge_scale': self.edge_scale,
-            'verdicts': count_verdicts(self.trials),
-            'verdicts_by_objects': count_by_objects(self.trials),
-            'judged_frames': len(self.judged),
-            'verdicts_with_simulated_boxes': count_verdicts(self.simulated),
-            'corrections': [asdict(correction) for correction in self.corrections],
-            'trials': [trial.as_dict() for trial in self.trials]}
-
 
 @dataclass(frozen=True)
 class GridCheck(Grid):
@@ -142,20 +129,6 @@ class GridCheck(Grid):
         near = self.accepted[self.is_near]
         return float((near > 0).mean()) if len(near) else 0.0
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the check as plain values, for JSON."""
-        return {
-            'headings': self.headings, 'spacing_m': self.spacing_m,
-            'accepted_positions_near_recording': self.accepted_positions,
-            'verdicts': count_verdicts(self.trials),
-            'positions': [
-                {'x_y_z': row, 'near_recording': bool(near), 'accepted': int(accepted),
-                 'misled': int(misled), 'expected_detections': visible.round(2).tolist()}
-                for row, near, accepted, misled, visible in zip(
-                    self.positions.round(3).tolist(), self.is_near, self.accepted,
-                    self.misled, self.visible, strict=True)],
-            'misled': [trial.as_dict() for trial in self.trials if trial.verdict == 'misled']}
-
 
 @dataclass(frozen=True)
 class KeyframeCheck:
@@ -178,29 +151,6 @@ class KeyframeCheck:
         """Return the share of the grid positions near the recording with a heading in reach."""
         near = int(self.grid.is_near.sum())
         return 1.0 - len(self.without) / near if near else 0.0
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the check as plain values, for JSON."""
-        return {
-            'keyframes': self.keyframes, 'points': self.points,
-            'recorded_frames_in_reach': float(self.recorded.mean()) if len(self.recorded)
-            else None,
-            'positions_in_reach_near_recording': self.reached_positions,
-            'positions_without': self.grid.positions[self.without].round(3).tolist()}
-
-
-class Carried(NamedTuple):
-    """Numbers of recorded frames or positions by the evidence that localizes a robot there."""
-
-    what: str
-    by_objects: int
-    by_keyframes: int  #: By keyframes only
-    not_at_all: int
-
-    def __str__(self) -> str:
-        """Describe the numbers in words."""
-        return (f'{sum(self[1:])} {self.what}: {self.by_objects} localized by objects, '
-                f'{self.by_keyframes} by keyframes only, {self.not_at_all} not localized')
 
 
 @dataclass(frozen=True)
@@ -230,14 +180,14 @@ class CheckReport:
         return 'passed' if not missed else 'keyframes only' if missed == [BY_OBJECTS] else 'failed'
 
     @property
-    def carried(self) -> tuple[Carried, ...]:
-        """Return the numbers of frames and positions that localize a robot, by evidence."""
-        found = [carried_positions(self.grid, self.keyframes)]
+    def localized(self) -> tuple[str, ...]:
+        """Return how many frames and positions localize a robot, by evidence, as sentences."""
+        found = [tell_positions(self.grid, self.keyframes)]
         if self.recording is not None and (judged := self.recording.judged):
-            objects = count_by_objects(judged)['accepted']
-            accepted = count_verdicts(judged)['accepted']
-            found.insert(0, Carried('recorded frames', objects, max(0, accepted - objects),
-                                    len(judged) - max(accepted, objects)))
+            found.insert(0, _tell_localized(
+                'recorded frames',
+                np.array([(trial.by_objects or trial.verdict) == 'accepted' for trial in judged]),
+                np.array([trial.verdict == 'accepted' for trial in judged])))
         return tuple(found)
 
     @property
@@ -299,34 +249,18 @@ class CheckReport:
                    if landmark.severity >= SERIOUS) / sum(
             landmark.weight for landmark in self.landmarks)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain values, for JSON."""
-        return {
-            'passed': self.passed, 'verdict': self.verdict,
-            'carried': [carried._asdict() for carried in self.carried],
-            'scale_by_sizes': self.scale,
-            'failures': list(self.failures), 'advice': list(self.advice),
-            'notes': list(self.notes), 'faulty_landmarks': self.faulty,
-            'duplicates': self.duplicates,
-            'landmarks': [asdict(landmark) for landmark in self.landmarks],
-            'overlaps': [{'first': self.map_ids[overlap.first],
-                          'second': self.map_ids[overlap.second],
-                          'distance': overlap.distance, 'is_duplicate': overlap.is_duplicate}
-                         for overlap in self.overlaps],
-            'look_alikes': [asdict(look_alike) for look_alike in self.look_alikes],
-            'grid': self.grid.as_dict(),
-            'recording': None if self.recording is None else self.recording.as_dict(),
-            'queries': [query.as_dict() for query in self.queries],
-            'keyframes': None if self.keyframes is None else self.keyframes.as_dict()}
+
+def tell_positions(grid: GridCheck, keyframes: KeyframeCheck | None) -> str:
+    """Return how many grid positions near the recording localize a robot, by evidence."""
+    by_objects = grid.accepted > 0
+    reached = by_objects if keyframes is None else by_objects | (keyframes.headings > 0)
+    return _tell_localized('positions', by_objects[grid.is_near], reached[grid.is_near])
 
 
-def carried_positions(grid: GridCheck, keyframes: KeyframeCheck | None) -> Carried:
-    """Count the grid positions near the recording by the evidence that localizes a robot there."""
-    by_objects = grid.accepted[grid.is_near] > 0
-    reached = np.zeros(len(by_objects), dtype=np.bool_) if keyframes is None else (
-        keyframes.headings[grid.is_near] > 0)
-    return Carried('positions', int(by_objects.sum()), int((reached & ~by_objects).sum()),
-                   int((~reached & ~by_objects).sum()))
+def _tell_localized(what: str, by_objects: NDArray[np.bool_], by_any: NDArray[np.bool_]) -> str:
+    by_any = by_any | by_objects
+    return (f'{len(by_any)} {what}: {by_objects.sum()} localized by objects, '
+            f'{(by_any & ~by_objects).sum()} by keyframes only, {(~by_any).sum()} not localized')
 
 
 def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:

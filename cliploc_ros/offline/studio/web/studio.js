@@ -212,7 +212,6 @@ function showCard() {
     field('Label', [one.label], set('label'), {isText: true, ...off}),
     mode === 'edit' && one.phrases.length ? el('div', {className: 'chips'}, ...one.phrases.map(
       text => button(text, () => set('label')(text), {off: one.is_locked, hint: text}))) : null,
-    note(one.note),
     field('Class', [one.class_id], set('class_id'), {isText: true, list: 'classes', ...off}),
     ...(mode !== 'edit' ? [] : [
       field('Position', one.center, set('center'), off),
@@ -292,13 +291,11 @@ const PANELS = {
     return [
       buttons(button('Relocalize the recording', doing('relocalize_all'), {kind: 'main', off: !views || is('relocalize_all')}),
               button('Relocalize here', doing('relocalize_here'), {off: !views}),
-              is('search_places') ? button('Stop', doing('stop_search'), {kind: 'danger'})
-                : button('Coverage and look-alikes', doing('search_places'), {hint: 'simulate views all over the map; takes up to a minute'})),
-      is('search_places') ? el('progress', {max: 1, value: test.share}) : null,
-      test.is_stale ? note('These are results of the map before the last edits: search again.') : null,
-      ...test.lines.map(note),
-      ...test.legend.map(([color, text]) => el('div', {}, el('span', {style: `color:${color}`}, '■ '), text)),
-      ...['Coverage', 'Look-alikes'].filter(name => name in state.layers).map(layerBox),
+              is('check_map') ? button('Stop', doing('stop_check'), {kind: 'danger'})
+                : button('Coverage and look-alikes', doing('check_map'), {hint: 'check the map, with simulated views all over it; takes a minute'}),
+              test.has_page ? button('Open the check', () => window.open(`${base}check`)) : null),
+      is('check_map') ? el('progress', {max: 1, value: test.share}) : null,
+      test.is_stale ? note('The check is of the map before the last edits: check again.') : null,
       test.answers.length ? el('div', {className: 'answers'}, ...test.answers.map(([view, verdict, error, reason]) =>
         button(`view ${view}: ${verdict}${error === null ? '' : `, off by ${error} m`}${reason ? `; ${reason}` : ''}`, doing('show_view', {view})))) : null,
       ...(test.robot ? [el('hr'), ...test.robot.map(note),

@@ -1,20 +1,23 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write the files of a check: figures as JSON, and a page with the main results first.
+"""Write the page that compares methods, and page and figures of the check of a map.
 
-Each piece of advice has an image of the recording: the best view of a landmark, or the nearest
-view.
+Both begin with the main results. Each piece of advice on a map has an image of the recording: the
+best view of a landmark, or the nearest view.
 """
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cliploc_ros.files.storage import write_text
 from cliploc_ros.offline import page as html
-from cliploc_ros.offline.evaluation.map_check.views import ViewPainter
+from cliploc_ros.offline.evaluation.summary import Summary, find_best
 from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts
 from cliploc_ros.offline.mapping.check.report import (
@@ -27,18 +30,119 @@ from cliploc_ros.offline.mapping.check.report import (
     share,
 )
 
-PAGE, DATA = 'check.html', 'check.json'
-LOOK_ALIKE = '#CC79A7'
-VERDICT_COLORS = {'accepted': html.ACCEPTED, 'refused': html.REFUSED, 'misled': html.MISLED}
-GRADE_COLORS = {'faulty': html.MISLED, 'minor': html.REFUSED, 'sound': '#009E73'}
-GRADE_NAMES = {'faulty': 'serious fault', 'minor': 'minor fault', 'sound': 'sound'}
-_MOST_LANDMARKS = 300
-_MOST_MATCHED = 12
+COMPARISON = 'report.html'
+CHECK, CHECK_DATA = 'check.html', 'check.json'
+_TOP_VIEW = 'top_view'
+# Columns of the table on the first screen: method, success, accepted, false accepts.
+_BRIEF = (0, 1, 2, 5, 7)
+CAPTIONS = {
+    _TOP_VIEW: 'Top view of the map. A line joins each estimate of this method to the true pose.',
+    'success_over_threshold': 'Share of poses, accepted or not, within a distance of the truth.',
+    'precision_over_recall': 'Precision and recall for all thresholds of the confidence.',
+    'best_iteration': 'Iteration that found the best pose.',
+    'success_over_iterations': 'Success over the number of iterations.'}
+#: Returns the JPEG and the caption of the image beside a piece of advice.
+ViewOf = Callable[[Advice], tuple[bytes, str] | None]
+#: Words and colour of each grade of a landmark.
+GRADES = {'faulty': ('serious fault', html.MISLED), 'minor': ('minor fault', html.REFUSED),
+          'sound': ('sound', '#009E73')}
+_MOST_LANDMARKS, _MOST_MATCHED = 300, 12
 # Numbers of figures and of pieces of advice on the first screen.
 _NUMBERS, FIRST_ADVICE = 3, 3
 # Beginnings of the names of figures in large type, the most important first.
 _TELLING = ('recorded frames accepted by', 'positions with a heading accepted',
             'views that mislead a robot', 'landmarks with a serious fault')
+
+
+# ---- methods ------------------------------------------------------------------------------------
+
+def write_comparison(folder: Path, summaries: Sequence[Summary], rows: Sequence[Sequence[str]],
+                     remarks: Sequence[str], pictures: Sequence[Path],
+                     about: Sequence[tuple[str, str]]) -> None:
+    """Write the page of `evaluate`. It embeds the pictures, which are PNG files.
+
+    `rows` are those of the table, its header first; `about` names and values of input and options.
+    """
+    best = find_best(summaries)
+    wrong, count = best.false_accepts(), best.errors_m.size
+    said = html.verdict(f'{best.method} is the best of {len(summaries)} methods on '
+                        f'{len(best.queries)} images' if len(summaries) > 1 else
+                        f'{best.method} on {len(best.queries)} images', not wrong)
+    numbers = [(f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True)]
+    if not best.is_given:
+        numbers += [
+            (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
+            (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)]
+    drawn = {picture.stem: html.figure(picture.read_bytes(), CAPTIONS[picture.stem], picture.stem)
+             for picture in pictures}
+    head, *brief = [[row[column] for column in _BRIEF] for row in rows]
+    top_view = drawn.pop(_TOP_VIEW, '')
+    write_text(folder / COMPARISON, html.page(
+        'Evaluation',
+        html.first_screen([said, html.tiles(numbers), html.table(head, brief)], [top_view]),
+        html.fold('Complete table', html.table(rows[0], rows[1:]), *map(html.note, remarks)),
+        html.fold('Input and options', html.table(('', ''), about)),
+        html.fold('Figures', html.side_by_side(drawn.values()), is_open=True)))
+
+
+# ---- a map --------------------------------------------------------------------------------------
+
+def write_check(folder: Path, name: str, report: CheckReport,
+                pictures: Iterable[tuple[str, str, bytes]],
+                view_of: ViewOf | None = None) -> None:
+    """Write the page and the JSON file of the check of a map, each atomically.
+
+    `pictures` have a name, a caption and a PNG. The first picture is on the first screen.
+    OptionsError: a file cannot be written; the old file stays.
+    """
+    write_text(folder / CHECK_DATA, json.dumps(_plain({'map': name, **_data(report)}), indent=1,
+                                               allow_nan=False))
+    write_text(folder / CHECK, check_page(name, report, pictures, view_of))
+
+
+def _data(report: CheckReport) -> dict[str, Any]:
+    """Return the content of the JSON file."""
+    grid, recording, layer = report.grid, report.recording, report.keyframes
+    data = {
+        'passed': report.passed, 'verdict': report.verdict, 'localized': report.localized,
+        'scale_by_sizes': report.scale, 'failures': report.failures, 'advice': report.advice,
+        'notes': report.notes, 'faulty_landmarks': report.faulty, 'duplicates': report.duplicates,
+        'landmarks': report.landmarks, 'look_alikes': report.look_alikes,
+        'overlaps': [{'first': report.map_ids[overlap.first],
+                      'second': report.map_ids[overlap.second], 'distance': overlap.distance,
+                      'is_duplicate': overlap.is_duplicate} for overlap in report.overlaps],
+        'queries': report.queries, 'recording': None, 'keyframes': None,
+        'grid': {**vars(grid), 'headings': grid.headings, 'poses': None,
+                 'accepted_positions_near_recording': grid.accepted_positions,
+                 'verdicts': count_verdicts(grid.trials),
+                 'trials': [trial for trial in grid.trials if trial.verdict == 'misled']}}
+    if recording is not None:
+        data['recording'] = {
+            **vars(recording), 'simulated': None, 'judged_frames': len(recording.judged),
+            'verdicts': count_verdicts(recording.trials),
+            'verdicts_by_objects': count_by_objects(recording.trials),
+            'verdicts_with_simulated_boxes': count_verdicts(recording.simulated)}
+    if layer is not None:
+        data['keyframes'] = {
+            'keyframes': layer.keyframes, 'points': layer.points,
+            'recorded_frames_in_reach': layer.recorded.mean() if len(layer.recorded) else None,
+            'positions_in_reach_near_recording': layer.reached_positions,
+            'positions_without': grid.positions[layer.without]}
+    return data
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as a JSON tree: not finite numbers as None, trials without their results."""
+    if is_dataclass(value):
+        value = {key: item for key, item in vars(value).items()
+                 if not (key == 'result' and isinstance(value, Trial))}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.round(4).tolist() if value.dtype.kind == 'f' else value.tolist()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def grade(landmark: LandmarkCheck) -> str:
@@ -48,41 +152,21 @@ def grade(landmark: LandmarkCheck) -> str:
     return 'minor' if landmark.faults else 'sound'
 
 
-def write_report(folder: Path, name: str, report: CheckReport,
-                 pictures: Iterable[tuple[str, str, bytes]], views: ViewPainter | None = None
-                 ) -> None:
-    """Write the page and the JSON file of the check of a map, each atomically.
-
-    `pictures` have a name, a caption and a PNG. The first picture is on the first screen. `views`
-    draws the images beside the advice. OptionsError: a file cannot be written; the old file stays.
-    """
-    data = _finite({'map': name, **report.as_dict()})
-    write_text(folder / DATA, json.dumps(data, indent=1, allow_nan=False))
-    write_text(folder / PAGE, _page(name, report, pictures, views))
-
-
-def _finite(value: Any) -> Any:
-    """Return a JSON tree with None in place of numbers that are not finite."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]],
-          views: ViewPainter | None) -> str:
+def check_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]],
+               view_of: ViewOf | None = None) -> str:
+    """Return the page of the check of a map, see write_check."""
     missed = len(report.failures)
     said = html.verdict('The map reaches all thresholds.' if report.passed else
                         'Keyframes only: the map misses the threshold for objects alone.'
                         if report.verdict == 'keyframes only' else
                         f'The map misses {missed} of {len(report.measures)} thresholds.',
                         report.passed)
-    said += html.items(str(item) for item in report.carried)
+    said += html.items(report.localized)
     told = [measure for name in _TELLING for measure in report.measures
             if measure.name.startswith(name)][:_NUMBERS]
     first, *others = (html.figure(png, caption, picture) for picture, caption, png in pictures)
-    cards = [_card(number, advice, views) for number, advice in enumerate(report.to_do, start=1)]
+    cards = [html.card(f'{number}. {advice.text}', *((view_of and view_of(advice)) or ()))
+             for number, advice in enumerate(report.to_do, start=1)]
     parts = [html.first_screen(
         [said, html.tiles((measure.show(measure.value), measure.name, not measure.is_missed)
                           for measure in told),
@@ -109,12 +193,6 @@ def _page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, byt
                   html.fold('Systematic residuals', _corrections(report.recording))]
     return html.page(f'Check of {name}', *parts,
                      html.fold('How these figures were computed', html.items(report.notes)))
-
-
-def _card(number: int, advice: Advice, views: ViewPainter | None) -> str:
-    view = None if views is None else views.of(advice)
-    text = f'{number}. {advice.text}'
-    return html.card(text) if view is None else html.card(text, view.jpeg, view.caption)
 
 
 def _bar(measure: Measure) -> html.Bar:
@@ -195,7 +273,7 @@ def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
                    (check.median_iou, 1.0, 2), (check.thinness, 1.0, 2)]
         texts = [support, *('' if value is None else f'{value * factor:.{digits}f}'
                             for value, factor, digits in numbers)]
-        faults = '; '.join(check.faults) if check.faults else GRADE_NAMES['sound']
+        faults = '; '.join(check.faults) if check.faults else GRADES['sound'][0]
         rows.append([
             (check.landmark_id, grade(check)), (label, 'text'), (faults, 'text'), *texts,
             ', '.join(f'{name} ({distance:.2f})' for name, distance in check.overlaps)])
