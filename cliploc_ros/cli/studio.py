@@ -57,7 +57,6 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--clip-pretrained NAME', 'offer the five phrases that this CLIP finds best: a '
            'folder or OWNER/NAME with ONNX files, or a tag or file of open_clip, as for build_map')
     option(parser, '--clip-model NAME', 'the architecture of a tag or file (%(default)s)')
-    option(parser, '--device', 'of CLIP (%(default)s)', default='auto')
     option(parser, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--occupancy-grid FILE', 'show the walls: the YAML file of nav2_map_server, in '
            "the map's coordinate frame")
@@ -178,7 +177,7 @@ def _phrase_finder(options: argparse.Namespace, recording: 'Recording | None'
                                '--clip-pretrained')
         return None
     clip = ClipOptions(model=options.clip_model or ClipOptions.model,
-                       pretrained=options.clip_pretrained, device=options.device)
+                       pretrained=options.clip_pretrained)
     return PhraseFinder(clip, load_vocabulary(options.vocabulary), recording)
 
 
