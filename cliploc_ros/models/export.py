@@ -11,6 +11,7 @@ import pickle
 import warnings
 import zipfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
-from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir
+from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_weights import (
     CHECKPOINT,
     CONFIG,
@@ -38,7 +39,7 @@ from cliploc_ros.models.files import (
     fingerprint_file,
     first_line,
 )
-from cliploc_ros.models.onnx_network import CompiledNetwork, import_openvino
+from cliploc_ros.models.onnx_network import CompiledNetwork, import_openvino, read_config
 
 if TYPE_CHECKING:
     import torch
@@ -141,7 +142,11 @@ def _find(options: ClipOptions) -> _Weights:
                          f'{did_you_mean(name, tags, 4, 0.5)} (known: '
                          f"{', '.join(tags) or 'none'})")
     if tag and not options.checkpoint_path:
-        file = _downloaded(model, tag, options)
+        own, where = resolve_cache_dir(options.cache_dir) / 'weights', tag.get('hf_hub', '')
+        address = f'https://huggingface.co/{where}' if where else tag.get('url')
+        file = download(f"the weights '{name}' of CLIP model '{model}'", own, (
+            f'Without a network: download {address} on another machine and set {CHECKPOINT}'
+            f'{WITHOUT_CLIP}'), partial(open_clip.download_pretrained, tag, cache_dir=str(own)))
     check_weights_file(file)
     quick_gelu = bool(config.get('quick_gelu') or tag.get('quick_gelu') or _is_torchscript(file))
     return _Weights(model, file, quick_gelu, {
@@ -154,14 +159,8 @@ def _add_config(name: str) -> str:
     import open_clip
 
     file = Path(name).expanduser().absolute()
-    if not file.exists():
-        raise ModelError(f'{file} does not exist: check the path of the model config')
-    try:
-        config = parse_json(read_file(file))
-    except (OSError, ValueError) as error:
-        raise ModelError(f'{file}, a model config, cannot be read as JSON: {error}') from None
-    missing = ([part for part in _CONFIG_PARTS if part not in config]
-               if isinstance(config, dict) else _CONFIG_PARTS)
+    config = read_config(file, 'it is the model config')
+    missing = [part for part in _CONFIG_PARTS if part not in config]
     if missing:
         raise ModelError(f'{file} is not a model config of open_clip: it lacks '
                          f'{", ".join(missing)}')
@@ -169,35 +168,6 @@ def _add_config(name: str) -> str:
         raise ModelError(f"open_clip has another model named '{file.stem}': rename {file}")
     open_clip.add_model_config(file)
     return file.stem
-
-
-def _downloaded(model: str, tag: dict[str, Any], options: ClipOptions) -> Path:
-    """Return the weights of a tag in safetensors or else for PyTorch, downloaded once."""
-    import huggingface_hub
-    from open_clip.constants import HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME
-
-    what = f"the weights '{options.pretrained}' of CLIP model '{model}'"
-    repository, name = os.path.split(tag.get('hf_hub', ''))
-    if not repository:
-        raise ModelError(f'{what} are not on a model hub: download {tag.get("url", "them")} and '
-                         f'set {CHECKPOINT}{WITHOUT_CLIP}')
-    newer, older = ((str(Path(name).with_suffix('.safetensors')), name) if name
-                    else (HF_SAFE_WEIGHTS_NAME, HF_WEIGHTS_NAME))
-    own = resolve_cache_dir(options.cache_dir) / 'weights'
-    for folder in (own, None):
-        for candidate in (newer, older):
-            found = huggingface_hub.try_to_load_from_cache(repository, candidate, folder)
-            if isinstance(found, str):
-                return Path(found)
-
-    def fetch() -> str:
-        # If packets are dropped, this times out after 10 s, hf_hub_download after 6 minutes.
-        wanted = newer if huggingface_hub.file_exists(repository, newer) else older
-        return str(huggingface_hub.hf_hub_download(repository, wanted, cache_dir=own))
-
-    return download(what, own, (
-        f'Without a network: download {newer} or {older} from https://huggingface.co/{repository} '
-        f'on another machine and set {CHECKPOINT}{WITHOUT_CLIP}'), fetch)
 
 
 def _load(weights: _Weights) -> Any:

@@ -181,16 +181,12 @@ def free_memory() -> None:
 
 
 def _settings(precision: str | None) -> dict[str, Any]:
-    limit, threads = os.environ.get('OMP_NUM_THREADS', ''), 0
-    if limit.isdecimal():
-        threads = int(limit)
-    siblings = Path('/sys/devices/system/cpu/smt/active')
-    is_doubled = siblings.exists() and siblings.read_text().strip() == '1'
     # No pinning: a pinned thread waits for other processes on its core.
     settings: dict[str, Any] = {
-        'PERFORMANCE_HINT': 'LATENCY', 'NUM_STREAMS': 1, 'ENABLE_CPU_PINNING': False,
-        'INFERENCE_NUM_THREADS':
-            threads or max(1, len(os.sched_getaffinity(0)) // (2 if is_doubled else 1))}
+        'PERFORMANCE_HINT': 'LATENCY', 'NUM_STREAMS': 1, 'ENABLE_CPU_PINNING': False}
+    # By default, OpenVINO has a thread for each core that this process may use.
+    if (threads := os.environ.get('OMP_NUM_THREADS', '')).isdecimal() and int(threads):
+        settings['INFERENCE_NUM_THREADS'] = int(threads)
     return settings if precision is None else settings | {'INFERENCE_PRECISION_HINT': precision}
 
 

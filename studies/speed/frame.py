@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure a request by stage for some networks: ``python -m studies.speed frame``.
 
-Each pair of detector and CLIP runs in a process of its own. The image, its boxes and the map are the demo's. The search uses the similarities of the
-demo's own CLIP, since similarities from random weights mean nothing. Weights that are not in the
-cache are random: the times are then still valid, but the detections and embeddings are not.
+Each pair of detector and CLIP runs in a process of its own. The image, its boxes and the map are
+the demo's. The search uses the similarities of the demo's own CLIP, since similarities from random
+weights mean nothing. Weights that are not in the cache are random: the times are then still valid,
+but the detections and embeddings are not.
 """
 
 import os
