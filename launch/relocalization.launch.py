@@ -42,7 +42,7 @@ NAMES = {
 _OF_CAMERA = ('image', 'camera_info', 'detections', 'depth', 'depth_camera_info')
 # An argument that is not given takes its value from the file `parameters`, else its default.
 DETECTOR_PARAMETERS = {
-    'profile': 'detector and CLIP: auto, accurate, balanced or fast',
+    'profile': 'detector and CLIP: accurate, balanced or fast',
     'model': 'weights of the detector',
     'vocabulary': 'classes of a YOLO-World or YOLOE: map, or a list of names',
     'map_file': 'map of objects: a path, or package://PACKAGE/PATH',
@@ -52,7 +52,7 @@ DETECTOR_PARAMETERS = {
     'use_sim_time': 'true: use the time of /clock',
 }
 RELOCALIZER_PARAMETERS = {
-    'profile': 'detector and CLIP: auto, accurate, balanced or fast',
+    'profile': 'detector and CLIP: accurate, balanced or fast',
     'map_file': 'map of objects: a path, or package://PACKAGE/PATH',
     'map_files': 'maps of several floors, instead of map_file: [ground.yaml, first.yaml]',
     'keyframes_file': "layer of keyframes; 'auto': next to map_file",

@@ -39,7 +39,7 @@ from cliploc_ros.command import positive_int, run_main
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 from cliploc_ros.files.storage import make_folder, write_file, write_text
-from cliploc_ros.models.files import download_file
+from cliploc_ros.models.files import download
 from cliploc_ros.offline import page as html
 from cliploc_ros.offline.datasets.folders import find_layout, read_sequence
 from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
@@ -218,22 +218,46 @@ def _is_agreed() -> bool:
         raise OptionsError('standard input is closed, so nobody can confirm: give --yes') from None
 
 
-def _downloaded(download: Download, out: Path) -> Path:
+def _download_file(url: str, file: Path, remedy: str, setting: str) -> Path:
+    """Download a file from its address, or continue an interrupted download.
+
+    A partial file has the name NAME.partial. ModelError, remedy and setting: see `download`.
+    """
+    partial = file.with_name(f'{file.name}.partial')
+
+    def fetch() -> Path:
+        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
+        from huggingface_hub.errors import HfHubHTTPError
+        from huggingface_hub.file_download import http_get
+
+        try:
+            with partial.open('ab') as opened:
+                http_get(url, opened, resume_size=opened.tell(), displayed_filename=file.name)
+        except HfHubHTTPError as error:
+            if error.response.status_code == 416:  # the partial file is longer than the file
+                partial.unlink()
+            raise
+        return partial.replace(file)
+
+    return download(url, file.parent, remedy, fetch, setting)
+
+
+def _downloaded(wanted: Download, out: Path) -> Path:
     """Download a file and check its digest; CliplocError: one of the two fails."""
-    file = out / 'downloads' / download.file
+    file = out / 'downloads' / wanted.file
     if not file.exists():
-        print(f'downloading {download.name}', flush=True)
-        download_file(download.url, file, f'Check network and address, then {_AGAIN}; or put the '
-                      f'file there yourself, as {file}', '--out')
+        print(f'downloading {wanted.name}', flush=True)
+        _download_file(wanted.url, file, f'Check network and address, then {_AGAIN}; or put the '
+                       f'file there yourself, as {file}', '--out')
     with file.open('rb') as opened:
         digest = hashlib.file_digest(opened, 'sha256').hexdigest()
     kept = _digest_file(file)
-    expected = download.sha256 or (kept.read_text().strip() if kept.exists() else digest)
+    expected = wanted.sha256 or (kept.read_text().strip() if kept.exists() else digest)
     if digest != expected:
         refused = file.replace(file.with_name(f'{file.name}.refused'))
         raise DatasetError(
             f'{file} has SHA-256 {digest}, expected {expected}: it is damaged, or another file is '
-            f'at {download.url}. It is kept as {refused.name}. Run again to download it again; if '
+            f'at {wanted.url}. It is kept as {refused.name}. Run again to download it again; if '
             'the file is correct, give --sources a copy of studies/reproduce.yaml with its digest')
     write_text(kept, digest + '\n')
     return file

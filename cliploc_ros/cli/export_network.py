@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
            'runs in fp32')
     option(parser, '--out PATH', 'the file of a detector, or the new folder of a CLIP', Path,
            required=True)
-    parser.set_defaults(device='cpu', inference='pytorch', profile='auto')
+    parser.set_defaults(profile='accurate')
     return parser
 
 
@@ -61,57 +61,37 @@ def export_network(options: argparse.Namespace) -> int:
         raise OptionsError(f'{options.out} exists: name a new {"folder" if is_clip else "file"}')
     if not is_clip and options.out.suffix != '.onnx':
         raise OptionsError(f'--out {options.out}: the file name of a detector must end in .onnx')
-    options.out = options.out.absolute()
-    make_folder(options.out.parent)
-    with tempfile.TemporaryDirectory(prefix='cliploc_ros_export_') as desk:
-        found = (_export_clip if is_clip else _export_detector)(options, Path(desk) / 'network')
-        _place(found, options.out)
-    files = [options.out] if options.out.is_file() else options.out.rglob('*')
-    print(f'{options.out}: {sum(file.stat().st_size for file in files) / 1e6:.1f} MB, results '
-          'equal to those of PyTorch')
-    return 0
-
-
-def _place(export: Path, out: Path) -> None:
-    """Copy a file or folder atomically."""
-    copy = shutil.copytree if export.is_dir() else shutil.copy
-    try:
-        with tempfile.TemporaryDirectory(dir=out.parent, prefix='.',
-                                         ignore_cleanup_errors=True) as desk:
-            Path(copy(export, Path(desk) / out.name)).rename(out)
-    except OSError as error:
-        raise OptionsError(f'{out}: cannot be written: {error.strerror}; {MAKE_ROOM}') from error
-
-
-def _export_detector(options: argparse.Namespace, desk: Path) -> Path:
-    from cliploc_ros.cli.sources import detector_options
-    from cliploc_ros.models.devices import needs_pytorch
+    out = options.out.absolute()
+    make_folder(out.parent)
+    # The imports take seconds.
+    from cliploc_ros.cli.sources import clip_options, detector_options
+    from cliploc_ros.models.export import export_clip
     from cliploc_ros.models.exports import DETECTOR, run_export
-    from cliploc_ros.models.yolo_weights import resolve_published
+    from cliploc_ros.models.yolo_weights import export_detector, resolve_published
 
-    detector = detector_options(options)
-    file = resolve_published(detector.model, '', 'model')
-    with needs_pytorch('an export'):
-        from cliploc_ros.models.yolo_detector import export_detector
-
-        run_export(str(file), partial(export_detector, file, detector, half=options.half), desk)
-    return desk / DETECTOR
-
-
-def _export_clip(options: argparse.Namespace, desk: Path) -> Path:
-    from cliploc_ros.cli.sources import clip_options
-    from cliploc_ros.models.clip_weights import resolve_clip_weights
-    from cliploc_ros.models.devices import needs_pytorch
-    from cliploc_ros.models.exports import run_export
-
-    weights = resolve_clip_weights(clip_options(options))
-    if weights.is_onnx:
-        raise OptionsError(f'{weights.file} has ONNX files already')
-    with needs_pytorch('an export'):
-        from cliploc_ros.models.export import export_clip
-
-        run_export(weights.model, partial(export_clip, weights, half=options.half), desk)
-    return desk
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_export_') as desk:
+        found = Path(desk) / 'network'
+        if is_clip:
+            clip = clip_options(options)
+            run_export(f'CLIP {clip.model}', partial(export_clip, clip, half=options.half), found)
+        else:
+            detector = detector_options(options)
+            file = resolve_published(detector.model, '', 'model')
+            run_export(str(file), partial(export_detector, file, detector, half=options.half),
+                       found)
+            found /= DETECTOR
+        copy = shutil.copytree if is_clip else shutil.copy
+        try:
+            with tempfile.TemporaryDirectory(dir=out.parent, prefix='.',
+                                             ignore_cleanup_errors=True) as beside:
+                Path(copy(found, Path(beside) / out.name)).rename(out)
+        except OSError as error:
+            raise OptionsError(f'{out}: cannot be written: {error.strerror}; {MAKE_ROOM}'
+                               ) from error
+    files = [out] if out.is_file() else out.rglob('*')
+    print(f'{out}: {sum(file.stat().st_size for file in files) / 1e6:.1f} MB, results equal to '
+          'those of PyTorch')
+    return 0
 
 
 if __name__ == '__main__':

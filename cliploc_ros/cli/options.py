@@ -9,7 +9,6 @@ from typing import Any
 
 from cliploc_ros.command import finite, not_negative, option, positive, positive_int, within
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
 
 # Options for folders only.
@@ -105,12 +104,8 @@ def add_topic_options(group: Any) -> None:
 def add_network_options(group: Any) -> None:
     """Add the options that name detector and CLIP to a group of a parser."""
     option(group, '--profile', 'detector and CLIP: the same as on the robot, as image embeddings '
-           'are specific to a CLIP (%(default)s: accurate on a GPU, balanced on a CPU)',
-           default='auto', choices=PROFILE_NAMES)
+           'are specific to a CLIP (%(default)s)', default='balanced', choices=PROFILE_NAMES)
     add_weights_options(group)
-    option(group, '--device', '(%(default)s)', default='auto')
-    option(group, '--inference', '(%(default)s: OpenVINO on a CPU if it is installed)',
-           default='auto', choices=INFERENCES)
     option(group, '--no-clip', 'run no CLIP: boxes and classes only', dest='clip',
            action='store_false')
     option(group, '--scheduler ADDRESS', 'address of a Dask cluster, used instead of local '

@@ -50,14 +50,13 @@ def detector_options(options: argparse.Namespace, **more: Any) -> DetectorOption
         prompts_of_map(LandmarkMap.from_file(words), words) if words.endswith('.yaml')
         else prompts_of_names(words))
     return with_detector(DetectorOptions(
-        model=options.model, device=options.device, inference=options.inference, prompts=prompts,
-        text_model=options.text_model, **more), options.profile)
+        model=options.model, prompts=prompts, text_model=options.text_model, **more),
+        options.profile)
 
 
 def clip_options(options: argparse.Namespace) -> ClipOptions:
     """Return the CLIP that the command line names."""
-    return with_encoder(ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained,
-                                    device=options.device, inference=options.inference),
+    return with_encoder(ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained),
                         options.profile)
 
 

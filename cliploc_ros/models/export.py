@@ -5,26 +5,41 @@
 import contextlib
 import gzip
 import json
+import logging
+import os
+import pickle
 import warnings
+import zipfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.models.clip_towers import load_one_tower, quiet_root_logger
+from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
+from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_weights import (
+    CHECKPOINT,
     CONFIG,
     IMAGE_TOWERS,
     PREPROCESS,
     TEXT_TOWERS,
     TOKENIZER,
-    ClipWeights,
+    WITHOUT_CLIP,
+    ClipOptions,
+    names_onnx,
 )
-from cliploc_ros.models.devices import import_openvino
 from cliploc_ros.models.exports import ExportError, describe_export
-from cliploc_ros.models.onnx_network import CompiledNetwork
+from cliploc_ros.models.files import (
+    check_weights_file,
+    damaged,
+    download,
+    fingerprint_file,
+    first_line,
+)
+from cliploc_ros.models.onnx_network import CompiledNetwork, import_openvino, read_config
 
 if TYPE_CHECKING:
     import torch
@@ -36,29 +51,33 @@ _TOLERANCE = 1e-3
 # Smaller tensors stay in fp32.
 _LEAST_HALVED = 1024
 _TEXTS = ['a photo of a red mug', "the dog's 2 bowls!", '']
+_CONFIG_PARTS = ('embed_dim', 'vision_cfg', 'text_cfg')
+_WEIGHT_SUFFIXES = ('.pt', '.pth', '.bin', '.safetensors')
 
 
-def export_clip(weights: ClipWeights, folder: Path, half: bool = False) -> None:
+def export_clip(options: ClipOptions, folder: Path, half: bool = False) -> None:
     """Export both towers of a CLIP of open_clip, with tokenizer and configuration, into a folder.
 
     With ``half``, weights are stored in half precision, but the towers run in fp32.
 
     ExportError: the results of a tower differ from those in PyTorch, or the tokenizer is not that
-    of CLIP. ModelError: the file does not hold the weights of the model.
+    of CLIP. ModelError: model or tag are unknown, the download failed, or the file does not hold
+    the weights of the model. OptionsError: the options name ONNX files.
     """
     import open_clip
     import torch
 
-    with quiet_root_logger():
+    weights = _find(options)
+    model = _load(weights)
+    with _quiet_root_logger():
         tokenizer = open_clip.get_tokenizer(weights.model)
-    for towers, name, example in ((IMAGE_TOWERS, 'visual', None),
+    crops = dict(model.visual.preprocess_cfg)
+    size: Any = crops['size']
+    sides = (size, size) if isinstance(size, int) else tuple(size)
+    images = torch.from_numpy(np.random.default_rng(0).standard_normal(
+        (3, 3, *sides)).astype(np.float32))
+    for towers, name, example in ((IMAGE_TOWERS, 'visual', images),
                                   (TEXT_TOWERS, 'text', tokenizer(_TEXTS))):
-        model, crops = load_one_tower(weights, name, 'cpu', 'fp32')
-        if example is None:
-            size: Any = crops['size']
-            sides = (size, size) if isinstance(size, int) else tuple(size)
-            example = torch.from_numpy(np.random.default_rng(0).standard_normal(
-                (3, 3, *sides)).astype(np.float32))
         file = folder / towers[-1]
         file.parent.mkdir(parents=True)
         tower = getattr(model, name)
@@ -70,13 +89,161 @@ def export_clip(weights: ClipWeights, folder: Path, half: bool = False) -> None:
         if half:
             halve(file)
         compare(file, example.numpy(), expected, half)
-        del model, tower
+        delattr(model, name)  # frees its memory
+        del tower
     (folder / PREPROCESS).write_text(json.dumps(crops))
     (folder / 'textual' / TOKENIZER).write_text(_tokenizer_of(tokenizer))
+    config = open_clip.get_model_config(weights.model)
     (folder / CONFIG).write_text(json.dumps({
-        'embed_dim': weights.embed_dim, 'text_cfg': {
+        'embed_dim': config['embed_dim'], 'text_cfg': {
             'context_length': tokenizer.context_length, 'vocab_size': tokenizer.vocab_size}}))
-    describe_export(folder, weights.key)
+    describe_export(folder, f'{weights.model}:{"quick_gelu" if weights.quick_gelu else "gelu"}:'
+                    f'{fingerprint_file(weights.file)}')
+
+
+# ---- finding and loading the weights ------------------------------------------------------------
+
+class _Weights(NamedTuple):
+    """The weights of a CLIP of open_clip."""
+
+    model: str
+    file: Path
+    quick_gelu: bool  #: Whether they were trained with OpenAI's approximate GELU
+    #: ``image_mean``, ``image_std``, ``image_interpolation`` and ``image_resize_mode`` as
+    #: ``open_clip.create_model`` takes them; empty for its defaults
+    preprocess: dict[str, Any]
+
+
+def _find(options: ClipOptions) -> _Weights:
+    """Find the weights that the options name; download them if necessary."""
+    import open_clip
+
+    name = options.pretrained
+    if names_onnx(options):
+        raise OptionsError(f'{options.checkpoint_path or name} has ONNX files already')
+    # OpenAI's spelling is ViT-L/14.
+    model = (_add_config(options.model) if options.model.endswith('.json')
+             else options.model.replace('/', '-'))
+    config = open_clip.get_model_config(model) if model in open_clip.list_models() else None
+    if config is None:
+        raise ModelError(f"unknown CLIP model '{options.model}'"
+                         f'{did_you_mean(model, open_clip.list_models(), 4, 0.5)} '
+                         '(open_clip.list_models() lists all)')
+    if {'hf_model_name', 'hf_tokenizer_name'} & config['text_cfg'].keys():
+        raise ModelError(f"CLIP model '{options.model}' takes its tokenizer from the transformers "
+                         "library, which is not supported: choose one like ViT-L-14 or RN50")
+    tag = open_clip.get_pretrained_cfg(model, name)
+    file = Path(options.checkpoint_path or name).expanduser().absolute()
+    if not tag and (options.checkpoint_path or not file.exists()):
+        if os.sep in name or name.endswith(_WEIGHT_SUFFIXES):
+            raise ModelError(f'{name} does not exist: check the path of the weights')
+        tags = open_clip.list_pretrained_tags_by_model(model)
+        raise ModelError(f"unknown weights '{name}' for CLIP model '{model}'"
+                         f'{did_you_mean(name, tags, 4, 0.5)} (known: '
+                         f"{', '.join(tags) or 'none'})")
+    if tag and not options.checkpoint_path:
+        own, where = resolve_cache_dir(options.cache_dir) / 'weights', tag.get('hf_hub', '')
+        address = f'https://huggingface.co/{where}' if where else tag.get('url')
+        file = download(f"the weights '{name}' of CLIP model '{model}'", own, (
+            f'Without a network: download {address} on another machine and set {CHECKPOINT}'
+            f'{WITHOUT_CLIP}'), partial(open_clip.download_pretrained, tag, cache_dir=str(own)))
+    check_weights_file(file)
+    quick_gelu = bool(config.get('quick_gelu') or tag.get('quick_gelu') or _is_torchscript(file))
+    return _Weights(model, file, quick_gelu, {
+        f'image_{name}': tag[name] for name in ('mean', 'std', 'interpolation', 'resize_mode')
+        if name in tag})
+
+
+def _add_config(name: str) -> str:
+    """Register a model config of the user with open_clip; return the model's name."""
+    import open_clip
+
+    file = Path(name).expanduser().absolute()
+    config = read_config(file, 'it is the model config')
+    missing = [part for part in _CONFIG_PARTS if part not in config]
+    if missing:
+        raise ModelError(f'{file} is not a model config of open_clip: it lacks '
+                         f'{", ".join(missing)}')
+    if file.stem in open_clip.list_models() and config != open_clip.get_model_config(file.stem):
+        raise ModelError(f"open_clip has another model named '{file.stem}': rename {file}")
+    open_clip.add_model_config(file)
+    return file.stem
+
+
+def _load(weights: _Weights) -> Any:
+    """Load a CLIP of open_clip; no code in a file of weights is run.
+
+    ModelError: the file is damaged, or does not hold the weights of the model.
+    """
+    import open_clip
+    from open_clip.convert import convert_state_dict
+    from open_clip.model import convert_to_custom_text_state_dict
+
+    file = weights.file
+    with _quiet_root_logger():
+        model = open_clip.create_model(
+            weights.model, load_weights=False, force_quick_gelu=weights.quick_gelu,
+            force_custom_text=True, **weights.preprocess)
+    try:
+        state = _read(file)
+    except pickle.UnpicklingError as error:
+        # a line of torch's long message names the refused class
+        lines = str(error).splitlines() or ['']
+        cause = next((line.strip() for line in lines if 'Unsupported' in line), lines[0])
+        raise ModelError(f'{file} is not a checkpoint of CLIP: {cause}') from error
+    except Exception as error:  # each format and version has different exceptions
+        raise damaged(file, first_line(error)) from error
+    try:
+        state = convert_to_custom_text_state_dict(convert_state_dict(model, state))
+        for tower in ('visual', 'text'):
+            getattr(model, tower).load_state_dict({
+                name.removeprefix(f'{tower}.'): tensor for name, tensor in state.items()
+                if name.startswith(f'{tower}.')})
+    except Exception as error:  # an object without tensors, or other tensors
+        raise ModelError(f"{file} does not hold the weights of CLIP model '{weights.model}': "
+                         f'{" ".join(str(error).split())[:300]}') from error
+    return model.requires_grad_(False).eval()
+
+
+def _read(file: Path) -> Any:
+    from open_clip.factory import load_state_dict
+
+    if not _is_torchscript(file):
+        return load_state_dict(str(file))
+    import torch
+
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', FutureWarning)  # TorchScript is deprecated
+        return torch.jit.load(file, map_location='cpu').state_dict()
+
+
+def _is_torchscript(file: Path) -> bool:
+    """Return whether a file is a TorchScript archive, the format of OpenAI's CLIP."""
+    if not zipfile.is_zipfile(file):
+        return False
+    with zipfile.ZipFile(file) as archive:
+        return any(name.endswith('/constants.pkl') for name in archive.namelist())
+
+
+@contextlib.contextmanager
+def _quiet_root_logger() -> Iterator[None]:
+    """Suppress open_clip's warnings of random weights, and its handler on the root logger.
+
+    open_clip logs through ``logging.warning``, which adds a handler to a root logger without one.
+    """
+    root = logging.getLogger()
+    handler = logging.NullHandler()
+
+    def is_from_elsewhere(record: logging.LogRecord) -> bool:
+        return 'open_clip' not in record.pathname or record.levelno >= logging.ERROR
+
+    root.addHandler(handler)
+    root.addFilter(is_from_elsewhere)
+    try:
+        yield
+    finally:
+        root.removeFilter(is_from_elsewhere)
+        root.removeHandler(handler)
 
 
 def _tokenizer_of(tokenizer: Any) -> str:

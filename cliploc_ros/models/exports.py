@@ -10,16 +10,14 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from cliploc_ros.errors import CliplocError, ModelError
-from cliploc_ros.files.storage import parse_json, read_file, resolve_cache_dir, warn_not_kept
-from cliploc_ros.models.devices import free_memory
-from cliploc_ros.models.files import fingerprint_file, first_line, keep_folder
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.files.storage import MAKE_ROOM, parse_json, read_file, resolve_cache_dir
+from cliploc_ros.models.files import fingerprint_file, first_line, remove_unused
+from cliploc_ros.models.onnx_network import free_memory
 
 # Version of these folders and of the export; a change makes new folders.
 _FORMAT = 1
@@ -29,22 +27,26 @@ _ABOUT = 'export.json'
 DETECTOR = 'model.onnx'
 
 logger = logging.getLogger(__name__)
-# Exports that could not be written to the cache, removed when the process ends.
-_unkept: dict[Path, tempfile.TemporaryDirectory[str]] = {}
 
 
 class ExportError(ModelError):
     """A network cannot be exported, or its results differ from those in PyTorch."""
 
 
-def detector_identity(file: Path, options: DetectorOptions) -> list[str]:
-    """Return the inputs of a detector's export: its weights and its prompts."""
-    identity = [fingerprint_file(file)]
-    if options.prompts:
-        tower = Path(options.text_model).expanduser()
-        identity += [fingerprint_file(tower) if tower.is_file() else options.text_model,
-                     json.dumps(options.prompts)]
-    return identity
+@contextlib.contextmanager
+def needs_pytorch(what: str, otherwise: str = '') -> Iterator[None]:
+    """Raise a ModelError instead of an import error; ``what`` is the network that needs PyTorch.
+
+    ``otherwise`` is a further remedy, after ONNX networks and PyTorch.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ModelError(
+            f'{error.name} is not installed, but {what} needs it: name ONNX files instead (a '
+            f"published network, or export_network on a machine with the extra 'models'), or "
+            f'install that extra (script/setup models){otherwise}, see doc/install.md'
+        ) from error
 
 
 def describe_export(folder: Path, key: str) -> None:
@@ -65,67 +67,65 @@ def export_key(folder: Path) -> str:
     return ''
 
 
-def find_export(cache_dir: str, name: str, identity: Sequence[str]) -> Path | None:
-    """Return the folder of an export in the cache; None if it is missing or damaged."""
-    folder = _folder(cache_dir, name, identity)
-    if folder in _unkept:
-        return Path(_unkept[folder].name) / folder.name
-    if not folder.exists():
-        return None
-    if not export_key(folder):
-        logger.warning('%s is damaged: exporting %s again', folder, name)
-        return None
-    with contextlib.suppress(OSError):  # a read-only cache works too
-        os.utime(folder)
-    return folder
-
-
-def keep_export(cache_dir: str, name: str, identity: Sequence[str],
-                export: Callable[[Path], None]) -> Path:
+def exported(cache_dir: str, kind: str, name: str, identity: Sequence[str],
+             export: Callable[[Path], None], otherwise: str = '') -> Path:
     """Return the folder of an export; export the network if the cache does not have it.
 
-    The name of the folder contains a hash of all inputs of the export. The folder is written under
-    another name and renamed, so that any number of processes can share the cache. ``export`` must
-    write into the folder that it is given, and end with `describe_export`.
+    The name of the folder begins with ``kind`` and contains a hash of all inputs of the export.
+    The folder is written under another name and renamed, so that any number of processes can share
+    the cache.
 
-    ExportError: the export failed. ModelError, ModuleNotFoundError: from ``export``.
+    ModelError, ExportError: see run_export, or the folder cannot be written.
     """
-    folder, started = _folder(cache_dir, name, identity), time.monotonic()
-    if folder in _unkept:
-        return Path(_unkept[folder].name) / folder.name
+    digest = hashlib.sha256(json.dumps([_FORMAT, *identity]).encode()).hexdigest()
+    cache = resolve_cache_dir(cache_dir) / 'onnx'
+    folder, started = cache / f'{kind}-{digest[:32]}', time.monotonic()
     if export_key(folder):
+        with contextlib.suppress(OSError):  # a read-only cache works too
+            os.utime(folder)
         return folder
+    if folder.exists():
+        logger.warning('%s is damaged: exporting %s again', folder, name)
     logger.info('exporting %s to ONNX: once, into %s', name, folder)
     # On a full disk, the libraries raise the same errors as for networks that cannot be exported.
     # To distinguish the two, the export is written to a temporary folder first.
-    desk = tempfile.TemporaryDirectory(prefix='cliploc_ros_export_')
-    written = Path(desk.name) / folder.name
-    run_export(name, export, written)
-    try:
-        keep_folder(folder, _MOST_EXPORTS, partial(shutil.copytree, written))
-    except OSError as error:
-        warn_not_kept('the exported network is not cached and the next start is slow again: '
-                      f'cannot write {folder} ({first_line(error)}); make room, or choose a '
-                      'writable cache_dir')
-        _unkept[folder], folder = desk, written
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_export_') as desk:
+        written = Path(desk) / folder.name
+        run_export(name, export, written, otherwise)
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            remove_unused([entry for entry in cache.iterdir() if not entry.name.startswith('.')],
+                          cache.glob('.*.tmp'), _MOST_EXPORTS - 1)
+            with tempfile.TemporaryDirectory(dir=cache, prefix='.', suffix='.tmp',
+                                             ignore_cleanup_errors=True) as beside:
+                whole = Path(shutil.copytree(written, Path(beside) / folder.name))
+                if folder.exists():  # damaged, or from another process
+                    folder.rename(Path(beside) / 'old')
+                whole.rename(folder)
+        except OSError as error:
+            raise ModelError(f'the export of {name} cannot be written to {folder}: '
+                             f'{first_line(error)}; {MAKE_ROOM} (cache_dir)') from error
     free_memory()
     logger.info('exported %s in %.0f s', name, time.monotonic() - started)
     return folder
 
 
-def run_export(name: str, export: Callable[[Path], None], folder: Path) -> None:
-    """Export a network into a new folder; errors as in keep_export, with the network's name."""
+def run_export(name: str, export: Callable[[Path], None], folder: Path, otherwise: str = ''
+               ) -> None:
+    """Export a network into a new folder.
+
+    ``export`` gets the folder, and ends with `describe_export`. ``otherwise`` is a remedy for a
+    missing PyTorch.
+
+    ExportError: the export failed. ModelError: PyTorch is missing, or from ``export``.
+    """
     folder.mkdir()  # readable by other users, unlike a temporary folder
     try:
-        export(folder)
+        with needs_pytorch(f'{name}, which is not an ONNX network,', otherwise):
+            export(folder)
     except ExportError as error:
         raise ExportError(f'{name}: {error}') from error
-    except (CliplocError, ModuleNotFoundError):
+    except CliplocError:
         raise
     except Exception as error:  # tracing and exporting raise exceptions of all kinds
         raise ExportError(f'{name} cannot be exported to ONNX: {first_line(error)}') from error
-
-
-def _folder(cache_dir: str, name: str, identity: Sequence[str]) -> Path:
-    digest = hashlib.sha256(json.dumps([_FORMAT, *identity]).encode()).hexdigest()
-    return resolve_cache_dir(cache_dir) / 'onnx' / f'{Path(name).name}-{digest[:32]}'

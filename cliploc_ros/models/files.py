@@ -5,10 +5,8 @@
 import errno
 import hashlib
 import logging
-import os
 import shutil
 import struct
-import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterable
@@ -109,30 +107,6 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
         raise ModelError(f'cannot download {what}: {reason}. {remedy}') from error
 
 
-def download_file(url: str, file: Path, remedy: str, setting: str) -> Path:
-    """Download a file from its address, or continue an interrupted download.
-
-    A partial file has the name NAME.partial. ModelError, remedy and setting: see download.
-    """
-    partial = file.with_name(f'{file.name}.partial')
-
-    def fetch() -> Path:
-        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
-        from huggingface_hub.errors import HfHubHTTPError
-        from huggingface_hub.file_download import http_get
-
-        try:
-            with partial.open('ab') as opened:
-                http_get(url, opened, resume_size=opened.tell(), displayed_filename=file.name)
-        except HfHubHTTPError as error:
-            if error.response.status_code == 416:  # the partial file is longer than the file
-                partial.unlink()
-            raise
-        return partial.replace(file)
-
-    return download(url, file.parent, remedy, fetch, setting)
-
-
 def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -> None:
     """Remove the least recently used entries of a cache, and partial files of killed writers."""
     def modified(entry: Path) -> float:
@@ -147,23 +121,6 @@ def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -
             shutil.rmtree(entry, ignore_errors=True)
         else:
             entry.unlink(missing_ok=True)
-
-
-def keep_folder(folder: Path, most: int, write: Callable[[Path], object]) -> None:
-    """Write a folder of a cache atomically; keep only the `most` recently used folders.
-
-    ``write`` gets the path of a folder to make. Any number of processes can share the cache.
-    """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    remove_unused([entry for entry in folder.parent.iterdir() if not entry.name.startswith('.')],
-                  folder.parent.glob('.*.tmp'), most - 1)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix='.', suffix='.tmp',
-                                     ignore_cleanup_errors=True) as desk:
-        whole = Path(desk) / folder.name
-        write(whole)
-        if folder.exists():  # damaged, or from another process
-            folder.rename(Path(desk) / 'old')
-        whole.rename(folder)
 
 
 def first_line(error: Exception) -> str:

@@ -27,8 +27,6 @@ _MOST_FILES = 32
 logger = logging.getLogger(__name__)
 #: Greatest number of labels encoded, cached and held at once: 134 MB with 512 numbers each.
 PART = 65_536
-# Number of descriptions mixed at once.
-_BLOCK = 8_192
 # L labels, d numbers, t bytes that identify labels and encoder.
 _SCHEMA = Schema('file of label embeddings', {
     'identity': Field('uint8', ('t',)),
@@ -121,15 +119,9 @@ def mixed_rows(descriptions: Sequence[WeightedLabels],
         (shares, [columns[label] for description in descriptions for label, _ in description],
          ends), shape=(len(descriptions), len(labels)))
     rows = np.zeros((len(descriptions), embed_dim), dtype=np.float32)
-    blocks = [slice(start, start + _BLOCK) for start in range(0, len(rows), _BLOCK)]
     for start in range(0, len(labels), PART):
         part = slice(start, start + PART)
-        embeddings = encode(labels[part])
-        for block in blocks:
-            rows[block] += weights[block, part] @ embeddings
-        del embeddings  # before the next part is encoded
-    is_mixed = np.diff(weights.indptr) > 1
-    for block in blocks:
-        lengths = np.sqrt(np.einsum('ij,ij->i', rows[block], rows[block]))
-        rows[block] /= np.where(is_mixed[block], np.maximum(lengths, 1e-12), 1.0)[:, None]
+        rows += weights[:, part] @ encode(labels[part])
+    lengths = np.maximum(np.sqrt(np.einsum('ij,ij->i', rows, rows)), 1e-12)
+    rows /= np.where(np.diff(weights.indptr) > 1, lengths, 1.0)[:, None]
     return rows

@@ -7,28 +7,25 @@ The meaning of inputs and outputs is read from the files and the configurations 
 
 import contextlib
 import html
-from collections.abc import Sequence
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import parse_json, read_file
 from cliploc_ros.models.clip_weights import (
     CONFIG,
-    IMAGE_TOWERS,
     PREPROCESS,
     PREPROCESSOR,
-    TEXT_TOWERS,
     TOKENIZER,
-    ClipOptions,
     ClipWeights,
 )
-from cliploc_ros.models.crops import CropPreparation
 from cliploc_ros.models.files import first_line
-from cliploc_ros.models.hub import find_network
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
 
 # Pillow's numbers of filters, as written by transformers.
@@ -40,6 +37,8 @@ _MOST_PX = 2048
 # Least size of a tokenizer's vocabulary, as a share of the text tower's.
 _LEAST_SHARE = 0.9
 _EMBEDDINGS = ('image_embeds', 'text_embeds', 'embedding')
+# Crops with a greater ratio of sides are cut first: CLIP sees only the central square.
+_MAX_ASPECT = 16
 
 
 class OnnxTower:
@@ -48,13 +47,10 @@ class OnnxTower:
     ModelError: the files do not hold an image tower of these weights.
     """
 
-    inference = 'openvino'
-
-    def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
-        network = OnnxNetwork(find_network(weights.file, '', IMAGE_TOWERS), options.cache_dir,
-                              'f32' if options.precision == 'fp32' else None)
+    def __init__(self, weights: ClipWeights, cache_dir: str) -> None:
+        network = OnnxNetwork(weights.image_tower, cache_dir, None)
         self._network, self._input = network, network.image_input()
-        self.prepare = CropPreparation(read_preparation(weights.file, self._input.shape[2:]))
+        self.prepare = CropPreparation(read_preparation(weights.folder, self._input.shape[2:]))
         probe = self.prepare(np.zeros((32, 32, 3), dtype=np.uint8))[None]
         self._output = _embedding(network, self._run(probe), weights)
 
@@ -108,14 +104,71 @@ def read_preparation(folder: Path, fixed: Sequence[int]) -> dict[str, Any]:
     return found | {'size': (height, width), 'mean': mean.tolist(), 'std': std.tolist()}
 
 
+class CropPreparation:
+    """Scales crops to the input of a tower, as in open_clip.
+
+    ``config`` is open_clip's ``PreprocessCfg``: size, mean, std, interpolation, resize_mode
+    ('shortest', 'longest' or 'squash') and fill_color.
+    """
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        size = config['size']
+        self._height, self._width = map(int, (size, size) if isinstance(size, int) else size)
+        self._mode = config.get('resize_mode') or 'shortest'
+        self._filter = (Image.Resampling.BILINEAR if config.get('interpolation') == 'bilinear'
+                        else Image.Resampling.BICUBIC)
+        self._fill = config.get('fill_color') or 0
+        self._mean, self._std = (np.float32(config[name]).reshape(-1, 1, 1)
+                                 for name in ('mean', 'std'))
+        self._max_aspect = _MAX_ASPECT if self._mode == 'shortest' else sys.maxsize
+
+    def __call__(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Convert a crop (h, w, 3) to the input (3, H, W) of the tower."""
+        image = Image.fromarray(np.ascontiguousarray(self._cut(crop_rgb)))
+        image = image.resize(self._scaled(*image.size), self._filter)
+        left, top = (round((has - wants) / 2.0) for has, wants in
+                     zip(image.size, (self._width, self._height), strict=True))
+        if left < 0 or top < 0:
+            frame = Image.new('RGB', (self._width, self._height), (self._fill,) * 3)
+            frame.paste(image, (max(self._width - image.width, 0) // 2,
+                                max(self._height - image.height, 0) // 2))
+            image, left, top = frame, 0, 0
+        image = image.crop((left, top, left + self._width, top + self._height))
+        pixels = np.asarray(image, dtype=np.float32).transpose(2, 0, 1) / np.float32(255)
+        return np.asarray((pixels - self._mean) / self._std)
+
+    def _scaled(self, width: int, height: int) -> tuple[int, int]:
+        """Return the width and height that a crop is scaled to."""
+        if self._mode == 'squash':
+            return self._width, self._height
+        ratios = height / self._height, width / self._width
+        if self._mode == 'shortest' and self._height == self._width:
+            short, side = min(width, height), self._height
+            return ((side, int(side * height / short)) if width <= height
+                    else (int(side * width / short), side))
+        ratio = max(ratios) if self._mode == 'longest' else min(ratios)
+        return round(width / ratio), round(height / ratio)
+
+    def _cut(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Cut a very long crop to its middle.
+
+        The short side is scaled to the tower's input before the central square is cut out. A crop
+        of 1 x 2000 pixels would first become an image of 224 x 448,000.
+        """
+        height, width = crop_rgb.shape[:2]
+        longest = self._max_aspect * min(height, width)
+        cut_x, cut_y = max(width - longest, 0) // 2, max(height - longest, 0) // 2
+        return crop_rgb[cut_y:height - cut_y, cut_x:width - cut_x]
+
+
 class OnnxTextTower:
     """A text tower with its tokenizer, in OpenVINO on a CPU.
 
     ModelError: the files do not hold a text tower of these weights.
     """
 
-    def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
-        network = OnnxNetwork(find_network(weights.file, '', TEXT_TOWERS), options.cache_dir)
+    def __init__(self, weights: ClipWeights, cache_dir: str) -> None:
+        network = OnnxNetwork(weights.text_tower, cache_dir)
         self._network, self._weights = network, weights
         masks = [port for port in network.inputs if 'mask' in port.name]
         texts = [port for port in network.inputs if 'mask' not in port.name]
@@ -126,9 +179,9 @@ class OnnxTextTower:
                              f'{network.described_inputs()}, expected (texts, tokens)')
         self._text, self._masks = texts[0], masks
         #: Greatest number of tokens of a label
-        self.context = (self._text.shape[1] if self._text.shape[1] != ANY
-                        else _of_text(weights.file, 'max_position_embeddings', 'context_length'))
-        self._tokenizer, self._padding = _read_tokenizer(weights.file)
+        self.context = self._text.shape[1] if self._text.shape[1] != ANY else _of_text(
+            weights.folder, 'max_position_embeddings', 'context_length')
+        self._tokenizer, self._padding = _read_tokenizer(weights.folder)
 
     def count(self, label: str) -> int:
         """Return the number of tokens of a label, including start and end."""

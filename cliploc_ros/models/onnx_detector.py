@@ -6,22 +6,22 @@ The meaning of the outputs is read from the metadata of the file and the configu
 """
 
 import ast
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import ModelError, OptionsError
-from cliploc_ros.models.devices import resolve_device
 from cliploc_ros.models.files import first_line
 from cliploc_ros.models.hub import find_network, resolve_folder
 from cliploc_ros.models.images import check_image_rgb
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.models.yolo_boxes import Letterbox, select_boxes, without_doubles
 
 _CONFIG, _PREPROCESSOR = 'config.json', 'preprocessor_config.json'
 #: The files of a published detector; of the networks, the first that exists is used.
@@ -30,6 +30,11 @@ BESIDE = (_CONFIG, _PREPROCESSOR)
 _LOGITS, _BOXES = 'logits', 'pred_boxes'
 # Default stride of YOLO, for files without one.
 _STRIDE = 32
+# Grey of the borders, and greatest number of boxes that are compared, as in ultralytics.
+_GREY = (114, 114, 114)
+_MOST_BOXES = 30_000
+# Columns of the output of a network that removes duplicates itself: box, score, class.
+_END2END = 6
 
 
 class _Head(Protocol):
@@ -49,19 +54,13 @@ class OnnxDetector:
     """An `ObjectDetector` in an ONNX file, run by OpenVINO on a CPU.
 
     ModelError: a file is missing or damaged, or is not a detector; the message names it.
-    OptionsError: the options request a GPU, PyTorch or prompts.
+    OptionsError: the options have prompts.
     """
-
-    device, inference = 'cpu', 'openvino'
 
     def __init__(self, options: DetectorOptions) -> None:
         if options.prompts:
             raise OptionsError(f'{options.model} has fixed classes: a vocabulary needs the .pt '
                                'file of a YOLO-World or YOLOE')
-        if (options.inference == 'pytorch' or options.precision == 'fp16'
-                or (options.device != 'auto' and resolve_device(options.device) != 'cpu')):
-            raise OptionsError(f"{options.model} runs in OpenVINO: set device to 'cpu', precision "
-                               "and inference to 'auto', or name a .pt file for a GPU")
         file = _resolve(options)
         network = OnnxNetwork(file, options.cache_dir)
         self._head: _Head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs)
@@ -77,7 +76,7 @@ class OnnxDetector:
                              'network again') from error
 
     def configure(self, options: DetectorOptions) -> None:
-        """Change the options, except for model, device and inference."""
+        """Change the options, except for the model."""
         self._options = options
 
     def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
@@ -298,3 +297,87 @@ def _names(network: OnnxNetwork) -> dict[int, str]:
             map(str, range(len(found)))) or not found:
         raise ModelError(f'{where} must have class names with the keys 0, 1 ...')
     return {int(number): str(name) for number, name in found.items()}
+
+
+# ---- boxes of YOLO, as in ultralytics -----------------------------------------------------------
+
+@dataclass(frozen=True)
+class Letterbox:
+    """The place of an image in a network's input: scaled, and centred in grey borders [px]."""
+
+    image_size: tuple[int, int]  #: Width and height of the image
+    scaled_size: tuple[int, int]  #: Width and height of the scaled image
+    #: Widths of the borders: left, top, right, bottom
+    borders: tuple[int, int, int, int]
+
+    @staticmethod
+    def of(image_size: tuple[int, int], height: int, width: int, stride: int | None
+           ) -> 'Letterbox':
+        """Fit an image into an input; with a stride, the input shrinks to a multiple of it."""
+        scale = min(height / image_size[1], width / image_size[0])
+        scaled = max(round(image_size[0] * scale), 1), max(round(image_size[1] * scale), 1)
+        free_x, free_y = width - scaled[0], height - scaled[1]
+        if stride is not None:
+            free_x, free_y = free_x % stride, free_y % stride
+        return Letterbox(image_size, scaled, (
+            round(free_x / 2 - 0.1), round(free_y / 2 - 0.1),
+            round(free_x / 2 + 0.1), round(free_y / 2 + 0.1)))
+
+    def fill(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Scale an image (h, w, 3) and add borders, giving an input (H, W, 3)."""
+        if self.scaled_size != self.image_size:
+            image = cv2.resize(image, self.scaled_size, interpolation=cv2.INTER_LINEAR)
+        left, top, right, bottom = self.borders
+        return np.asarray(cv2.copyMakeBorder(image, top, bottom, left, right,
+                                             cv2.BORDER_CONSTANT, value=_GREY))
+
+    def in_image(self, boxes_xyxy: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Convert boxes (n, 4) in the input to boxes in the image, clipped to it."""
+        scaled, size, corner = (np.array(pair * 2, dtype=np.float32) for pair in
+                                (self.scaled_size, self.image_size, self.borders[:2]))
+        return np.clip((boxes_xyxy - corner) / (scaled / size), 0, size)
+
+
+def select_boxes(output: NDArray[np.float32], conf: float, iou: float, max_det: int,
+                 is_end2end: bool) -> NDArray[np.float32]:
+    """Return the boxes (n, 6) of an output: left, top, right, bottom, score, class.
+
+    The output is (4 + classes, boxes), with centre and size of each box. A network that removes
+    duplicates itself has the output (boxes, 6 or more), the most confident box first.
+    """
+    if is_end2end or output.shape[-1] == _END2END:
+        return output[output[:, 4] > conf][:max_det, :_END2END]
+    scores = output[4:].max(axis=0)
+    rows = np.flatnonzero(scores > conf)
+    rows = rows[np.argsort(-scores[rows], kind='stable')[:_MOST_BOXES]]
+    middle, half = output[:2, rows].T, output[2:4, rows].T / 2
+    classes = output[4:, rows].argmax(axis=0)
+    boxes = np.hstack([middle - half, middle + half])
+    kept = without_doubles(boxes, classes, iou, max_det)
+    return np.hstack([boxes, scores[rows][:, None], classes[:, None]])[kept].astype(np.float32)
+
+
+def without_doubles(boxes_xyxy: NDArray[np.floating], classes: NDArray[np.number], iou: float,
+                    most: int) -> NDArray[np.int64]:
+    """Return the rows of boxes (n, 4) that remain after non-maximum suppression by class.
+
+    The boxes are sorted, the best first. A box is dropped if its IoU with a kept box of its class
+    exceeds ``iou``.
+    """
+    left, top, right, bottom = boxes_xyxy.T
+    areas = (right - left) * (bottom - top)
+    is_open = np.ones(len(boxes_xyxy), dtype=bool)
+    kept: list[int] = []
+    for row in range(len(boxes_xyxy)):
+        if not is_open[row]:
+            continue
+        kept.append(row)
+        if len(kept) == most:
+            break
+        later = row + 1 + np.flatnonzero(is_open[row + 1:] & (classes[row + 1:] == classes[row]))
+        width = np.minimum(right[row], right[later]) - np.maximum(left[row], left[later])
+        height = np.minimum(bottom[row], bottom[later]) - np.maximum(top[row], top[later])
+        shared = np.maximum(width, 0) * np.maximum(height, 0)
+        # not divided by the union, which is 0 for boxes without area
+        is_open[later[shared > np.float32(iou) * (areas[row] + areas[later] - shared)]] = False
+    return np.array(kept, dtype=np.int64)

@@ -1,20 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Profiles: detector and encoder for a device."""
+"""Profiles: detector and encoder by name; the detector that options name."""
 
-import logging
+import json
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.models.devices import (
-    needs_pytorch,
-    resolve_device,
-    resolve_inference,
-    resolve_precision,
-)
 
 if TYPE_CHECKING:  # not at run time: nodes need the names of profiles before loading networks
     from cliploc_ros.models.clip_weights import ClipOptions
@@ -39,101 +33,66 @@ PROFILES = {
     'balanced': Profile('onnx-community/dfine_m_obj365-ONNX', '', _CLIP),
     'fast': Profile('onnx-community/dfine_n_coco-ONNX', '', _CLIP),
 }
-PROFILE_NAMES = ('auto', *PROFILES)
-logger = logging.getLogger(__name__)
+PROFILE_NAMES = tuple(PROFILES)
 
 
-def resolve_profile(profile: str, device: str) -> Profile:
-    """Return the profile of a name; 'auto' means 'accurate' on a GPU, 'balanced' on a CPU.
-
-    OptionsError: the name is unknown, or the device is missing.
-    """
-    if profile not in PROFILE_NAMES:
-        raise OptionsError(f"profile '{profile}' is not one of {', '.join(PROFILE_NAMES)}")
-    if profile == 'auto':
-        profile = 'balanced' if resolve_device(device) == 'cpu' else 'accurate'
-    return PROFILES[profile]
+def _profile(name: str) -> Profile:
+    if name not in PROFILES:
+        raise OptionsError(f"profile '{name}' is not one of {', '.join(PROFILES)}")
+    return PROFILES[name]
 
 
 def with_detector(options: 'DetectorOptions', profile: str) -> 'DetectorOptions':
-    """Return options that name a detector: that of the profile if the model is ''."""
-    if options.model:
-        return options
-    return replace(options, model=resolve_profile(profile, options.device).detector)
+    """Return options that name a detector: that of the profile if the model is ''.
+
+    OptionsError: the profile is unknown.
+    """
+    return options if options.model else replace(options, model=_profile(profile).detector)
 
 
 def with_encoder(options: 'ClipOptions', profile: str) -> 'ClipOptions':
     """Return options that name an encoder: that of the profile if they do not name one.
 
     If the options name a model, weights or a file, the missing ones are the defaults of
-    ClipOptions, not those of the profile, because weights belong to a model.
+    ClipOptions, not those of the profile, because weights belong to a model. OptionsError: the
+    profile is unknown.
     """
     if options.model or options.pretrained or options.checkpoint_path:
         defaults = type(options)
         return replace(options, model=options.model or defaults.model,
                        pretrained=options.pretrained or defaults.pretrained)
-    chosen = resolve_profile(profile, options.device)
+    chosen = _profile(profile)
     return replace(options, model=chosen.clip_model, pretrained=chosen.clip_pretrained)
 
 
 def load_detector(options: 'DetectorOptions') -> 'ObjectDetector':
-    """Load a detector of any kind.
+    """Load a detector; weights of ultralytics are exported to ONNX at their first use.
 
     Raises
     ------
     ModelError
-        The weights are missing or damaged, or are not those of a detection model.
+        The weights are missing or damaged, are not those of a detection model, or cannot be
+        exported, for example without PyTorch.
     OptionsError
-        The device or the inference engine is missing.
+        The options name prompts for a network with fixed classes.
     """
+    from cliploc_ros.models.files import fingerprint_file
     from cliploc_ros.models.hub import is_hub_name
     from cliploc_ros.models.onnx_detector import OnnxDetector
 
     path = Path(options.model).expanduser()
     if path.suffix == '.onnx' or path.is_dir() or is_hub_name(options.model):
         return OnnxDetector(options)
-    from cliploc_ros.models.yolo_weights import resolve_published
+    from cliploc_ros.models.exports import DETECTOR, exported
+    from cliploc_ros.models.yolo_weights import export_detector, resolve_published
 
     file = resolve_published(options.model, options.cache_dir, 'model')
-    device = resolve_device(options.device)
-    if resolve_inference(options.inference, device,
-                         resolve_precision(options.precision, device)) == 'openvino':
-        exported = _exported(file, options)
-        if exported is not None:
-            return OnnxDetector(exported)
-    with needs_pytorch(f'{file}, which is not an ONNX network,'):
-        from cliploc_ros.models.yolo_detector import YoloDetector
+    identity = [fingerprint_file(file)]
+    if options.prompts:
+        tower = Path(options.text_model).expanduser()
+        identity += [fingerprint_file(tower) if tower.is_file() else options.text_model,
+                     json.dumps(options.prompts)]
 
-        return YoloDetector(file, options)
-
-
-def _exported(file: Path, options: 'DetectorOptions') -> 'DetectorOptions | None':
-    """Export weights to ONNX once, and return options that name the ONNX file.
-
-    If a network cannot be exported, return None with inference 'auto', and raise an ExportError
-    with 'openvino'.
-    """
-    from cliploc_ros.models.exports import (
-        DETECTOR,
-        ExportError,
-        detector_identity,
-        find_export,
-        keep_export,
-    )
-
-    identity = detector_identity(file, options)
-    folder = find_export(options.cache_dir, 'YOLO', identity)
-    if folder is None:
-        with needs_pytorch(f'{file}, which is not an ONNX network,'):
-            from cliploc_ros.models.yolo_detector import export_detector
-
-            try:
-                folder = keep_export(options.cache_dir, 'YOLO', identity,
-                                     partial(export_detector, file, options))
-            except ExportError as error:
-                if options.inference == 'openvino':
-                    raise
-                logger.warning('%s; PyTorch runs it (set inference to pytorch to skip the '
-                               'attempt)', error)
-                return None
-    return replace(options, model=str(folder / DETECTOR), prompts=())
+    folder = exported(options.cache_dir, 'YOLO', str(file), identity,
+                      partial(export_detector, file, options))
+    return OnnxDetector(replace(options, model=str(folder / DETECTOR), prompts=()))

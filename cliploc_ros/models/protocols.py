@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.models.devices import check_run
 
 if TYPE_CHECKING:  # not at run time, for a fast --help of the programs
     import numpy as np
@@ -27,17 +26,15 @@ class DetectorOptions:
     """
 
     #: Path of an ONNX file, of a folder with one or of a ``.pt`` file; or a network that is
-    #: downloaded once: OWNER/NAME[@REVISION][:FILE] of the hub, or a published ``.pt`` file
+    #: downloaded once: OWNER/NAME[@REVISION][:FILE] of the hub, or a published ``.pt`` file.
+    #: PyTorch exports a ``.pt`` file to ONNX at its first use
     model: str = 'yolov8x.pt'
     conf: float = 0.1  #: Least confidence of a detection, 0 to 1
     iou: float = 0.7  #: Above this IoU, the weaker of two boxes of a class is dropped, 0 to 1
     imgsz: int = 640  #: Longer side of the scaled image that the network gets [px]
     max_det: int = 300  #: Greatest number of detections in an image; the most confident are kept
-    device: str = 'auto'  #: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'
-    precision: str = 'auto'  #: 'auto' (fp16 on a GPU, fp32 on a CPU), 'fp16' or 'fp32'
-    cache_dir: str = ''  #: Folder for downloads and compiled networks; '': the user's cache
-    #: 'auto' (OpenVINO on a CPU if it is installed), 'pytorch' or 'openvino'
-    inference: str = 'auto'
+    #: Folder for downloads, exported and compiled networks; '': the user's cache
+    cache_dir: str = ''
     #: Texts that a YOLO-World or YOLOE looks for; empty: the classes stored in its file
     prompts: Prompts = ()
     #: File of the text tower for prompts: CLIP ViT-B-32 for YOLO-World, mobileclip_blt.ts for
@@ -47,7 +44,6 @@ class DetectorOptions:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        check_run(self.precision, self.inference)
         for name in ('conf', 'iou'):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise OptionsError(f'{name} must be 0 to 1, not {getattr(self, name)}')
@@ -76,12 +72,10 @@ class ImageTextEncoder(Protocol):
 class ObjectDetector(Protocol):
     """Finds the objects in an image."""
 
-    device: str  #: The device that the network runs on
-    inference: str  #: The inference engine, such as 'pytorch'
     class_names: tuple[str, ...]  #: All classes of the network
 
     def configure(self, options: DetectorOptions) -> None:
-        """Change the options, except for model, device and inference."""
+        """Change the options, except for the model."""
 
     def detect(self, image_rgb: 'NDArray[np.uint8]') -> 'Detections':
         """Return the objects in an image (h, w, 3) uint8, the most confident first.

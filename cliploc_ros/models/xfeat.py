@@ -25,7 +25,6 @@ from cliploc_ros.core.keyframes.features import (
 )
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import read_file, replace_file, resolve_cache_dir
-from cliploc_ros.models.devices import import_openvino
 from cliploc_ros.models.files import download, first_line
 
 if TYPE_CHECKING:  # loaded where a layer has these features
@@ -91,10 +90,8 @@ def _is_published(content: bytes) -> bool:
 @cache
 def _network(file: Path) -> 'CompiledNetwork':
     """Load the network of a file; ModelError: see load_xfeat."""
-    from cliploc_ros.models.onnx_network import CompiledNetwork
+    from cliploc_ros.models.onnx_network import CompiledNetwork, import_openvino
 
-    if import_openvino() is None:
-        raise ModelError(f'{file} needs OpenVINO: pip install openvino, {WITHOUT_XFEAT}')
     try:
         is_published = _is_published(read_file(file))
     except OSError as error:
@@ -104,6 +101,8 @@ def _network(file: Path) -> 'CompiledNetwork':
                          f'{WITHOUT_XFEAT}')
     try:
         return CompiledNetwork.of(any_size(import_openvino().Core().read_model(file)))
+    except ModelError as error:
+        raise ModelError(f'{error}, {WITHOUT_XFEAT}') from error
     except Exception as error:  # OpenVINO has no exception classes
         raise ModelError(f'OpenVINO cannot run {file}: {first_line(error)}; update OpenVINO, '
                          f'{WITHOUT_XFEAT}') from error

@@ -1,9 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Weights of YOLO, and the import of ultralytics (AGPL-3.0).
+"""Weights of YOLO: find them, and export them to ONNX with ultralytics (AGPL-3.0).
 
 `import_ultralytics` must be called before any other import of ultralytics: it sets environment
 variables that prevent network requests, installations and files in the home directory.
+
+YOLO-World and YOLOE take embeddings of texts from the text tower that they were trained with:
+YOLO-World from OpenAI's CLIP ViT-B-32, YOLOE from MobileCLIP. Embeddings are cached.
 """
 
 import atexit
@@ -12,16 +15,34 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.errors import ModelError, did_you_mean
-from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.devices import needs_pytorch
-from cliploc_ros.models.files import check_weights_file, download, first_line
+import numpy as np
+from numpy.typing import NDArray
 
+from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
+from cliploc_ros.files.storage import resolve_cache_dir
+from cliploc_ros.models.clip_encoder import encode_labels
+from cliploc_ros.models.clip_weights import (
+    CHECKPOINT,
+    WITHOUT_CLIP,
+    ClipOptions,
+    resolve_clip_weights,
+)
+from cliploc_ros.models.export import OPSET, compare, halve, quiet_export
+from cliploc_ros.models.exports import DETECTOR, describe_export, needs_pytorch
+from cliploc_ros.models.files import check_weights_file, download, fingerprint_file, first_line
+from cliploc_ros.models.label_embeddings import LabelCache
+from cliploc_ros.models.protocols import DetectorOptions
+
+# Sides of an input must be multiples of the stride.
 _LEAST_STRIDE = 32
+# Length of an embedding of a text in all networks that take texts, and the towers of YOLOE.
+_EMBED_DIM = 512
+_TOWERS = {'mobileclip:blt': 'mobileclip_blt.ts', 'mobileclip2:b': 'mobileclip2_b.ts'}
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +50,7 @@ logger = logging.getLogger(__name__)
 @cache
 def import_ultralytics() -> Any:
     """Import ultralytics without network requests, installations and files in the home."""
-    import torch  # before ultralytics, which sets OMP_NUM_THREADS to 1
+    import torch  # noqa: F401  before ultralytics, which sets OMP_NUM_THREADS to 1
 
     if 'ultralytics' in sys.modules:
         logger.warning('ultralytics was imported before the detector: it may use the network')
@@ -52,18 +73,7 @@ def import_ultralytics() -> Any:
     ultralytics_logger.handlers.clear()
     ultralytics_logger.propagate = True
     ultralytics_logger.setLevel(logging.WARNING)
-    if not _is_restricted(ultralytics):
-        logger.warning('ultralytics %s with torch %s runs code in files of weights: load only '
-                       'trusted files', ultralytics.__version__, torch.__version__)
     return ultralytics
-
-
-def _is_restricted(ultralytics: Any) -> bool:
-    """Return whether ultralytics reads only weights, and refuses code in their files."""
-    import torch
-
-    return (getattr(ultralytics.utils, 'SAFE_LOAD', False)
-            and hasattr(torch.serialization, 'get_unsafe_globals_in_checkpoint'))
 
 
 def resolve_published(given: str, cache_dir: str, option: str) -> Path:
@@ -82,7 +92,7 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
         check_weights_file(folder / name)
         return folder / name
     with needs_pytorch(f'{name}, which is not a local file and not in {folder},'):
-        _refuse_code(folder / name)
+        import_ultralytics()
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset
 
     if name not in GITHUB_ASSETS_NAMES:
@@ -100,32 +110,22 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
         f'on another machine and set the {option} to the path of the file'), fetch)
 
 
-def _refuse_code(file: Path) -> None:
-    """Raise a ModelError if a downloaded file could run code."""
-    if not _is_restricted(import_ultralytics()):
-        raise ModelError(f'this ultralytics or PyTorch would run code in {file.name}: update '
-                         'them, or give the path of a file that you trust')
-
-
-def stride_of(model: Any) -> int:
-    """Return the stride of a model: sides of an input must be multiples of it."""
-    return max(int(model.stride.max()), _LEAST_STRIDE)
-
-
-def load_yolo(file: Path, is_download: bool = False) -> Any:
+def load_yolo(file: Path) -> Any:
     """Load the detection model of ultralytics in a ``.pt`` file.
 
     The file is a pickle, which can run code. This function reads it in the restricted mode of
-    ultralytics (``weights_only=True`` and a list of known classes), which refuses code. Versions
-    of ultralytics without this mode, and PyTorch before 2.6, read plain pickles: in this case,
-    only a file that the options name by its path is loaded, with a warning to load only trusted
-    files.
+    ultralytics (``weights_only=True`` and a list of known classes), which refuses code.
 
-    ModelError: the file is damaged or not a detection model.
+    ModelError: the file is damaged or not a detection model, or the installed ultralytics or
+    PyTorch (before 2.6) lacks this mode.
     """
+    import torch
+
     ultralytics = import_ultralytics()
-    if is_download:
-        _refuse_code(file)
+    if not (getattr(ultralytics.utils, 'SAFE_LOAD', False)
+            and hasattr(torch.serialization, 'get_unsafe_globals_in_checkpoint')):
+        raise ModelError(f'ultralytics {ultralytics.__version__} with torch {torch.__version__} '
+                         f'would run code in {file}: update them')
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_yolo_') as desk:
         # Ultralytics changes some paths (quotes, yolov5) and requires the suffix.
         neutral = Path(desk) / 'weights.pt'
@@ -141,3 +141,107 @@ def load_yolo(file: Path, is_download: bool = False) -> Any:
         raise ModelError(f"{file} is a YOLO model for the task '{model.task}': give a model for "
                          "'detect'")
     return model
+
+
+def export_detector(file: Path, options: DetectorOptions, folder: Path, half: bool = False
+                    ) -> None:
+    """Export a YOLO of ultralytics into a folder, with the classes of the options' prompts.
+
+    ``half``: see export_clip.
+
+    ExportError: the results differ from those in PyTorch. ModelError: the file is damaged or not a
+    detection model. OptionsError: the network does not take texts.
+    """
+    import torch
+
+    loaded = load_yolo(file)
+    if options.prompts:
+        set_prompts(loaded, options)
+        classes = dict(options.prompts)
+        loaded.model.names = {number: classes[name] for number, name in loaded.names.items()}
+    model = loaded.model.float().eval()
+    model.pt_path = str(folder / 'model.pt')
+    with quiet_export():
+        loaded.export(format='onnx', dynamic=True, simplify=False, opset=OPSET, verbose=False)
+    if half:
+        halve(folder / DETECTOR)
+    stride = max(int(model.stride.max()), _LEAST_STRIDE)
+    probe = np.random.default_rng(0).random((1, 3, 2 * stride, 3 * stride), dtype=np.float32)
+    with torch.inference_mode():
+        outputs = model(torch.from_numpy(probe))
+    expected = outputs[0] if isinstance(outputs, tuple | list) else outputs
+    compare(folder / DETECTOR, probe, expected[0] if isinstance(expected, tuple) else expected,
+            half)
+    describe_export(folder, 'detector')
+
+
+def set_prompts(model: Any, options: DetectorOptions) -> str:
+    """Set the options' prompts in a network of ultralytics; return the key of the text tower.
+
+    Raises
+    ------
+    OptionsError
+        The network does not take texts.
+    ModelError
+        The text tower is missing or damaged, or belongs to another network.
+    """
+    import torch
+
+    ultralytics = import_ultralytics()
+    network, texts = model.model, [text for text, _ in options.prompts]
+    is_yoloe, head = isinstance(model, ultralytics.YOLOE), model.model.model[-1]
+    if (not is_yoloe and not isinstance(model, ultralytics.YOLOWorld)) or hasattr(head, 'lrpc'):
+        raise OptionsError(f'{options.model} takes no texts: a vocabulary needs a YOLO-World or a '
+                           'YOLOE with prompts, such as yolov8s-worldv2.pt')
+    key, encode = _tower(getattr(network, 'text_model', 'mobileclip:blt') if is_yoloe else 'clip',
+                         options)
+    cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
+    rows = cache.load(key, texts, _EMBED_DIM)
+    if rows is None:
+        rows = encode(texts)
+        cache.store(key, texts, rows)
+    embedded = torch.from_numpy(rows)[None]
+    if is_yoloe:
+        with torch.no_grad():
+            network.set_classes(texts, head.get_tpe(embedded))
+    else:  # as in WorldModel.set_classes, which would load its own text tower
+        network.txt_feats, head.nc, network.names = embedded, len(texts), dict(enumerate(texts))
+    return key
+
+
+def _tower(name: str, options: DetectorOptions
+           ) -> tuple[str, Callable[[Sequence[str]], NDArray[np.float32]]]:
+    """Return the key of a text tower, and a function that embeds texts; see set_prompts."""
+    if name == 'clip' and not options.text_model.endswith('.ts'):
+        try:
+            clip = ClipOptions('ViT-B-32', 'openai', checkpoint_path=options.text_model,
+                               cache_dir=options.cache_dir)
+            weights = resolve_clip_weights(clip)
+        except ModelError as error:
+            remedy = str(error).replace(f'{CHECKPOINT}{WITHOUT_CLIP}', 'text_model to the file')
+            raise ModelError(f'text tower of {options.model}: {remedy}') from error
+        return weights.key, lambda texts: encode_labels(weights, texts, clip)
+    if name not in ('clip', *_TOWERS):
+        raise ModelError(f"{options.model} needs the text tower '{name}', which is unknown: "
+                         f'expected {", ".join(_TOWERS)}')
+    file = resolve_published(options.text_model or _TOWERS[name], options.cache_dir, 'text_model')
+    return f'torchscript:{fingerprint_file(file)}', lambda texts: _run_torchscript(file, texts)
+
+
+def _run_torchscript(file: Path, texts: Sequence[str]) -> NDArray[np.float32]:
+    """Return the embeddings (n, _EMBED_DIM) of texts, unit rows, by a tower in TorchScript."""
+    import open_clip
+    import torch
+
+    tokens = open_clip.get_tokenizer('ViT-B-32')(list(texts))
+    try:
+        with torch.inference_mode():
+            found = torch.jit.load(file, map_location='cpu')(tokens).float().numpy()
+    except Exception as error:  # PyTorch has no exception classes
+        raise ModelError(f'{file} is not a text tower in TorchScript: {first_line(error)}'
+                         ) from error
+    lengths = np.linalg.norm(found, axis=-1, keepdims=True)
+    if found.shape != (len(texts), _EMBED_DIM) or not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise ModelError(f'{file} gives embeddings of shape {found.shape} or length 0, expected '
+                         f'{(len(texts), _EMBED_DIM)}: it is not the text tower of this detector')
+    return np.asarray(found / lengths, dtype=np.float32)

@@ -190,7 +190,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
                           prompts=prompts, text_model=parameters.text_model)
         self._detector = load_detector(options)
         of_texts = f', {len(options.prompts)} texts' if options.prompts else ''
-        return f'detector {options.model} ({self._detector.inference}{of_texts})'
+        return f'detector {options.model}{of_texts}'
 
     @property
     def detector(self) -> ObjectDetector | None:
@@ -212,7 +212,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         self._update()
 
     def examine(self, health: Health) -> None:
-        """Report the input, rates, dropped messages and the device."""
+        """Report the input, rates and dropped messages."""
         for camera in self._cameras.values():
             camera.examine(health, self.settings.values.stale_after_s)
         if self._last_error:
@@ -222,8 +222,6 @@ class DetectorNode(ManagedNode[DetectorParameters]):
                           f'{0.0 if since is None else time.monotonic() - since:.2f}'}
         if self._first_boxes_s is not None:
             health.values['first boxes after [s]'] = f'{self._first_boxes_s:.2f}'
-        if self._detector is not None:
-            health.values['device'] = self._detector.device
 
     def _update(self) -> None:
         """Subscribe to the images of each camera whose detections have a subscriber."""
@@ -265,8 +263,7 @@ def detector_options(parameters: DetectorParameters) -> DetectorOptions:
     """Return the network's options."""
     return DetectorOptions(
         model=parameters.model, conf=parameters.conf, iou=parameters.iou, imgsz=parameters.imgsz,
-        max_det=parameters.max_det, device=parameters.device, cache_dir=parameters.cache_dir,
-        inference=parameters.inference)
+        max_det=parameters.max_det, cache_dir=parameters.cache_dir)
 
 
 def main() -> NoReturn:

@@ -139,7 +139,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             part.forget()
 
     def examine(self, health: Health) -> None:
-        """Report the inputs, the last verdict and the device."""
+        """Report the inputs and the last verdict."""
         parameters = self.settings.values
         missing = [line for source in self._frames.sources.values() for line in source.missing()]
         if parameters.require_localizer and (no_localizer := self._handoff.missing()):
@@ -170,8 +170,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                 health.fail(f'{wrong}: check camera_info, and the pixels and corners of the boxes')
             if parameters.depth_transport != 'none':
                 health.values['depth scale'] = f'{depth_scale.ratio:.2f}'
-            health.values |= {'map': localizer.description, 'map hash': localizer.map_hash,
-                              'device': localizer.device}
+            health.values |= {'map': localizer.description, 'map hash': localizer.map_hash}
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         answer = self._answer()

@@ -206,7 +206,7 @@ def _check_map(node: Doctor, parameters: RelocalizerParameters, report: Report
     began_at = time.monotonic()
     with report.failing('map'):
         localizer = node.worker.run(partial(load_localizer, node, parameters))
-        report.add('map', State.PASS, f'{localizer.description}, on {localizer.device}, loaded in '
+        report.add('map', State.PASS, f'{localizer.description}, loaded in '
                                       f'{time.monotonic() - began_at:.1f} s')
         keyframes, file = localizer.keyframes, keyframes_path(parameters)
         if file is None:

@@ -86,8 +86,6 @@ class FrameLocalizer:
         Compares crops with the map's labels and images. None if only classes are matched.
     relocalizer : Relocalizer
         Relocalizer of the map, with these options.
-    device : str
-        Device of the observer's network.
     map_hash : str
         See load_hashed_map.
     keyframes : Keyframes, optional
@@ -95,9 +93,9 @@ class FrameLocalizer:
     """
 
     def __init__(self, landmark_map: LandmarkMap, observer: 'Observer | None',
-                 relocalizer: Relocalizer, options: RelocalizerOptions, device: str,
-                 map_hash: str, keyframes: Keyframes | None = None) -> None:
-        self.device, self.map_hash, self.keyframes = device, map_hash, keyframes
+                 relocalizer: Relocalizer, options: RelocalizerOptions, map_hash: str,
+                 keyframes: Keyframes | None = None) -> None:
+        self.map_hash, self.keyframes = map_hash, keyframes
         #: The map, or all maps joined, and the coordinate frames of the maps
         self.landmark_map = landmark_map
         self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
@@ -220,19 +218,17 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
     keyframes = load_keyframes(parameters, landmark_map)
     if not len(landmark_map) and keyframes is None:
         raise MapError('the map has neither landmarks nor keyframes next to it: rebuild it')
-    observer, device = None, 'cpu'
+    observer = None
     if options.needs_similarities and len(landmark_map):
         from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
         from cliploc_ros.models.observer import Observer
         asked = (clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings)
         if former is not None and former.observer is not None:
-            observer, device = former.observer.with_labels(embed_map(*asked)), former.device
+            observer = former.observer.with_labels(embed_map(*asked))
         else:
-            encoder, embeddings = load_encoder_for_map(*asked)
-            observer, device = Observer(encoder, embeddings), encoder.device
+            observer = Observer(*load_encoder_for_map(*asked))
             observer.measure()
-    return FrameLocalizer(landmark_map, observer, relocalizer, options, device, map_hash,
-                          keyframes)
+    return FrameLocalizer(landmark_map, observer, relocalizer, options, map_hash, keyframes)
 
 
 def clip_options_of(parameters: RelocalizerParameters) -> 'ClipOptions':
@@ -240,8 +236,7 @@ def clip_options_of(parameters: RelocalizerParameters) -> 'ClipOptions':
     from cliploc_ros.models.clip_weights import ClipOptions
     named = ClipOptions(
         model=parameters.clip_model, pretrained=parameters.clip_pretrained,
-        checkpoint_path=parameters.clip_checkpoint_path, device=parameters.device,
-        cache_dir=parameters.cache_dir, inference=parameters.inference)
+        checkpoint_path=parameters.clip_checkpoint_path, cache_dir=parameters.cache_dir)
     return with_encoder(named, parameters.profile)
 
 

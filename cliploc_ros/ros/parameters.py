@@ -21,7 +21,6 @@ from cliploc_ros.core.options import (
 )
 from cliploc_ros.errors import MapError, OptionsError
 from cliploc_ros.messages import parse_class_map
-from cliploc_ros.models.devices import INFERENCES
 from cliploc_ros.models.profiles import PROFILE_NAMES
 from cliploc_ros.ros.conversions import DETECTION_TYPES
 from cliploc_ros.ros.node.parameters import Parameters, parameter
@@ -41,12 +40,6 @@ _SEARCH_SHARE = 0.5
 class CommonParameters(Parameters):
     """Parameters that both nodes have."""
 
-    device: str = parameter('auto',
-        "Device of the network: 'auto' (a GPU if there is one), 'cpu', 'cuda' or 'cuda:N'.",
-        read_only=True)
-    inference: str = parameter('auto',
-        "Engine of the network; 'auto': OpenVINO on a CPU, PyTorch on a GPU.",
-        choices=INFERENCES, read_only=True)
     cache_dir: str = parameter('',
         'Folder of downloads, label embeddings, compiled networks and kernels; empty: '
         '~/.cache/cliploc_ros.', read_only=True)
@@ -80,8 +73,8 @@ class CommonParameters(Parameters):
 class DetectorParameters(CommonParameters):
     """The parameters of the detector."""
 
-    profile: str = parameter('auto',
-        "Detector; 'auto': accurate on a GPU, balanced on a CPU.", choices=PROFILE_NAMES,
+    profile: str = parameter('balanced',
+        'Detector, if model is empty.', choices=PROFILE_NAMES,
         read_only=True)
     model: str = parameter('',
         'An ONNX file or a folder with one, OWNER/NAME on the Hugging Face hub, or YOLO weights '
@@ -201,8 +194,8 @@ class RelocalizerParameters(CommonParameters):
         'is accepted (only for matching hybrid with algorithm auto).', choices=CROPS)
     max_detections: int = parameter(50,
         'Use at most this many detections, the most confident.', low=3, high=1000)
-    profile: str = parameter('auto',
-        "Encoder; 'auto': accurate on a GPU, balanced on a CPU.", choices=PROFILE_NAMES,
+    profile: str = parameter('balanced',
+        'Encoder, if none is named below.', choices=PROFILE_NAMES,
         read_only=True)
     clip_model: str = parameter('',
         'Architecture of open_clip weights, or a model config (.json); not needed for ONNX files.',

@@ -10,7 +10,7 @@ from cliploc_ros.command import run_command
 
 STUDIES = {
     'search': 'the search, compared with a plain loop in the same run, and by size of the map',
-    'frame': 'a request by stage, for each profile, in PyTorch and OpenVINO',
+    'frame': 'a request by stage, for two pairs of networks',
     'node_start': 'the start of the relocalizer'}
 
 if __name__ == '__main__':

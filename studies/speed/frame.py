@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure a request by stage for some networks: ``python -m studies.speed frame``.
 
-Each pair of detector and CLIP runs in two processes, one after the other: with PyTorch and with
-OpenVINO. The image, its boxes and the map are the demo's. The search uses the similarities of the
-demo's own CLIP, since similarities from random weights mean nothing. Weights that are not in the
-cache are random: the times are then still valid, but the detections and embeddings are not.
+Each pair of detector and CLIP runs in a process of its own. The image, its boxes and the map are
+the demo's. The search uses the similarities of the demo's own CLIP, since similarities from random
+weights mean nothing. Weights that are not in the cache are random: the times are then still valid,
+but the detections and embeddings are not.
 """
 
 import os
@@ -22,7 +22,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -38,18 +37,16 @@ from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.devices import free_memory
 from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.onnx_network import free_memory
 from cliploc_ros.models.profiles import PROFILES, Profile, load_detector
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 from cliploc_ros.models.yolo_weights import import_ultralytics
 from demo import ASSETS
 from studies.reports import table
 from studies.rooms.rooms import open_folder, posed
 
-# Networks of ultralytics and open_clip, which both engines run.
 _PAIRS = {'paper': PROFILES['accurate'], 'small': Profile('yolov8n.pt', 'ViT-B-32', 'openai')}
-_ENGINES = ('pytorch', 'openvino')
 _STAGES = ('detection', 'CLIP', 'search')
 # The node's default.
 _TIME_BUDGET_S = 0.05
@@ -63,32 +60,29 @@ def run(arguments: Sequence[str]) -> int:
     parser.add_argument('--crops', type=int, default=12, metavar='N', help='(%(default)s)')
     parser.add_argument('--rounds', type=int, default=5, metavar='N', help='(%(default)s)')
     parser.add_argument('--threads', type=int, default=2, metavar='N', help='(%(default)s)')
-    parser.add_argument('--device', default='cpu',
-                        help='on a GPU only PyTorch is measured (%(default)s)')
-    parser.add_argument('--child', nargs=4, metavar='X', help=argparse.SUPPRESS)
+    parser.add_argument('--child', nargs=3, metavar='X', help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.child:
-        print(json.dumps(_measure(*options.child, crops=options.crops, rounds=options.rounds,
-                                  device=options.device)))
+        print(json.dumps(_measure(*options.child, crops=options.crops, rounds=options.rounds)))
         return 0
     rows = []
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_frame_') as folder:
-        for name, engine in product(options.networks,
-                                    _ENGINES if options.device == 'cpu' else _ENGINES[:1]):
+        for name in options.networks:
             yolo, clip, kind = _weights(name, Path(folder))
+            _load(yolo, clip, folder)  # exports and compiles them
             done = subprocess.run(
-                [sys.executable, '-m', 'studies.speed', 'frame', *arguments, '--child', engine,
-                 yolo, clip, folder], stdout=subprocess.PIPE, text=True, check=True,
+                [sys.executable, '-m', 'studies.speed', 'frame', *arguments, '--child', yolo,
+                 clip, folder], stdout=subprocess.PIPE, text=True, check=True,
                 env=os.environ | {'OMP_NUM_THREADS': str(options.threads)})
             found = json.loads(done.stdout.splitlines()[-1])
             wall, processor = found['wall_ms'], found['processor_ms']
-            rows.append([name, engine, *(
+            rows.append([name, *(
                 f'{wall_ms:.0f} ({processor_ms:.0f})' for wall_ms, processor_ms in zip(
                     [*wall, sum(wall)], [*processor, sum(processor)], strict=True)),
                 f'{found["start_s"]:.1f}', f'{found["mib"]:.0f}', kind])
-    print(f'{options.crops} crops of 640 x 480 px, all embedded; {options.threads} threads, device'
-          f' {options.device}; median of {options.rounds} rounds: ms (ms of processor time)')
-    print(table(['networks', 'engine', *_STAGES, 'total', 'start [s]', 'MiB', 'weights'], rows))
+    print(f'{options.crops} crops of 640 x 480 px, all embedded; {options.threads} threads; '
+          f'median of {options.rounds} rounds: ms (ms of processor time)')
+    print(table(['networks', *_STAGES, 'total', 'start [s]', 'MiB', 'weights'], rows))
     return 0
 
 
@@ -119,24 +113,21 @@ def _weights(name: str, folder: Path) -> tuple[str, str, str]:
     return str(yolo), encoder, f'random: {", ".join(random)}' if random else 'published'
 
 
-def _measure(engine: str, yolo: str, clip: str, folder: str, *, crops: int, rounds: int,
-             device: str) -> dict[str, Any]:
-    """Load networks, and measure the median times of requests with them."""
-    import open_clip  # noqa: F401  (before the measurements)
+def _load(yolo: str, clip: str, folder: str) -> tuple[ObjectDetector, ClipEncoder]:
+    options = ClipOptions(*json.loads(clip), cache_dir=folder)
+    return (load_detector(DetectorOptions(yolo, cache_dir=folder)),
+            ClipEncoder(resolve_clip_weights(options), options))
 
-    import_ultralytics()
+
+def _measure(yolo: str, clip: str, folder: str, *, crops: int, rounds: int) -> dict[str, Any]:
+    """Load networks, and measure the median times of requests with them."""
     image_rgb, observation = _demo_frame(crops, folder)
     relocalizer = Relocalizer(LandmarkMap.from_file(ASSETS / 'map.yaml'),
                               RelocalizerOptions(time_budget_s=_TIME_BUDGET_S))
     relocalizer.warm_up()
     free_memory()
     imports_mib, started = _resident_mib(), time.perf_counter()
-    detector = load_detector(
-        DetectorOptions(yolo, device=device, inference=engine, cache_dir=folder))
-    model, pretrained, file = json.loads(clip)
-    options = ClipOptions(model, pretrained, file, device=device, inference=engine,
-                          cache_dir=folder)
-    encoder = ClipEncoder(resolve_clip_weights(options), options)
+    detector, encoder = _load(yolo, clip, folder)
     start_s = time.perf_counter() - started
     stages: tuple[Callable[[], Any], ...] = (
         lambda: detector.detect(image_rgb),
@@ -158,14 +149,13 @@ def _measure(engine: str, yolo: str, clip: str, folder: str, *, crops: int, roun
 
 def _demo_frame(crops: int, folder: str) -> tuple[NDArray[np.uint8], Observation]:
     """Return an image of the demo with enough boxes, and the demo networks' observation of it."""
-    detector = load_detector(DetectorOptions(str(ASSETS / 'yolo.pt'), inference='pytorch'))
+    detector = load_detector(DetectorOptions(str(ASSETS / 'yolo.onnx')))
     for raw in posed(open_folder(str(ASSETS / 'sequence'))[1]):
         image_rgb, camera = raw.color()
         detections = detector.detect(image_rgb).usable(camera.width, camera.height, crops)
         if len(detections) == crops:
             break
-    clip = ClipOptions(str(ASSETS / 'clip.json'), str(ASSETS / 'clip.safetensors'),
-                       inference='pytorch', cache_dir=folder)
+    clip = ClipOptions(pretrained=str(ASSETS / 'clip'), cache_dir=folder)
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     observer = Observer(*load_encoder(clip, landmark_map.weighted_labels))
     return image_rgb, observer.observe(image_rgb, camera, detections, 0)

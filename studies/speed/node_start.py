@@ -28,7 +28,7 @@ _STARTS = {'colcon build': 'first', 'script/setup': 'second', 'warm': 'second'}
 
 def _start(package: Path, matching: str, kernels: Path, cache: Path) -> tuple[float, float]:
     """Return processor time and elapsed time [s] until the relocalizer of a package is ready."""
-    parameters = {'map_file': ASSETS / 'map.yaml', 'matching': matching, 'device': 'cpu',
+    parameters = {'map_file': ASSETS / 'map.yaml', 'matching': matching,
                   'clip_pretrained': ASSETS / 'clip', 'cache_dir': cache}
     command = [sys.executable, '-m', 'cliploc_ros.nodes.relocalizer', '--ros-args']
     for name, value in parameters.items():

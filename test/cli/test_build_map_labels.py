@@ -16,7 +16,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.observations import load_observations
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
-CLIP = ('--clip-pretrained', ASSETS / 'clip', '--device', 'cpu')
+CLIP = ('--clip-pretrained', ASSETS / 'clip')
 # a short walk shows objects from one side only
 SHORT = ('--min-baseline', '0.5', '--no-check')
 IMAGES = 10

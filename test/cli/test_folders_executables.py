@@ -25,7 +25,7 @@ from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.views import make_views
 
 pytestmark = [pytest.mark.full, pytest.mark.needs('pycolmap')]
-NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--device', 'cpu')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx')
 CLIP = ('--clip-pretrained', ASSETS / 'clip')
 
 

@@ -29,8 +29,7 @@ def walk(tmp_path_factory):
     folder = tmp_path_factory.mktemp('walk')
     shutil.copytree(ASSETS / 'sequence', folder / 'sequence')
     shutil.copy(ASSETS / 'map.yaml', folder)
-    clip = ClipOptions(device='cpu', cache_dir=str(folder),
-                       pretrained=str(ASSETS / 'clip'))
+    clip = ClipOptions(cache_dir=str(folder), pretrained=str(ASSETS / 'clip'))
     landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
     others = np.roll(np.asarray(embed_labels(
         resolve_clip_weights(clip), clip, landmark_map.labels)), 1, axis=0)
@@ -38,7 +37,7 @@ def walk(tmp_path_factory):
         resolve_clip_weights(clip).key, landmark_map.landmark_ids, others.astype(np.float16),
         others[:0].astype(np.float16), np.zeros(len(others) + 1, np.int64)))
     return folder, landmark_map, RecordingOptions(
-        DetectorOptions(model=str(ASSETS / 'yolo.onnx'), device='cpu'), clip, EVERY_FRAME,
+        DetectorOptions(model=str(ASSETS / 'yolo.onnx')), clip, EVERY_FRAME,
         'every 24th')
 
 

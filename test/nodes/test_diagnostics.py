@@ -43,7 +43,6 @@ def test_a_relocalizer_that_hears_everything_nothing_and_half(own_relocalizer, t
     frame = make_frame()
     values = status.wait(OK, 'active', frame, **{'last verdict': 'accepted: x 0.3'})
     assert values['state'] == 'active'
-    assert values['device'] == 'cpu'
     assert int(values['accepted']) > 0
     assert float(values['search p99 [ms]']) >= float(values['search mean [ms]']) > 0.0
     assert {'waiting last [ms]', 'queue age [s]', 'images dropped unpaired',
@@ -87,7 +86,6 @@ def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
         values = status.wait(OK, 'active', (image,), **{'listened to': 'True',
                                                        'detection mean [ms]': '.'})
         assert detected
-        assert values['device'] in ('cpu', 'cuda:0')
         assert float(values['first boxes after [s]']) > 0.0
         assert {'images dropped', 'queue age [s]', 'waiting last [ms]', 'memory [MiB]'} <= set(
             values)

@@ -39,7 +39,7 @@ def slow(own_relocalizer, tester, weights, tmp_path):
     return own_relocalizer(
         matching='hybrid', algorithm='auto', min_confidence=1.0, clip_model='ViT-B-32',
         clip_pretrained=weights, cache_dir=tmp_path, timeout_s=TIMEOUT_S,
-        max_detections=BOXES, device='cpu')
+        max_detections=BOXES)
 
 
 def crowded_frame(number):

@@ -23,7 +23,7 @@ from cliploc_ros.offline.recording.networks import RunNetworks
 from demo.truth import read_objects
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
-NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--device', 'cpu')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx')
 # Distortion of the TUM sequences fr1.
 LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob',
               (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))

@@ -30,7 +30,7 @@ from cliploc_ros.offline.recording.recorder import (
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'demo/assets'
-NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--device', 'cpu')
+NETWORKS = ('--model', ASSETS / 'yolo.onnx')
 CLIP = ('--clip-pretrained', ASSETS / 'clip')
 # A short walk shows objects from one side only: this test is about the networks' output.
 ALL = ('--min-baseline', '1', '--frame-id', 'room', '--no-check')
@@ -115,7 +115,7 @@ def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen):
         for place in range(seen):
             yield RawFrame(place, place, np.eye(4), lambda: (image, camera), None)
         raise DatasetError('ends here')
-    options = RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx'), device='cpu'), None)
+    options = RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx')), None)
     with pytest.raises(DatasetError, match='ends here'):
         record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
     left = list(tmp_path.iterdir())

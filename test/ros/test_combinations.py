@@ -49,7 +49,7 @@ class Drive:
             time_budget_ms=5000.0, record_folder=str(folder / 'cases'))
         options = self.parameters.options()
         keyframes = Keyframes(KeyframeLocalizer(LAYER)) if known in ('keyframes', 'all') else None
-        self.localizer = FrameLocalizer(MAP, None, Relocalizer(MAP, options), options, 'cpu', '',
+        self.localizer = FrameLocalizer(MAP, None, Relocalizer(MAP, options), options, '',
                                         keyframes)
         self.has_odometry, self.has_depth = True, known in ('depth', 'all')
         self.region = None if known not in ('prior', 'all') else Region(

@@ -70,12 +70,11 @@ def world(tmp_path_factory):
     count = len(named)
     write_map(folder / 'map.yaml',
               replace(named, labels=('a thing',) * count, class_ids=('thing',) * count))
-    clip = ClipOptions(device='cpu', cache_dir=str(folder),
-                       pretrained=str(ASSETS / 'clip'))
+    clip = ClipOptions(cache_dir=str(folder), pretrained=str(ASSETS / 'clip'))
     images = images_of(named, ClipEncoder(resolve_clip_weights(clip), clip))
     save_landmark_embeddings(embeddings_path(folder / 'map.yaml'), images)
     return RelocalizerParameters(
-        map_file=str(folder / 'map.yaml'), clip_model=clip.model, device='cpu',
+        map_file=str(folder / 'map.yaml'), clip_model=clip.model,
         clip_pretrained=clip.pretrained, cache_dir=str(folder), time_budget_ms=1e4)
 
 

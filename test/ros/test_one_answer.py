@@ -120,7 +120,7 @@ def by_check(landmark_map, layer, queries):
 
 def by_node(landmark_map, layer, queries, file):
     localizer = FrameLocalizer(
-        landmark_map, None, Relocalizer(landmark_map, OPTIONS), OPTIONS, 'cpu', '',
+        landmark_map, None, Relocalizer(landmark_map, OPTIONS), OPTIONS, '',
         layer and Keyframes(KeyframeLocalizer(layer)))
     found = []
     for query in queries:

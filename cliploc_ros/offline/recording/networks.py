@@ -17,7 +17,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.devices import set_threads
+from cliploc_ros.models.onnx_network import set_threads
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ImageTextEncoder
 from cliploc_ros.offline.datasets.frames import RawFrame
@@ -80,7 +80,7 @@ class LoadNetworks:
 
     detector: DetectorOptions
     clip: ClipOptions | None  #: None: classes and boxes only
-    threads: int = 0  #: Threads of a network on a CPU; 0: the default of the network
+    threads: int = 0  #: Threads of a network; 0: the default of the network
 
     def __call__(self) -> Callable[[RawFrame], SeenFrame | str]:
         """Load the networks; return the function that runs them on a frame.

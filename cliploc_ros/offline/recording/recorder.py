@@ -389,9 +389,10 @@ def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> 
 
 def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
     """Return the options that change the output of a network."""
-    return {name: value for name, value in asdict(options).items()
-            if name not in ('cache_dir', 'max_batch', 'inference')
-            and (value or name not in ('prompts', 'text_model'))}  # as in files of older versions
+    # as in files of older versions
+    settings = asdict(options) | {'device': 'auto', 'precision': 'auto'}
+    return {name: value for name, value in settings.items() if name != 'cache_dir'
+            and (value or name not in ('prompts', 'text_model'))}
 
 
 def _state(path: Path) -> tuple[int, int] | None:

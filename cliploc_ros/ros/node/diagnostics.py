@@ -8,7 +8,6 @@ diagnostic_updater does the same, but has no package on PyPI.
 import csv
 import io
 import os
-import sys
 import threading
 import time
 from collections import deque
@@ -178,7 +177,7 @@ class Diagnostics:
             state, health = self._state(), self._health()
         pages = int(Path('/proc/self/statm').read_text().split()[1])  # resident pages
         values = {'state': state, **health.values, 'memory [MiB]':
-                  f'{pages * os.sysconf("SC_PAGE_SIZE") / 2**20:.0f}', **_gpu_memory()}
+                  f'{pages * os.sysconf("SC_PAGE_SIZE") / 2**20:.0f}'}
         name = self._node.get_fully_qualified_name().lstrip('/')
         status = DiagnosticStatus(
             level=health.level, name=f'{name}: status', hardware_id=name,
@@ -187,12 +186,3 @@ class Diagnostics:
         msg = DiagnosticArray(status=[status])
         msg.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(msg)
-
-
-def _gpu_memory() -> dict[str, object]:
-    """Return the GPU memory that PyTorch uses; empty if it uses none."""
-    torch = sys.modules.get('torch')
-    cuda = getattr(torch, 'cuda', None)  # torch may be partially imported
-    if cuda is None or not cuda.is_initialized():
-        return {}
-    return {'GPU memory [MiB]': f'{cuda.memory_allocated() / 2**20:.0f}'}

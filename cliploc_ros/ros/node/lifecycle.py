@@ -34,7 +34,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.command import Interruption, split_ros_args
 from cliploc_ros.errors import CliplocError, OptionsError, StoppedError
-from cliploc_ros.models.devices import free_memory
+from cliploc_ros.models.onnx_network import free_memory
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.node.parameters import NodeParameters, Parameters
 from cliploc_ros.ros.node.threads import BoundedCallbackGroup, NodeExecutor, Worker, log_failure
@@ -402,8 +402,8 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
     if {'-h', '--help'} & {*split_ros_args(sys.argv[1:])[0]}:
         print(_HELP.format(name=name, about=about))
         sys.exit()
-    # The networks of both nodes share a robot's cores. PyTorch's threads wait by spinning, which
-    # slows the other process tenfold. PyTorch reads this variable when it is loaded.
+    # Both nodes share a robot's cores. While a network is exported, PyTorch's threads wait by
+    # spinning, which slows the other process tenfold. PyTorch reads this variable on import.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
     # Two heaps for all threads: free memory in twenty heaps adds up.
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
