@@ -22,6 +22,7 @@ from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.messages import faults_of_rectified
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, RequestCounters, Verdict, answer_msg
+from cliploc_ros.ros.frame_localizer import FrameLocalizer
 from cliploc_ros.ros.handoff import HandOff, MapToOdom
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.rig import CameraRig
@@ -51,10 +52,18 @@ _OTHER_TOPICS = ('odom', 'imu', 'initialpose', '/tf', '/tf_static')
 
 
 class RelocalizerNode(ManagedNode[RelocalizerParameters]):
-    """Localizes the robot on request, or with every frame."""
+    """Localizes the robot on request, or with every frame.
 
-    def __init__(self) -> None:
-        super().__init__('relocalizer', RelocalizerParameters, DetectorParameters)
+    Parameters
+    ----------
+    delivers : bool
+        Whether it publishes poses, hands them over, and serves requests of other nodes.
+    options
+        Further arguments of rclpy's Node.
+    """
+
+    def __init__(self, name: str = 'relocalizer', delivers: bool = True, **options: Any) -> None:
+        super().__init__(name, RelocalizerParameters, DetectorParameters, **options)
         parameters = self.settings.values
         self._robot = RobotStateSource(self)
         self._jumps = TimeJumps(self, self._forget)
@@ -75,7 +84,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._handoff.on_shown(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))
         self._requests = Requests(self, self._frames, self._robot, self._jumps, self._pipeline,
-                                  self._cases, self._handoff)
+                                  self._cases, self._handoff if delivers else None)
         self._watcher = Watcher(self, self._frames, self._robot, self._jumps, self._pipeline,
                                 self._requests, self._handoff, self._answer)
         self._counters = RequestCounters()
@@ -94,9 +103,14 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             load_map = importlib.import_module('nav2_msgs.srv').LoadMap
             services.append((load_map, '~/load_map', self._on_load_map))
         group = BoundedCallbackGroup(MAX_REQUESTS)
-        for service_type, name, callback in services:
+        for service_type, name, callback in services if delivers else ():
             self.create_service(service_type, name, callback, qos_profile=qos.SERVICE,
                                 callback_group=group)
+
+    @property
+    def localizer(self) -> FrameLocalizer | None:
+        """Return the map and its networks, None unless they are loaded."""
+        return self._pipeline.localizer
 
     def load(self) -> str:
         """Load map and network."""

@@ -102,8 +102,8 @@ def test_the_doctor_looks_at_each_camera(four_cameras, start):
     found = {tuple(line.split()[:2]) for line in doctor.output().splitlines()}
     for name in NAMES:
         state = 'fail' if name == NAMES[0] else 'pass'
-        assert {(f'{name}/camera', state), (f'{name}/calibration', state)} <= found
-    assert {('detector', 'pass'), ('time', 'pass')} <= found
+        assert (f'{name}/camera', state) in found
+    assert ('input', 'pass') in found
 
 
 @pytest.mark.full  # ros/test_combinations.py replays four cameras, test_record.py by evaluate
