@@ -112,6 +112,9 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
     header = Header(stamp=frame.image.header.stamp, frame_id=localized.landmark_map.frame_id)
     evidence, points, depth = found.evidence, found.recognized, found.depth
     stamp, seen = header.stamp, localized.seen.observation
+    compared = int((seen.similarity_rows >= 0).sum())
+    is_cut = not found.accepted and seen.similarities is not None \
+        and compared < len(seen.detections)
     figures: dict[str, object] = {
         'stamp [s]': f'{stamp.sec}.{stamp.nanosec:09d}', 'frame': header.frame_id,
         'source': found.source if found.solved else '', 'confidence': found.confidence,
@@ -120,7 +123,7 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
         'score': found.score, 'landmarks': 0 if evidence is None else evidence.inliers,
         'frames': len(found.frame_matches), 'hypotheses': found.tried,
         'searched percent': 100.0 * found.coverage, 'crops': '' if seen.similarities is None else
-        f'{localized.compared} of {len(seen.detections)}',
+        f'{compared} of {len(seen.detections)}',
         'keyframe points': 0 if points is None else points.inliers,
         'keyframe search': found.keyframe_search,
         'depth': '' if depth is None else f'depth of {depth.objects} objects' if depth.is_passed
@@ -134,7 +137,7 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
                      and not (name == 'confidence' and name in found.reason))
     summary = f'[{said}; {in_words(stages_ms)}]'
     answer = Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, frame.received_at,
-                    localized.query, localized.is_cut, stages_ms, map_hash, found.refusal_kind,
+                    localized.query, is_cut, stages_ms, map_hash, found.refusal_kind,
                     header, figures)
     if not found.accepted:
         return answer

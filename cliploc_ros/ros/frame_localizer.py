@@ -5,6 +5,7 @@
 import hashlib
 import logging
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.kernels.compiled import KernelCache
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layer_of_map
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
@@ -44,6 +46,8 @@ logger = logging.getLogger(__name__)
 #: Value of keyframes_file that selects the layer next to the map, if it exists.
 NEXT_TO_MAP = 'auto'
 _DIGITS = 12
+# A search ends this long before its request, see Localizer.answer.
+_LATE_S = 0.1
 # A map file that changes while it is read is read again.
 _ATTEMPTS = 3
 
@@ -65,10 +69,6 @@ class Localized(NamedTuple):
     landmark_map: LandmarkMap
     #: The image, the compared crops and their similarities to this map.
     seen: SeenImage
-    #: Number of crops that were compared with labels.
-    compared: int
-    #: Whether the frame was refused before all crops were compared.
-    is_cut: bool
     #: Covariance (6, 6) for a filter that fuses all accepted poses. In continuous mode it covers
     #: only the new information, see cliploc_ros.core.localizer.
     for_filter: NDArray[np.float64] | None
@@ -132,16 +132,22 @@ class FrameLocalizer:
         query = replace(self.instants.query(frame, parameters, known),
                         is_thorough=not math.isinf(deadline))
         found = self.answer(query, parameters.options(), times, deadline)
+        if not found.accepted and query.is_thorough and found.keyframe_search == 'fast':
+            found = replace(found, reason=f'{found.reason}; thorough search of keyframes: time '
+                                          'was up; raise timeout_s')
+        if found.refusal_kind is RefusalKind.SEARCH_CUT_SHORT and time.monotonic() > deadline - \
+                _LATE_S:  # the request ended the search, not its time budget
+            found = replace(found, reason=found.reason.partition('; raise ')[0]
+                            + '; raise timeout_s')
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest
         if (found.accepted and found.map_from_camera is not None
                 and parameters.base_frame not in ('', frame.image.header.frame_id)):
             self.instants.check_axes(frame, known.state, found.map_from_camera)
-        compared = int((seen.similarity_rows >= 0).sum())
-        is_cut = not found.accepted and self.observer is not None \
-            and compared < len(seen.detections)
-        for_filter = self.localizer.covariance_for_filter(found) \
-            if found.accepted and parameters.mode == 'continuous' else found.covariance
+        # the result of a request that is late is not published, and must not advance the filter
+        for_filter = self.localizer.covariance_for_filter(found) if (
+            found.accepted and parameters.mode == 'continuous'
+            and time.monotonic() < deadline) else found.covariance
         found, own = in_its_map(self.instants.explained(found), self.landmark_map)
         parts = parts_of(self.landmark_map)
         if seen.similarities is not None and len(parts) > 1:
@@ -152,8 +158,8 @@ class FrameLocalizer:
         names = [camera_frame.camera_name for camera_frame in query.frames]
         layer = None if self.keyframes is None else self.keyframes.localizer.layer
         return Localized(
-            found, own.landmark_map, SeenImage(query.images[-1], seen, layer), compared, is_cut,
-            for_filter, (*frame.left_out, *(beside.camera for beside, _ in known.beside
+            found, own.landmark_map, SeenImage(query.images[-1], seen, layer), for_filter,
+            (*frame.left_out, *(beside.camera for beside, _ in known.beside
                                             if beside.camera not in names)), query)
 
     def answer(self, query: Query, options: RelocalizerOptions, times: StageTimes,

@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth of an RGB-D camera at the relocalizer: correct, wrong, late and missing."""
 
-import struct
 
-import cv2
 import numpy as np
 import pytest
 from scene import MAP_FROM_CAMERA, depth_image, make_room, see_room
@@ -27,12 +25,6 @@ def message(frame, depths_m=DEPTHS_M, encoding='16UC1', frame_id=None, late_s=0.
     msg.header.stamp.nanosec = header.stamp.nanosec + round(late_s * 1e9)
     msg.data = pixels.tobytes()
     return msg
-
-
-def compressed(frame):
-    png = cv2.imencode('.png', (1000.0 * DEPTHS_M).astype(np.uint16))[1].tobytes()
-    return CompressedImage(header=frame[0].header, format='16UC1; compressedDepth png',
-                           data=struct.pack('<iff', 0, 0.0, 0.0) + png)
 
 
 @pytest.fixture
@@ -63,11 +55,6 @@ def test_depth_counts_and_a_recorded_request_keeps_it(own_relocalizer, tester, d
     assert stored.success, stored.message
     (case,) = tmp_path.glob('case_*')
     replay(case, room_map, answer)
-
-
-def test_compressed_depth(own_relocalizer, depth_camera):
-    own_relocalizer(depth_transport='compressed', **SEARCH)
-    ask_until(depth_camera, 'depth of 12', compressed(make_frame()))
 
 
 @pytest.mark.parametrize(('given', 'said'), [

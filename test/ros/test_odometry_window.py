@@ -39,14 +39,6 @@ def test_between_two_messages_it_is_in_between():
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
 
 
-def test_it_turns_the_short_way():
-    """Quaternions of opposite sign are the same orientation."""
-    window = OdometryWindow(10.0)
-    window.add(0, np.zeros(3), turned(170.0))
-    window.add(S // 10, np.zeros(3), -turned(190.0))
-    assert abs(heading(window.pose_at(S // 20))) == pytest.approx(180.0, abs=1e-6)
-
-
 @pytest.mark.parametrize('speed_m_s', [1.0, 0.0])  # reset 51 m away, or detected by its heading
 def test_odometry_that_was_reset_joins_nothing_across_it(speed_m_s):
     window = OdometryWindow(10.0)
@@ -231,17 +223,6 @@ def test_one_of_two_poses_of_a_stamp_stays():
     assert window.pose_at(S)[0, 3] == 1.0 and window.run == 0
     window.add(S, np.array([1.2, 0.0, 0.0]), UPRIGHT)
     assert window.run == 1
-
-
-def test_it_tells_what_it_may_know_of():
-    window = OdometryWindow(10.0)
-    assert not window.spans(0, S) and not window.is_ahead(0)
-    drive(window, (5.0, 7.0))
-    for moment, spans, is_ahead in ((3.9, False, False), (4.1, True, False), (6.0, True, False),
-                                    (6.9, True, False), (7.3, True, True), (7.5, True, False),
-                                    (8.0, False, False)):
-        assert window.spans(round(moment * S), S) == spans
-        assert window.is_ahead(round(moment * S)) == is_ahead
 
 
 def test_the_way_is_what_was_driven_not_how_far_it_led():

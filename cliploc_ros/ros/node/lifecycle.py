@@ -17,7 +17,7 @@ import time
 import traceback
 from abc import abstractmethod
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, NoReturn
 
@@ -232,10 +232,13 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         """
         if self._self_managed and not self.active:
             left_s = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
-            start = self._begin_start()
-            if not wait([start], left_s).done:
-                raise NotActiveError(f'the node is {self.state}: it is still loading; retry')
-            start.result()
+            try:  # not concurrent.futures.wait, which never returns after cancel()
+                self._begin_start().result(left_s)
+            except TimeoutError as error:
+                raise NotActiveError(f'the node is {self.state}: it is still loading; retry'
+                                     ) from error
+            except CancelledError as error:
+                raise StoppedError('the node is shutting down') from error
         self.check_active()
 
     def check_active(self) -> None:
