@@ -53,10 +53,8 @@ def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uin
 
     ImageError: a field is invalid; the message names it.
     """
-    return _decoded(msg) if hasattr(msg, 'format') else _unpacked(msg)
-
-
-def _unpacked(msg: ImageMessage) -> NDArray[np.uint8]:
+    if hasattr(msg, 'format'):
+        return _decoded(msg)
     if msg.encoding not in _CHANNELS:
         raise ImageError(f"image encoding '{msg.encoding}' is not one of {', '.join(_CHANNELS)}")
     order, channels = _CHANNELS[msg.encoding]

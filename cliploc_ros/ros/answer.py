@@ -246,7 +246,20 @@ class CaseRecorder:
         if not parameters.record_folder:
             raise OptionsError('record_folder is not set: start the node with a folder that has '
                                'space for record_limit_mb')
-        queries, found, last = self._linked()
+        with self._lock:
+            seen, last = list(self._seen), self._last
+        while seen and seen[-1].received_at != last.received_at:
+            seen.pop()
+        if not seen:
+            raise DatasetError(f'nothing to record: the last request had no frame: {last.message}')
+        # odometry links the queries to the newest one; the oldest first
+        queries: list[Query] = []
+        for answer in reversed(seen):
+            assert answer.query is not None
+            if queries and (answer.query.run is None or answer.query.run != queries[0].run):
+                break
+            queries.insert(0, answer.query)
+        found = seen[-1]
         try:
             folder = Path(parameters.record_folder).expanduser()
             make_folder(folder)
@@ -256,7 +269,7 @@ class CaseRecorder:
         for name in _LIBRARIES:
             with suppress(PackageNotFoundError):
                 versions[name] = version(name)
-        arrays = case_arrays(Case(queries, {
+        arrays = case_arrays(Case(tuple(queries), {
             'verdict': last.verdict, 'message': last.message, 'found': found.verdict,
             'reason': found.detail, 'map_hash': found.map_hash,
             'parameters': asdict(parameters), 'options': asdict(parameters.options()),
@@ -275,23 +288,3 @@ class CaseRecorder:
         path = folder / f'case_{now}_{last.verdict}.npz'
         CASE.write(path, arrays, compress=True)
         return f'{path}: {len(queries)} frames; {last.message}'
-
-    def _linked(self) -> tuple[tuple[Query, ...], Answer, Answer]:
-        """Return the queries behind the last answer, the answer to its newest frame, and itself.
-
-        The queries are those that odometry links to the newest one, the oldest first. Without
-        odometry, only the newest query is returned.
-        """
-        with self._lock:
-            seen, last = list(self._seen), self._last
-        while seen and seen[-1].received_at != last.received_at:
-            seen.pop()
-        if not seen:
-            raise DatasetError(f'nothing to record: the last request had no frame: {last.message}')
-        linked: list[Query] = []
-        for answer in reversed(seen):
-            assert answer.query is not None
-            if linked and (answer.query.run is None or answer.query.run != linked[0].run):
-                break
-            linked.insert(0, answer.query)
-        return tuple(linked), seen[-1], last

@@ -38,7 +38,6 @@ from cliploc_ros.ros.parameters import RelocalizerParameters, map_files, path_of
 from cliploc_ros.ros.visualization import SeenImage
 
 if TYPE_CHECKING:  # loaded where crops are compared
-    from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.models.observer import Observer
 
 logger = logging.getLogger(__name__)
@@ -228,9 +227,15 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
         raise MapError('the map has neither landmarks nor keyframes next to it: rebuild it')
     observer, device = None, 'cpu'
     if options.needs_similarities and len(landmark_map):
+        from cliploc_ros.models.clip_weights import ClipOptions
         from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
         from cliploc_ros.models.observer import Observer
-        asked = (clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings)
+        named = ClipOptions(
+            model=parameters.clip_model, pretrained=parameters.clip_pretrained,
+            checkpoint_path=parameters.clip_checkpoint_path, device=parameters.device,
+            cache_dir=parameters.cache_dir, inference=parameters.inference)
+        asked = (with_encoder(named, parameters.profile), landmark_map, files,
+                 parameters.landmark_embeddings)
         if former is not None and former.observer is not None:
             observer, device = former.observer.with_labels(embed_map(*asked)), former.device
         else:
@@ -239,16 +244,6 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
             observer.measure()
     return FrameLocalizer(landmark_map, observer, relocalizer, options, device, map_hash,
                           keyframes)
-
-
-def clip_options_of(parameters: RelocalizerParameters) -> 'ClipOptions':
-    """Return the CLIP that the parameters name, by default that of the profile."""
-    from cliploc_ros.models.clip_weights import ClipOptions
-    named = ClipOptions(
-        model=parameters.clip_model, pretrained=parameters.clip_pretrained,
-        checkpoint_path=parameters.clip_checkpoint_path, device=parameters.device,
-        cache_dir=parameters.cache_dir, inference=parameters.inference)
-    return with_encoder(named, parameters.profile)
 
 
 def keyframes_path(parameters: RelocalizerParameters) -> Path | None:

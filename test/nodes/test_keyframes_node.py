@@ -122,13 +122,6 @@ def test_a_map_of_keyframes_alone(start, tester, room_map, tmp_path, capsys):
         assert tester.set_parameter('map_file', str(path)).successful
         assert tester.trigger('reload_map').success
         assert tester.relocalize(its).success
-    assert tester.set_parameter('map_file', '').successful
-    assert tester.set_parameter('map_files', [str(room_map), str(bare)]).successful
-    assert 'search it alone' in tester.trigger('reload_map').message
-    process.stop()
-    process = start('nodes.relocalizer', '--ros-args', '--params-file', str(bare))
-    process.wait_for_output('is given as map_file')
-    assert 'Traceback' not in process.output()
 
 
 def diagnostics_of(tester):

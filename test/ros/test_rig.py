@@ -100,18 +100,6 @@ def test_frames_of_one_instant_come_together(rig, cameras, wait, late_s, togethe
     assert {heard.image.header.frame_id for heard in (frame, *frame.beside)} == set(together)
 
 
-def test_silent_inputs_are_named_by_camera(rig, cameras, wait):
-    since = time.monotonic()
-    ask(rig, cameras, {'front': 0.0}, wait)
-    for name, source in rig.sources.items():
-        assert set(source.unheard(since)) == (
-            set() if name == 'front' else {'image', 'camera_info', 'detections'})
-        assert source.missing() == []  # all are published
-        assert source.image_topic == f'/{name}/image'
-        assert [*source.topics.values()] == [
-            f'{name}/image', f'{name}/camera_info', f'{name}/detections']
-
-
 def test_nothing_in_time_and_a_rig_that_is_closed(rig, cameras, wait):
     now = time.monotonic()
     with pytest.raises(NoFrameError):

@@ -78,13 +78,6 @@ def ear(nodes, spin_until):
     ear.subscription.destroy()
 
 
-@pytest.mark.parametrize('policy', [RELIABLE, BEST_EFFORT])
-def test_it_is_as_reliable_as_the_publisher_that_comes(ear, policy):
-    publisher = ear.offer(policy)
-    ear.wait_for_policies(policy)
-    ear.wait_for_hearing(publisher, 'camera')
-
-
 def test_a_best_effort_publisher_beside_a_reliable_one_is_heard(ear):
     reliable = ear.offer(RELIABLE)
     ear.wait_for_policies(RELIABLE)
