@@ -11,11 +11,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from handing_over import PARAMETERS, TEN_HZ, Robot, make_pose, stamp, stand, tell
 
-from cliploc_ros.ros.handoff import (
-    HandOffError,
-    NoLocalizerError,
-    is_taken,
-)
+from cliploc_ros.ros.handoff import HandOffError, NoLocalizerError, is_taken
 from cliploc_ros.ros.inputs.stamps import TimeJumpError
 
 

@@ -216,10 +216,12 @@ class TurnEstimate:
         # the deviation; consecutive looks are correlated in pairs
         sigmas = (1.4826 * np.median(np.abs(turns - median), axis=0)
                   * math.sqrt(math.pi / 2) * math.sqrt(2.0 / len(turns)))
-        angle, sigma = float(np.linalg.norm(median)), float(sigmas.max())
-        self.turn = CameraTurn(median, sigma, bool(
-            abs(given[2, :3] @ median) > terms.yaw_share * angle)) if angle >= max(
-                terms.least_deg, terms.least_sigmas * sigma) else None
+        angle = float(np.linalg.norm(median))
+        axis = median / max(angle, 1e-12)
+        is_sure = angle >= max(terms.least_deg,
+                               terms.least_sigmas * float(np.linalg.norm(axis * sigmas)))
+        self.turn = CameraTurn(median, float(sigmas.max()), bool(
+            abs(given[2, :3] @ axis) > terms.yaw_share)) if is_sure else None
 
 
 class WatchState(StrEnum):

@@ -26,11 +26,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.odometry import (
-    NoOdometryError,
-    OdometryPlace,
-    OdometrySource,
-)
+from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometryPlace, OdometrySource
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.stamps import StampOrder, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health
