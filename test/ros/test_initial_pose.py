@@ -11,7 +11,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from handing_over import PARAMETERS, TEN_HZ, Robot, make_pose, stamp, stand, tell
 
-from cliploc_ros.ros.handoff import HandOffError, NoLocalizerError, is_taken
+from cliploc_ros.ros.handoff import HandOffError, NoLocalizerError, difference
 from cliploc_ros.ros.inputs.stamps import TimeJumpError
 
 
@@ -228,6 +228,6 @@ def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
     shown.header.frame_id, shown.pose.pose.position.x = frame, x_m
     shown.pose.pose.orientation.z = math.sin(math.radians(yaw_deg) / 2)
     shown.pose.pose.orientation.w = math.cos(math.radians(yaw_deg) / 2)
-    assert is_taken(given, shown) == is_taken_over
+    assert (not difference(given, shown)) == is_taken_over
     shown.pose.pose.orientation.y = 1e200
-    assert not is_taken(given, shown)
+    assert difference(given, shown)
