@@ -42,8 +42,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='doctor', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         usage='doctor [options] [--ros-args ...]',
-        description='Check parameters, map, camera, calibration, clock, tf, odometry, detector, '
-        'localizer and the time of a request. Each failure comes with its remedy.')
+        description='Check parameters, map, cameras, clocks, tf, odometry, localizer, the input '
+        'of a request and its answer. Each failure comes with its remedy.')
     option(parser, '--relocalizer NAME', 'its name, absolute or in the namespace of this node '
            '(%(default)s)', default='relocalizer')
     option(parser, '--params-file FILE', 'check with these parameters; repeat it as on the '

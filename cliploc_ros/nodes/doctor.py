@@ -165,15 +165,14 @@ class Doctor(RelocalizerNode):
     def _check_inputs(self, parameters: RelocalizerParameters, patience_s: float, report: Report
                       ) -> None:
         """Wait for a frame; check what does not depend on its content: silence, clocks, motion."""
-        after, frame = time.monotonic(), None
-        with suppress(NoFrameError):  # reported by the sources
-            frame = self._frames.next_frame(after, after + patience_s, math.inf)
-            while parameters.depth_transport != 'none' and frame.depth is None:
-                # discovery of the depth topic may take longer than that of the image
+        after, frame, seen = time.monotonic(), None, set[str]()
+        with suppress(NoFrameError):  # reported by the sources; discovery may take seconds
+            while frame is None or len(seen) < len(self._frames.sources) or (
+                    parameters.depth_transport != 'none' and frame.depth is None):
                 frame = self._frames.next_frame(time.monotonic(), after + patience_s, math.inf)
+                seen |= {one.camera for one in (frame, *frame.beside)}
         for name, source in self._frames.sources.items():
-            is_silent = frame is None or name in frame.left_out
-            report.judge(of_camera(name, 'camera'), source.why_none(after) if is_silent else '',
+            report.judge(of_camera(name, 'camera'), '' if name in seen else source.why_none(after),
                          f'it publishes {", ".join(source.topics.values())}')
             if math.isfinite(source.nearest_lag_s):
                 report.judge(of_camera(name, 'clock'), self._clock_fault(source.nearest_lag_s),

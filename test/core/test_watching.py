@@ -260,17 +260,6 @@ def test_a_jump_in_place_or_in_heading_alone_speaks_against_the_new_pose(change)
     assert belief.has_jumped and belief.probability < 0.5
 
 
-def test_without_odometry_the_watch_learns_more_slowly(room):
-    chances = []
-    for odom in (True, False):
-        watch = Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
-        wrong = moved(np.eye(4), 2.0, 0.5)
-        chances.append([report.probability for report in follow(watch, room, drive(12), wrong,
-                                                          odom=odom)])
-    assert chances[0][3] < chances[1][3]
-    assert chances[1][-1] < 0.05
-
-
 def test_missing_landmarks_are_named(watch, room):
     gone = [2, 9, 17, 25]
     there = np.setdiff1d(np.arange(COUNT), gone)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer as a process: inputs, modes, frames, floods and shutdown."""
 
-import math
 import signal
 
 import cv2
@@ -32,25 +31,6 @@ def test_compressed_images(own_relocalizer, tester):
         assert not answer.success
         assert 'does not decode' in answer.message
     assert tester.relocalize((good, info, detections)).success
-
-
-def test_any_detector_will_do(own_relocalizer, tester):
-    """Another publisher has different class names and rotated boxes."""
-    names = {'a': 'class/0', 'b': 'Beta', 'c': 'gamma ray'}
-    image, info, detections = make_frame()
-    for detection in detections.detections:
-        hypothesis = detection.results[0].hypothesis
-        hypothesis.class_id = names.get(hypothesis.class_id, hypothesis.class_id)
-        box = detection.bbox
-        box.center.theta = math.pi / 2
-        box.size_x, box.size_y = box.size_y, box.size_x
-    process = own_relocalizer()
-    answer = tester.relocalize((image, info, detections))
-    assert not answer.success
-    assert 'candidates' in answer.message
-    process.stop()
-    own_relocalizer(class_map="'class/0=a, Beta=b, gamma ray=c'")
-    assert tester.relocalize((image, info, detections)).success
 
 
 def test_continuous_mode_publishes_without_being_asked(own_relocalizer, tester):

@@ -42,11 +42,6 @@ def test_parameters_and_file_give_the_same_map(start_with, tmp_path):
         assert loaded.classes.sizes_of(loaded.classes.classes_of(['cell phone'])) == len(room)
 
 
-def test_a_node_without_any_map_says_what_to_do(make_node):
-    with pytest.raises(MapError, match='set map_file'):
-        load_map(make_node(), [])
-
-
 def test_a_value_beside_its_own_fields_is_named(make_node):
     node = make_node()
     node.declare_parameter('map.frame_id', 'map')
