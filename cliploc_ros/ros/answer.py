@@ -73,7 +73,7 @@ class Answer:
     #: Whether the frame was refused before all crops were compared, so that a retry may succeed
     is_cut: bool = False
     stages_ms: Mapping[str, float] = field(default_factory=dict)  #: Duration of each stage [ms]
-    #: Hash of the searched map, see frame_localizer.load_hashed_map; empty without a map
+    #: Hash of the searched map, see frame_localizer.load_map; empty without a map
     map_hash: str = ''
     kind: RefusalKind | None = None  #: Kind of a refusal; None for other verdicts
     header: Header | None = None  #: Stamp of the image, frame of the map; None without an image

@@ -47,8 +47,6 @@ NEXT_TO_MAP = 'auto'
 _DIGITS = 12
 # A search ends this long before its request, see Localizer.answer.
 _LATE_S = 0.1
-# A map file that changes while it is read is read again.
-_ATTEMPTS = 3
 
 
 class Keyframes(NamedTuple):
@@ -88,7 +86,7 @@ class FrameLocalizer:
     device : str
         Device of the observer's network.
     map_hash : str
-        See load_hashed_map.
+        See load_map.
     keyframes : Keyframes, optional
         The layer of keyframes of the map.
     """
@@ -220,7 +218,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
         KernelCache.folder = resolve_cache_dir(parameters.cache_dir) / 'kernels'
     options = parameters.options()
     files = map_files(parameters)
-    landmark_map, map_hash = load_hashed_map(node, files)
+    landmark_map, map_hash = load_map(node, files)
     relocalizer = Relocalizer(landmark_map, options)  # errors show before the slow steps
     keyframes = load_keyframes(parameters, landmark_map)
     if not len(landmark_map) and keyframes is None:
@@ -274,64 +272,37 @@ def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
         return None
 
 
-def load_map(node: Node, files: Sequence[str]) -> LandmarkMap:
-    """Load the map from files, or without files, from the node's parameters.
-
-    MapError: the map is invalid; the message names the source, the landmark and the field.
-    """
-    if files:
-        return join_maps([LandmarkMap.from_file(file) for file in files], files)
-    parameters = node.get_parameters_by_prefix('map')
-    if not parameters:
-        raise MapError('no map: set map_file, or load a map with --params-file')
-    tree: dict[str, Any] = {}
-    for name, parameter in parameters.items():
-        _insert(tree, name.split('.'), parameter.value)
-    return LandmarkMap.from_mapping(tree, 'parameters')
-
-
-def _insert(tree: dict[str, Any], path: list[str], value: Any) -> None:
-    """Insert a value at its dotted name."""
-    for key in path[:-1]:
-        branch = tree.setdefault(key, {})
-        if not isinstance(branch, dict):
-            raise MapError(f"parameters: map.{'.'.join(path)}: '{key}' has both a value "
-                           'and fields')
-        tree = branch
-    tree[path[-1]] = value
-
-
-def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
-    """Load one map, or join several, and return it with its hash.
+def load_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
+    """Load the map from files, or without files, from the node's parameters; also return its hash.
 
     The hash is the beginning of the output of `cat FILE... | sha256sum`. For a map in parameters
     it is the hash of its landmarks.
 
-    MapError: see load_map; or a file changes repeatedly while it is read.
+    MapError: the map is invalid; the message names the source, the landmark and the field.
     """
-    for _ in range(_ATTEMPTS):
-        before = _hash_of(files)
-        landmark_map = load_map(node, files)
-        if not files:
-            content = b''.join([
-                repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
-                      landmark_map.class_ids)).encode(),
-                landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
-                landmark_map.quats_xyzw.tobytes()])
-            return landmark_map, _hash(content)
-        if before == _hash_of(files):
-            return landmark_map, before
-    raise MapError(f'{", ".join(files)}: changes while it is read; write a new file, then rename '
-                   'it')
-
-
-def _hash_of(files: Sequence[str]) -> str:
-    """Return the hash of files; empty if one cannot be read, which load_map reports."""
-    try:
-        return _hash(b''.join(map(read_file, files)))
-    except OSError:
-        return ''
-
-
-def _hash(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:_DIGITS]
+    if files:
+        landmark_map = join_maps([LandmarkMap.from_file(file) for file in files], files)
+        try:
+            content = b''.join(map(read_file, files))
+        except OSError as error:
+            raise MapError(f'{", ".join(files)}: {error}') from error
+    else:
+        parameters = node.get_parameters_by_prefix('map')
+        if not parameters:
+            raise MapError('no map: set map_file, or load a map with --params-file')
+        tree: dict[str, Any] = {}
+        for name, parameter in parameters.items():
+            *path, last = name.split('.')
+            branch = tree
+            for key in path:
+                branch = branch.setdefault(key, {})
+                if not isinstance(branch, dict):
+                    raise MapError(f"parameters: map.{name}: '{key}' has both a value and fields")
+            branch[last] = parameter.value
+        landmark_map = LandmarkMap.from_mapping(tree, 'parameters')
+        content = b''.join([
+            repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
+                  landmark_map.class_ids)).encode(),
+            landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
+            landmark_map.quats_xyzw.tobytes()])
+    return landmark_map, hashlib.sha256(content).hexdigest()[:_DIGITS]

@@ -337,8 +337,9 @@ def difference(given: PoseWithCovarianceStamped, shown: PoseWithCovarianceStampe
     near = TAKEN.wider(3.0 * deviation_m, math.degrees(3.0 * math.sqrt(covariance[5, 5])))
     if near.agree(_planar(given), _planar(shown)):
         return ''
-    with np.errstate(invalid='ignore'):  # a localizer may publish NaN
-        distance_m, angle_deg = pose_error(_planar(given), _planar(shown))
+    if not np.isfinite(_planar(shown)).all():
+        return 'has NaN'
+    distance_m, angle_deg = pose_error(_planar(given), _planar(shown))
     return (f'differs from it by {distance_m:.2f} m and {angle_deg:.0f} degrees (limits '
             f'{near.distance_m:.2f} and {near.angle_deg:.0f})')
 

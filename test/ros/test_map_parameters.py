@@ -27,8 +27,8 @@ def test_parameters_and_file_give_the_same_map(start_with, tmp_path):
         class_weights=(('a', 0.6), ('cell phone', 0.4)))
     room = replace(make_room(), details=(details,) * 12)
     write_map(path, room)
-    of_parameters = load_map(start_with(path), [])
-    of_file = load_map(start_with(path), [str(path)])
+    of_parameters, _ = load_map(start_with(path), [])
+    of_file, _ = load_map(start_with(path), [str(path)])
     # rclpy passes parameters in arbitrary order
     again = of_parameters.select([of_parameters.landmark_ids.index(name)
                                   for name in of_file.landmark_ids])
