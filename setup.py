@@ -13,7 +13,7 @@ PACKAGE = 'cliploc_ros'
 COMMANDS = ('build_map', 'check_map', 'evaluate', 'export_network', 'import_map', 'studio',
             'tum_to_bag')
 # These need ROS. Without ROS they would only print an error, so a wheel does not contain them.
-ROS_COMMANDS = ('doctor', 'prepare', 'replay', 'wake_up')
+ROS_COMMANDS = ('doctor', 'replay', 'wake_up')
 NODES = ('detector', 'relocalizer')
 BUILDS_WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel'}.isdisjoint(sys.argv)
 

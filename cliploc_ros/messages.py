@@ -8,9 +8,9 @@ No field of a message is assumed valid.
 import math
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,39 +42,10 @@ _SAME_ASPECT = 0.02
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
 # JPEG markers that are followed by the image size.
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-
-
-class ImageMessage(Protocol):
-    """sensor_msgs/Image."""
-
-    encoding: str
-    width: int
-    height: int
-    step: int
-    data: Any
-
-
-@runtime_checkable
-class CompressedImageMessage(Protocol):
-    """sensor_msgs/CompressedImage."""
-
-    format: str
-    data: Any
-
-
-class CameraInfoMessage(Protocol):
-    """sensor_msgs/CameraInfo."""
-
-    width: int
-    height: int
-    distortion_model: str
-    k: Sequence[float]
-    d: Sequence[float]
-    r: Sequence[float]
-    p: Sequence[float]
-    binning_x: int
-    binning_y: int
-    roi: Any
+#: Messages of sensor_msgs, of the classes of rclpy or of rosbags
+type ImageMessage = Any
+type CompressedImageMessage = Any
+type CameraInfoMessage = Any
 
 
 def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uint8]:
@@ -82,10 +53,8 @@ def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uin
 
     ImageError: a field is invalid; the message names it.
     """
-    return _decoded(msg) if isinstance(msg, CompressedImageMessage) else _unpacked(msg)
-
-
-def _unpacked(msg: ImageMessage) -> NDArray[np.uint8]:
+    if hasattr(msg, 'format'):
+        return _decoded(msg)
     if msg.encoding not in _CHANNELS:
         raise ImageError(f"image encoding '{msg.encoding}' is not one of {', '.join(_CHANNELS)}")
     order, channels = _CHANNELS[msg.encoding]
@@ -146,7 +115,7 @@ def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray
     The encoding is 16UC1, mono16 or 32FC1; 0 or NaN means no depth. ImageError: a field is
     invalid.
     """
-    if isinstance(msg, CompressedImageMessage):
+    if hasattr(msg, 'format'):
         return _decode_depth_png(msg)
     dtype = _depth_type(msg.encoding).newbyteorder('>' if getattr(msg, 'is_bigendian', 0) else '<')
     pixels = np.ascontiguousarray(_rows(msg, msg.width * dtype.itemsize)).view(dtype)

@@ -9,9 +9,8 @@ seconds, and an accelerometer with motion capture. The verticals are those of th
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +39,6 @@ from studies.reports import table
 
 _WAYS_M = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 _LOST, _RATES_HZ = (0.0, 0.1), (5.0, 10.0, 25.0, 50.0)
-_TWISTS: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
-    'as it is': lambda twist: twist, 'empty': np.zeros_like}
 _LAGS_S = np.arange(-0.5, 0.51, 0.02)
 # A slower robot counts as standing. The mean acceleration within this time before and after is
 # taken as gravity.
@@ -58,7 +55,6 @@ class Robot:
 
     name: str
     poses: NDArray[np.float64]  #: (n, 8): stamp [s], position [m], quaternion x, y, z, w
-    twists: NDArray[np.float64]  #: (n, 2, 3) [m/s], [rad/s]
     samples: tuple[Sample, ...]  #: (m,)
     turn_rates: NDArray[np.float64]  #: (m, 3): angular rates of the gyroscope [rad/s]
 
@@ -80,7 +76,7 @@ class Robot:
 
 def read_robot(bag: Path) -> Robot:
     """Read a bag of ROS 1 or 2 with one odometry topic and one IMU topic."""
-    poses, twists, samples, rates = [], [], list[Sample](), []
+    poses, samples, rates = [], list[Sample](), []
     with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         for topic, _, data in reader.messages():
             msg: Any = reader.deserialize(data, topic.msgtype)
@@ -88,13 +84,11 @@ def read_robot(bag: Path) -> Robot:
             if topic.msgtype.endswith('/Odometry'):
                 p, q = msg.pose.pose.position, msg.pose.pose.orientation
                 poses.append((at_s, p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-                v, w = msg.twist.twist.linear, msg.twist.twist.angular
-                twists.append(((v.x, v.y, v.z), (w.x, w.y, w.z)))
             elif topic.msgtype.endswith('/Imu') and (sample := sample_from_msg(msg)) is not None:
                 w = msg.angular_velocity
                 samples.append(sample)
                 rates.append((w.x, w.y, w.z))
-    return Robot(bag.stem, np.array(poses), np.array(twists), tuple(samples), np.array(rates))
+    return Robot(bag.stem, np.array(poses), tuple(samples), np.array(rates))
 
 
 def restarts_table(robot: Robot, rates_hz: Sequence[float], tries: int = 4) -> str:
@@ -107,21 +101,19 @@ def restarts_table(robot: Robot, rates_hz: Sequence[float], tries: int = 4) -> s
     for rate_hz in rates_hz:
         every = max(1, round(1.0 / np.median(np.diff(robot.poses[:, 0])) / rate_hz))
         found = []
-        for lost, twist in product(_LOST, _TWISTS.values()):
+        for lost in _LOST:
             runs = 0
             for first in range(tries):
                 window = OdometryWindow(30.0)
                 for row in range(first % every, len(robot.poses), every):
                     if rng.random() >= lost:
                         at_s, *pose = robot.poses[row]
-                        window.add(round(at_s * NS_PER_S), np.array(pose[:3]), np.array(pose[3:]),
-                                   twist(robot.twists[row]))
+                        window.add(round(at_s * NS_PER_S), np.array(pose[:3]), np.array(pose[3:]))
                 runs += window.run
             found.append(runs)
         rows.append([robot.name, f'{rate_hz:g}', tries * len(robot.poses) // every, *found])
-    return table(['bag', 'rate [Hz]', 'messages', *(
-        f'restarts, {lost:.0%} lost, twist {name}' for lost, name in product(_LOST, _TWISTS))],
-        rows)
+    return table(['bag', 'rate [Hz]', 'messages',
+                  *(f'restarts, {lost:.0%} lost' for lost in _LOST)], rows)
 
 
 def angle_table(robot: Robot) -> str:

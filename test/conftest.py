@@ -94,14 +94,6 @@ def pytest_collection_modifyitems(config, items):
         config.stash[NOT_RUN].setdefault(missing_module(item), []).append(item.nodeid)
     config.hook.pytest_deselected(items=left_out)
     items[:] = sorted((item for item in items if not missing_module(item)), key=place)
-    for item in items:
-        # Processes that race on two busy cores fail about once in a thousand tests. All other
-        # tests have to pass at the first attempt, unless they hang.
-        if not item.get_closest_marker('clock'):
-            of_processes = (item.path.parent.name in {'nodes', 'demo'}
-                            or item.path.name == 'test_cluster.py')
-            item.add_marker(pytest.mark.flaky(
-                reruns=1, only_rerun=None if of_processes else 'the test hangs'))
 
 
 def fail_slow_test(_number, _frame):
@@ -111,7 +103,7 @@ def fail_slow_test(_number, _frame):
 
 @pytest.hookimpl(wrapper=True)
 def limit_time(item):
-    """Stop a test that hangs, so that the others run. The time limit applies to each attempt."""
+    """Stop a test that hangs, so that the others run."""
     signal.signal(signal.SIGALRM, fail_slow_test)
     signal.alarm(PATIENCE_S)
     try:
@@ -157,12 +149,7 @@ def count(reporter, *outcomes: str) -> int:
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    """Print failed first attempts, measurements, the tests not run, and the counts."""
-    reran = terminalreporter.stats.get('rerun', [])
-    if reran:
-        terminalreporter.section('attempts that failed, and ran again')
-    for report in reran:
-        terminalreporter.write_line(f'{report.nodeid}\n{report.longreprtext}\n')
+    """Print measurements, the tests not run, and the counts."""
     measured = [report for report in terminalreporter.stats.get('passed', [])
                 if report.when == 'call' and report.capstdout.strip()]
     if measured:
@@ -171,8 +158,6 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(report.nodeid)
         for line in report.capstdout.strip().splitlines():
             terminalreporter.write_line(f'    {line}')
-    for name in sorted({report.nodeid for report in reran}):
-        terminalreporter.write_line(f'ran again: {name}')
     for module, tests in sorted(config.stash[NOT_RUN].items()):
         terminalreporter.write_line(f'not run, {module} is not installed: {", ".join(tests)}')
     passed = count(terminalreporter, 'passed', 'xpassed')

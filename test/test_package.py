@@ -22,7 +22,7 @@ SOURCES = [*MODULES, PROJECT / 'setup.py', *(
     for path in sorted((PROJECT / folder).rglob('*.py')))]
 SCRIPTS = [path for path in sorted((PROJECT / 'script').iterdir()) if path.is_file()]
 INTERFACES = sorted((PROJECT / 'cliploc_ros/offline/datasets/vision_msgs/msg').glob('*.msg'))
-EXECUTABLES = ['build_map', 'check_map', 'detector', 'import_map', 'prepare',
+EXECUTABLES = ['build_map', 'check_map', 'detector', 'import_map',
                'relocalizer', 'replay', 'studio', 'tum_to_bag', 'wake_up']
 # As in vision_msgs 4.1.1 of Jazzy. The hash covers the other six messages as well.
 DETECTIONS_TYPE_HASH = 'RIHS01_214274120007f4a683866481336b70310268cfa107aebe9d594a6acf75bda968'

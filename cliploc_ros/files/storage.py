@@ -248,7 +248,7 @@ def write_file(path: Path, write: Callable[[Path], object]) -> None:
 
 
 def warn_not_kept(text: str) -> None:
-    """Warn that a file could not be cached, and record the warning for `prepare`."""
+    """Warn that a file could not be cached, and record the warning for `doctor --prepare`."""
     NOT_KEPT.append(text)
     logger.warning('%s', text)
 

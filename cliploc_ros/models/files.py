@@ -102,8 +102,8 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             reason = f'the disk of {folder} is full: make room, or set {setting} to another disk'
         if setting == 'cache_dir':
-            remedy += ('; or run prepare --cache-dir there, and set cache_dir to a copy of its '
-                       'folder')
+            remedy += ('; or run doctor --prepare --cache-dir there, and set cache_dir to a '
+                       'copy of its folder')
         raise ModelError(f'cannot download {what}: {reason}. {remedy}') from error
 
 

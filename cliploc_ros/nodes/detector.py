@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The detector node: publishes detections in images, while the detections have a subscriber."""
 
-import math
 import threading
 import time
 from collections import deque
@@ -173,9 +172,6 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         self._cameras = {name: _Camera(self, name, self._newest, self._update)
                          for name in self.settings.values.camera_names or ('',)}
         self._last_error = ''
-        # When the first subscriber came (monotonic clock) [s], and the time until the first boxes.
-        self._awaited_since = math.inf
-        self._first_boxes_s: float | None = None
 
     def load(self) -> str:
         """Load the network."""
@@ -228,8 +224,6 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         with self._lock:
             for camera in self._cameras.values():
                 if self._open and camera.is_wanted:
-                    if not any(other.subscription for other in self._cameras.values()):
-                        self._awaited_since = time.monotonic()
                     camera.open()
                 else:
                     camera.close()
@@ -254,9 +248,6 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         self.stages.add(times.ms)
         if self.active:
             camera.publish(detections_to_msg(detections, image.msg.header))
-            if self._awaited_since < math.inf:
-                self._first_boxes_s = time.monotonic() - self._awaited_since
-                self._awaited_since = math.inf
 
 
 def detector_options(parameters: DetectorParameters) -> DetectorOptions:

@@ -73,7 +73,7 @@ class Answer:
     #: Whether the frame was refused before all crops were compared, so that a retry may succeed
     is_cut: bool = False
     stages_ms: Mapping[str, float] = field(default_factory=dict)  #: Duration of each stage [ms]
-    #: Hash of the searched map, see frame_localizer.load_hashed_map; empty without a map
+    #: Hash of the searched map, see frame_localizer.load_map; empty without a map
     map_hash: str = ''
     kind: RefusalKind | None = None  #: Kind of a refusal; None for other verdicts
     header: Header | None = None  #: Stamp of the image, frame of the map; None without an image
@@ -112,6 +112,9 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
     header = Header(stamp=frame.image.header.stamp, frame_id=localized.landmark_map.frame_id)
     evidence, points, depth = found.evidence, found.recognized, found.depth
     stamp, seen = header.stamp, localized.seen.observation
+    compared = int((seen.similarity_rows >= 0).sum())
+    is_cut = not found.accepted and seen.similarities is not None \
+        and compared < len(seen.detections)
     figures: dict[str, object] = {
         'stamp [s]': f'{stamp.sec}.{stamp.nanosec:09d}', 'frame': header.frame_id,
         'source': found.source if found.solved else '', 'confidence': found.confidence,
@@ -120,7 +123,7 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
         'score': found.score, 'landmarks': 0 if evidence is None else evidence.inliers,
         'frames': len(found.frame_matches), 'hypotheses': found.tried,
         'searched percent': 100.0 * found.coverage, 'crops': '' if seen.similarities is None else
-        f'{localized.compared} of {len(seen.detections)}',
+        f'{compared} of {len(seen.detections)}',
         'keyframe points': 0 if points is None else points.inliers,
         'keyframe search': found.keyframe_search,
         'depth': '' if depth is None else f'depth of {depth.objects} objects' if depth.is_passed
@@ -134,7 +137,7 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
                      and not (name == 'confidence' and name in found.reason))
     summary = f'[{said}; {in_words(stages_ms)}]'
     answer = Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, frame.received_at,
-                    localized.query, localized.is_cut, stages_ms, map_hash, found.refusal_kind,
+                    localized.query, is_cut, stages_ms, map_hash, found.refusal_kind,
                     header, figures)
     if not found.accepted:
         return answer
@@ -243,7 +246,20 @@ class CaseRecorder:
         if not parameters.record_folder:
             raise OptionsError('record_folder is not set: start the node with a folder that has '
                                'space for record_limit_mb')
-        queries, found, last = self._linked()
+        with self._lock:
+            seen, last = list(self._seen), self._last
+        while seen and seen[-1].received_at != last.received_at:
+            seen.pop()
+        if not seen:
+            raise DatasetError(f'nothing to record: the last request had no frame: {last.message}')
+        # odometry links the queries to the newest one; the oldest first
+        queries: list[Query] = []
+        for answer in reversed(seen):
+            assert answer.query is not None
+            if queries and (answer.query.run is None or answer.query.run != queries[0].run):
+                break
+            queries.insert(0, answer.query)
+        found = seen[-1]
         try:
             folder = Path(parameters.record_folder).expanduser()
             make_folder(folder)
@@ -253,7 +269,7 @@ class CaseRecorder:
         for name in _LIBRARIES:
             with suppress(PackageNotFoundError):
                 versions[name] = version(name)
-        arrays = case_arrays(Case(queries, {
+        arrays = case_arrays(Case(tuple(queries), {
             'verdict': last.verdict, 'message': last.message, 'found': found.verdict,
             'reason': found.detail, 'map_hash': found.map_hash,
             'parameters': asdict(parameters), 'options': asdict(parameters.options()),
@@ -272,23 +288,3 @@ class CaseRecorder:
         path = folder / f'case_{now}_{last.verdict}.npz'
         CASE.write(path, arrays, compress=True)
         return f'{path}: {len(queries)} frames; {last.message}'
-
-    def _linked(self) -> tuple[tuple[Query, ...], Answer, Answer]:
-        """Return the queries behind the last answer, the answer to its newest frame, and itself.
-
-        The queries are those that odometry links to the newest one, the oldest first. Without
-        odometry, only the newest query is returned.
-        """
-        with self._lock:
-            seen, last = list(self._seen), self._last
-        while seen and seen[-1].received_at != last.received_at:
-            seen.pop()
-        if not seen:
-            raise DatasetError(f'nothing to record: the last request had no frame: {last.message}')
-        linked: list[Query] = []
-        for answer in reversed(seen):
-            assert answer.query is not None
-            if linked and (answer.query.run is None or answer.query.run != linked[0].run):
-                break
-            linked.insert(0, answer.query)
-        return tuple(linked), seen[-1], last

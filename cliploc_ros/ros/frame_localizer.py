@@ -5,6 +5,7 @@
 import hashlib
 import logging
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.kernels.compiled import KernelCache
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layer_of_map
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
@@ -36,7 +38,6 @@ from cliploc_ros.ros.parameters import RelocalizerParameters, map_files, path_of
 from cliploc_ros.ros.visualization import SeenImage
 
 if TYPE_CHECKING:  # loaded where crops are compared
-    from cliploc_ros.models.clip_weights import ClipOptions
     from cliploc_ros.models.observer import Observer
 
 logger = logging.getLogger(__name__)
@@ -44,8 +45,8 @@ logger = logging.getLogger(__name__)
 #: Value of keyframes_file that selects the layer next to the map, if it exists.
 NEXT_TO_MAP = 'auto'
 _DIGITS = 12
-# A map file that changes while it is read is read again.
-_ATTEMPTS = 3
+# A search ends this long before its request, see Localizer.answer.
+_LATE_S = 0.1
 
 
 class Keyframes(NamedTuple):
@@ -65,10 +66,6 @@ class Localized(NamedTuple):
     landmark_map: LandmarkMap
     #: The image, the compared crops and their similarities to this map.
     seen: SeenImage
-    #: Number of crops that were compared with labels.
-    compared: int
-    #: Whether the frame was refused before all crops were compared.
-    is_cut: bool
     #: Covariance (6, 6) for a filter that fuses all accepted poses. In continuous mode it covers
     #: only the new information, see cliploc_ros.core.localizer.
     for_filter: NDArray[np.float64] | None
@@ -87,7 +84,7 @@ class FrameLocalizer:
     relocalizer : Relocalizer
         Relocalizer of the map, with these options.
     map_hash : str
-        See load_hashed_map.
+        See load_map.
     keyframes : Keyframes, optional
         The layer of keyframes of the map.
     """
@@ -130,16 +127,22 @@ class FrameLocalizer:
         query = replace(self.instants.query(frame, parameters, known),
                         is_thorough=not math.isinf(deadline))
         found = self.answer(query, parameters.options(), times, deadline)
+        if not found.accepted and query.is_thorough and found.keyframe_search == 'fast':
+            found = replace(found, reason=f'{found.reason}; thorough search of keyframes: time '
+                                          'was up; raise timeout_s')
+        if found.refusal_kind is RefusalKind.SEARCH_CUT_SHORT and time.monotonic() > deadline - \
+                _LATE_S:  # the request ended the search, not its time budget
+            found = replace(found, reason=found.reason.partition('; raise ')[0]
+                            + '; raise timeout_s')
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest
         if (found.accepted and found.map_from_camera is not None
                 and parameters.base_frame not in ('', frame.image.header.frame_id)):
             self.instants.check_axes(frame, known.state, found.map_from_camera)
-        compared = int((seen.similarity_rows >= 0).sum())
-        is_cut = not found.accepted and self.observer is not None \
-            and compared < len(seen.detections)
-        for_filter = self.localizer.covariance_for_filter(found) \
-            if found.accepted and parameters.mode == 'continuous' else found.covariance
+        # the result of a request that is late is not published, and must not advance the filter
+        for_filter = self.localizer.covariance_for_filter(found) if (
+            found.accepted and parameters.mode == 'continuous'
+            and time.monotonic() < deadline) else found.covariance
         found, own = in_its_map(self.instants.explained(found), self.landmark_map)
         parts = parts_of(self.landmark_map)
         if seen.similarities is not None and len(parts) > 1:
@@ -150,8 +153,8 @@ class FrameLocalizer:
         names = [camera_frame.camera_name for camera_frame in query.frames]
         layer = None if self.keyframes is None else self.keyframes.localizer.layer
         return Localized(
-            found, own.landmark_map, SeenImage(query.images[-1], seen, layer), compared, is_cut,
-            for_filter, (*frame.left_out, *(beside.camera for beside, _ in known.beside
+            found, own.landmark_map, SeenImage(query.images[-1], seen, layer), for_filter,
+            (*frame.left_out, *(beside.camera for beside, _ in known.beside
                                             if beside.camera not in names)), query)
 
     def answer(self, query: Query, options: RelocalizerOptions, times: StageTimes,
@@ -213,31 +216,27 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
         KernelCache.folder = resolve_cache_dir(parameters.cache_dir) / 'kernels'
     options = parameters.options()
     files = map_files(parameters)
-    landmark_map, map_hash = load_hashed_map(node, files)
+    landmark_map, map_hash = load_map(node, files)
     relocalizer = Relocalizer(landmark_map, options)  # errors show before the slow steps
     keyframes = load_keyframes(parameters, landmark_map)
     if not len(landmark_map) and keyframes is None:
         raise MapError('the map has neither landmarks nor keyframes next to it: rebuild it')
     observer = None
     if options.needs_similarities and len(landmark_map):
+        from cliploc_ros.models.clip_weights import ClipOptions
         from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
         from cliploc_ros.models.observer import Observer
-        asked = (clip_options_of(parameters), landmark_map, files, parameters.landmark_embeddings)
+        named = ClipOptions(
+            model=parameters.clip_model, pretrained=parameters.clip_pretrained,
+            checkpoint_path=parameters.clip_checkpoint_path, cache_dir=parameters.cache_dir)
+        asked = (with_encoder(named, parameters.profile), landmark_map, files,
+                 parameters.landmark_embeddings)
         if former is not None and former.observer is not None:
             observer = former.observer.with_labels(embed_map(*asked))
         else:
             observer = Observer(*load_encoder_for_map(*asked))
             observer.measure()
     return FrameLocalizer(landmark_map, observer, relocalizer, options, map_hash, keyframes)
-
-
-def clip_options_of(parameters: RelocalizerParameters) -> 'ClipOptions':
-    """Return the CLIP that the parameters name, by default that of the profile."""
-    from cliploc_ros.models.clip_weights import ClipOptions
-    named = ClipOptions(
-        model=parameters.clip_model, pretrained=parameters.clip_pretrained,
-        checkpoint_path=parameters.clip_checkpoint_path, cache_dir=parameters.cache_dir)
-    return with_encoder(named, parameters.profile)
 
 
 def keyframes_path(parameters: RelocalizerParameters) -> Path | None:
@@ -268,64 +267,37 @@ def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
         return None
 
 
-def load_map(node: Node, files: Sequence[str]) -> LandmarkMap:
-    """Load the map from files, or without files, from the node's parameters.
-
-    MapError: the map is invalid; the message names the source, the landmark and the field.
-    """
-    if files:
-        return join_maps([LandmarkMap.from_file(file) for file in files], files)
-    parameters = node.get_parameters_by_prefix('map')
-    if not parameters:
-        raise MapError('no map: set map_file, or load a map with --params-file')
-    tree: dict[str, Any] = {}
-    for name, parameter in parameters.items():
-        _insert(tree, name.split('.'), parameter.value)
-    return LandmarkMap.from_mapping(tree, 'parameters')
-
-
-def _insert(tree: dict[str, Any], path: list[str], value: Any) -> None:
-    """Insert a value at its dotted name."""
-    for key in path[:-1]:
-        branch = tree.setdefault(key, {})
-        if not isinstance(branch, dict):
-            raise MapError(f"parameters: map.{'.'.join(path)}: '{key}' has both a value "
-                           'and fields')
-        tree = branch
-    tree[path[-1]] = value
-
-
-def load_hashed_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
-    """Load one map, or join several, and return it with its hash.
+def load_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
+    """Load the map from files, or without files, from the node's parameters; also return its hash.
 
     The hash is the beginning of the output of `cat FILE... | sha256sum`. For a map in parameters
     it is the hash of its landmarks.
 
-    MapError: see load_map; or a file changes repeatedly while it is read.
+    MapError: the map is invalid; the message names the source, the landmark and the field.
     """
-    for _ in range(_ATTEMPTS):
-        before = _hash_of(files)
-        landmark_map = load_map(node, files)
-        if not files:
-            content = b''.join([
-                repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
-                      landmark_map.class_ids)).encode(),
-                landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
-                landmark_map.quats_xyzw.tobytes()])
-            return landmark_map, _hash(content)
-        if before == _hash_of(files):
-            return landmark_map, before
-    raise MapError(f'{", ".join(files)}: changes while it is read; write a new file, then rename '
-                   'it')
-
-
-def _hash_of(files: Sequence[str]) -> str:
-    """Return the hash of files; empty if one cannot be read, which load_map reports."""
-    try:
-        return _hash(b''.join(map(read_file, files)))
-    except OSError:
-        return ''
-
-
-def _hash(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:_DIGITS]
+    if files:
+        landmark_map = join_maps([LandmarkMap.from_file(file) for file in files], files)
+        try:
+            content = b''.join(map(read_file, files))
+        except OSError as error:
+            raise MapError(f'{", ".join(files)}: {error}') from error
+    else:
+        parameters = node.get_parameters_by_prefix('map')
+        if not parameters:
+            raise MapError('no map: set map_file, or load a map with --params-file')
+        tree: dict[str, Any] = {}
+        for name, parameter in parameters.items():
+            *path, last = name.split('.')
+            branch = tree
+            for key in path:
+                branch = branch.setdefault(key, {})
+                if not isinstance(branch, dict):
+                    raise MapError(f"parameters: map.{name}: '{key}' has both a value and fields")
+            branch[last] = parameter.value
+        landmark_map = LandmarkMap.from_mapping(tree, 'parameters')
+        content = b''.join([
+            repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
+                  landmark_map.class_ids)).encode(),
+            landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
+            landmark_map.quats_xyzw.tobytes()])
+    return landmark_map, hashlib.sha256(content).hexdigest()[:_DIGITS]

@@ -28,13 +28,7 @@ from rclpy.timer import Timer
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
-from cliploc_ros.core.geometry.transforms import (
-    SAME_SPOT,
-    TAKEN,
-    Tolerance,
-    invert_transform,
-    pose_error,
-)
+from cliploc_ros.core.geometry.transforms import SAME_SPOT, TAKEN, invert_transform, pose_error
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_from_msg, pose_to_msg, stamp_ns
@@ -228,7 +222,7 @@ class HandOff:
     def _is_taken(self, given: PoseWithCovarianceStamped, patience_s: float = 0.0) -> bool:
         """Return whether the localizer's pose agrees with `given`; wait for odometry at it."""
         shown = self._shown
-        return shown is not None and is_taken(
+        return shown is not None and not difference(
             self._carried(given, shown.header.stamp, patience_s), shown)
 
     def _carried(self, given: PoseWithCovarianceStamped, stamp: Stamp, patience_s: float = 0.0
@@ -256,15 +250,8 @@ class HandOff:
             return (f'{why}no message on {self._pose_topic} since initialpose was published '
                     f'{times} times in {time.monotonic() - begun_at:.0f} s: check that the '
                     'localizer is active and receives scans')
-        frames = [pose.header.frame_id.lstrip('/') for pose in (shown, given)]
-        if frames[0] != frames[1]:
-            return (f"{why}{self._pose_topic} is in frame '{frames[0]}', the pose in "
-                    f"'{frames[1]}': correct the map's frame_id")
         given = self._carried(given, shown.header.stamp)
-        distance_m, angle_deg = pose_error(_planar(given), _planar(shown))
-        near = tolerance_of(given)
-        return (f'{why}{self._pose_topic} differs from it by {distance_m:.2f} m and '
-                f'{angle_deg:.0f} degrees (limits {near.distance_m:.2f} and {near.angle_deg:.0f})')
+        return f'{why}{self._pose_topic} {difference(given, shown)}'
 
     def check_rest(self, max_speed_m_s: float, max_turn_rad_s: float, deadline: float) -> None:
         """Raise HandOffError unless odometry shows that the robot is at rest.
@@ -340,18 +327,21 @@ def _left_s(deadline: float) -> float:
     return max(0.0, deadline - time.monotonic())
 
 
-def is_taken(given: PoseWithCovarianceStamped, shown: PoseWithCovarianceStamped | None) -> bool:
-    """Return whether the localizer's pose `shown` agrees with the given one."""
-    return (shown is not None
-            and shown.header.frame_id.lstrip('/') == given.header.frame_id.lstrip('/')
-            and tolerance_of(given).agree(_planar(given), _planar(shown)))
-
-
-def tolerance_of(given: PoseWithCovarianceStamped) -> Tolerance:
-    """Return the allowed difference between the localizer's pose and the given one."""
+def difference(given: PoseWithCovarianceStamped, shown: PoseWithCovarianceStamped) -> str:
+    """Return how the localizer's pose `shown` differs from the given one; empty if they agree."""
+    frames = [pose.header.frame_id.lstrip('/') for pose in (shown, given)]
+    if frames[0] != frames[1]:
+        return f"is in frame '{frames[0]}', the pose in '{frames[1]}': correct the map's frame_id"
     covariance = np.array(given.pose.covariance).reshape(6, 6)
-    variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-    return TAKEN.wider(3.0 * math.sqrt(variance), math.degrees(3.0 * math.sqrt(covariance[5, 5])))
+    deviation_m = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+    near = TAKEN.wider(3.0 * deviation_m, math.degrees(3.0 * math.sqrt(covariance[5, 5])))
+    if near.agree(_planar(given), _planar(shown)):
+        return ''
+    if not np.isfinite(_planar(shown)).all():
+        return 'has NaN'
+    distance_m, angle_deg = pose_error(_planar(given), _planar(shown))
+    return (f'differs from it by {distance_m:.2f} m and {angle_deg:.0f} degrees (limits '
+            f'{near.distance_m:.2f} and {near.angle_deg:.0f})')
 
 
 def _planar(msg: PoseWithCovarianceStamped) -> NDArray[np.float64]:

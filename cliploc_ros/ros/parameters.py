@@ -12,24 +12,12 @@ from typing import Any
 from ament_index_python.packages import get_package_share_directory
 
 from cliploc_ros.core.fit.verification import MAX_FRAMES
-from cliploc_ros.core.options import (
-    ALGORITHMS,
-    COMPARED,
-    CROPS,
-    MATCHINGS,
-    RelocalizerOptions,
-)
+from cliploc_ros.core.options import ALGORITHMS, COMPARED, CROPS, MATCHINGS, RelocalizerOptions
 from cliploc_ros.errors import MapError, OptionsError
 from cliploc_ros.messages import parse_class_map
 from cliploc_ros.models.profiles import PROFILE_NAMES
 from cliploc_ros.ros.conversions import DETECTION_TYPES
 from cliploc_ros.ros.node.parameters import Parameters, parameter
-
-TRANSPORTS = ('raw', 'compressed')
-MODES = ('on_request', 'continuous')
-VERTICAL_SOURCES = ('none', 'base_frame', 'imu')
-WATCHES = ('none', 'tf', 'amcl_pose')
-REACTIONS = ('report', 'relocalize')
 
 _FILE, _PACKAGE = 'file://', 'package://'
 # Share of timeout_s that algorithms other than auto may search.
@@ -44,7 +32,8 @@ class CommonParameters(Parameters):
         'Folder of downloads, label embeddings, compiled networks and kernels; empty: '
         '~/.cache/cliploc_ros.', read_only=True)
     image_transport: str = parameter('raw',
-        'Subscribe to image or to image/compressed.', choices=TRANSPORTS, read_only=True)
+        'Subscribe to image or to image/compressed.', choices=('raw', 'compressed'),
+        read_only=True)
     cameras: list[str] = parameter([''],
         'Names of several cameras, which are the namespaces of their topics; empty: one camera.',
         read_only=True)
@@ -125,7 +114,8 @@ class RelocalizerParameters(CommonParameters):
     last_pose_probability: float = parameter(0.8,
         'Probability that the robot is still there after a restart.', low=0.0, high=0.99)
     mode: str = parameter('on_request',
-        'Localize on request, or with every frame (continuous).', choices=MODES, read_only=True)
+        'Localize on request, or with every frame (continuous).',
+        choices=('on_request', 'continuous'), read_only=True)
     timeout_s: float = parameter(10.0,
         'Answer a request within this time.', unit='s', low=0.1, high=3600.0)
     matching: str = parameter('hybrid',
@@ -147,7 +137,7 @@ class RelocalizerParameters(CommonParameters):
         'algorithms have half of timeout_s.', unit='ms', low=1.0, high=3.6e6)
     gravity: str = parameter('none',
         'Source of the vertical: base_frame (the robot stands upright) or the topic imu. Two '
-        'objects then suffice.', choices=VERTICAL_SOURCES, read_only=True)
+        'objects then suffice.', choices=('none', 'base_frame', 'imu'), read_only=True)
     tilt_deviation_deg: float = parameter(40.0,
         "Standard deviation of the camera's tilt if the vertical is unknown; 0: all tilts are "
         'equally likely.', unit='deg', low=0.0, high=60.0)
@@ -243,13 +233,13 @@ class RelocalizerParameters(CommonParameters):
         'Coordinate frame of odometry, for publish_tf.')
     watch: str = parameter('none',
         "Check the localizer's pose continuously: map -> base_frame in tf2, or the topic "
-        'localizer_pose.', choices=WATCHES, read_only=True)
+        'localizer_pose.', choices=('none', 'tf', 'amcl_pose'), read_only=True)
     watch_period_s: float = parameter(2.0,
         'Time between checks of the watch. A metre or a quarter turn by odom triggers an earlier '
         'check, at most once a second.', unit='s', low=1.0, high=5.0)
     on_lost: str = parameter('report',
         'Reaction to a lost robot: only report it, or relocalize as soon as the robot is at rest '
-        'by odom.', choices=REACTIONS)
+        'by odom.', choices=('report', 'relocalize'))
     tf_timeout_s: float = parameter(0.5,
         "Longest wait for a transform at the image's stamp. A request waits for the camera's "
         'mount until timeout_s.', unit='s', low=0.0, high=60.0)

@@ -174,12 +174,13 @@ class Requests:
 
     A request that had to wait gets the previous answer if the image of that answer arrived after
     the request. Thus simultaneous requests need one search and reset the localizer once.
-    Otherwise it is answered with new frames.
+    Otherwise it is answered with new frames. Without `handoff`, poses are neither published nor
+    delivered.
     """
 
     def __init__(self, node: ManagedNode[RelocalizerParameters], frames: CameraRig,
                  robot: RobotStateSource, jumps: TimeJumps, pipeline: Pipeline,
-                 cases: CaseRecorder, handoff: HandOff) -> None:
+                 cases: CaseRecorder, handoff: HandOff | None) -> None:
         self._node, self._frames, self._robot, self._jumps = node, frames, robot, jumps
         self._pipeline, self._cases, self._handoff = pipeline, cases, handoff
         self._turn = threading.Lock()
@@ -232,11 +233,8 @@ class Requests:
                 frame = self._frames.next_frame(after, deadline)
                 times.begin('detection', frame.received_at)
                 times.begin('waiting', frame.detected_at)
-                # published here and not by the worker, which goes on after a time-out
-                answer = self._pipeline.publish(self._node.worker.run(
+                answer, may_go_on = self._deliver(self._node.worker.run(
                     partial(self._pipeline.localize, frame, times, deadline), deadline), deadline)
-                self._cases.add(answer)
-                answer, may_go_on = self._hand_over(answer, deadline)
             except (TimeJumpError, NoTransformError) as error:  # a newer frame may work
                 problem, after = error, time.monotonic()
                 if after <= deadline - _GRACE_S:
@@ -268,8 +266,15 @@ class Requests:
         return replace(last, detail=f'{last.detail} [{looks} frames in '
                                     f'{time.monotonic() - arrived_at:.1f} s]')
 
-    def _hand_over(self, answer: Answer, deadline: float) -> tuple[Answer, bool]:
-        """Deliver an accepted pose; return the answer, and whether another frame may help."""
+    def _deliver(self, look: Look, deadline: float) -> tuple[Answer, bool]:
+        """Publish a result and hand its pose over; return the answer, and whether to go on.
+
+        It is published here and not by the worker, which goes on after a time-out.
+        """
+        if self._handoff is None:
+            return look.answer, look.answer.pose is None
+        answer = self._pipeline.publish(look, deadline)
+        self._cases.add(answer)
         if answer.pose is None:
             return answer, True
         try:

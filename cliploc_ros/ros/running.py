@@ -3,11 +3,7 @@
 """Access to a running relocalizer from other programs: diagnostics and parameters."""
 
 import math
-import re
 import time
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMsg
@@ -18,7 +14,6 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.validate_topic_name import validate_topic_name
 
-from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, OptionsError
 
 #: Diagnostics are published once a second; a relocalizer that is silent for longer is dead.
@@ -55,10 +50,6 @@ class RelocalizerStatus:
     def time_limit_s(self) -> float:
         """Return the time limit of a request [s]; infinite if unknown."""
         return float(self.values.get('time limit [s]', math.inf))
-
-    def has_reported_since(self, moment: float) -> bool:
-        """Return whether it is active and has reported since `moment` (monotonic clock) [s]."""
-        return self._received_at > moment and self.values.get('state') == 'active'
 
     def problem(self) -> str:
         """Return why the relocalizer cannot answer a request, and the remedy; empty if it can."""
@@ -129,47 +120,3 @@ def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, li
         raise NotRunningError(f'{name} does not respond: restart it')
     return status, [Parameter.from_parameter_msg(ParameterMsg(name=parameter, value=value))
                     for parameter, value in zip(names, got.result().values, strict=True)]
-
-
-def parameters_of_files(files: Sequence[Path], name: str) -> list[Parameter]:
-    """Return the parameters that ROS reads from files for a node; later files take precedence.
-
-    Parameters
-    ----------
-    name : str
-        Name of the node, with its namespace.
-
-    CliplocError: a file is invalid, or no file has parameters of the node.
-    """
-    found: dict[str, Any] = {}
-    others: list[str] = []
-    for file in files:
-        for pattern, values in _nodes_of(read_parameter_file(file)):
-            # ** matches any number of words of the name, * matches one
-            words = ['(/[^/]+)*' if word == '**' else '/[^/]+' if word == '*' else
-                     f'/{re.escape(word)}' for word in pattern.split('/') if word]
-            if re.fullmatch(''.join(words), name):
-                found |= _flat(values)
-            else:
-                others.append(pattern)
-    if not found:
-        raise OptionsError(f'{", ".join(map(str, files))}: no parameters of {name}, only of '
-                           f'{", ".join(others) or "no node"}; name the node with --relocalizer')
-    return [Parameter(name, value=value) for name, value in found.items() if value is not None]
-
-
-def _nodes_of(tree: dict[str, Any], prefix: str = '') -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the name and parameters of each node in a file, including nested namespaces."""
-    for key, content in tree.items():
-        if key == 'ros__parameters':
-            yield prefix, content if isinstance(content, dict) else {}
-        elif isinstance(content, dict):
-            yield from _nodes_of(content, f'{prefix}/{key.strip("/")}')
-
-
-def _flat(tree: dict[str, Any], prefix: str = '') -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in tree.items():
-        found |= _flat(value, f'{prefix}{name}.') if isinstance(value, dict) else {
-            f'{prefix}{name}': value}
-    return found

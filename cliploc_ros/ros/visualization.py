@@ -257,23 +257,18 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
                 cv2.polylines(canvas, [_pixels(points).reshape(-1, 1, 2)], True, _ELLIPSE, 2,
                               cv2.LINE_AA)
             label = landmark_map.labels[match.landmark][:_LABEL_CHARS]
-            similarity = _similarity(seen.observation, match.detection, match.landmark)
-            _write_near(canvas, f'{label} {similarity}IoU {match.iou:.2f}',
-                        boxes[match.detection], taken)
+            similarities, row = seen.observation.similarities, \
+                seen.observation.similarity_rows[match.detection]
+            if similarities is not None and row >= 0:
+                similarity = similarities.crops[row] @ similarities.labels.unique[
+                    similarities.labels.of_landmarks[match.landmark]] if isinstance(
+                        similarities, CropSimilarities) else similarities[row, match.landmark]
+                label = f'{label} CLIP {float(similarity):.2f}'
+            _write_near(canvas, f'{label} IoU {match.iou:.2f}', boxes[match.detection], taken)
     if seen.layer is not None and found.recognized is not None:
         canvas = beside_keyframe(canvas, found.recognized, seen.layer)
     return canvas if not verdict else _above_bar(
         canvas, verdict, _ACCEPTED_BAR if found.accepted else _REFUSED_BAR)
-
-
-def _similarity(observation: Observation, detection: int, landmark: int) -> str:
-    similarities, row = observation.similarities, observation.similarity_rows[detection]
-    if similarities is None or row < 0:
-        return ''
-    if isinstance(similarities, CropSimilarities):
-        label = similarities.labels.unique[similarities.labels.of_landmarks[landmark]]
-        return f'CLIP {float(similarities.crops[row] @ label):.2f} '
-    return f'CLIP {float(similarities[row, landmark]):.2f} '
 
 
 def _pixels(points: NDArray[np.float64]) -> NDArray[np.int32]:

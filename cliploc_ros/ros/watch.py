@@ -35,7 +35,6 @@ from cliploc_ros.ros.conversions import pose_from_msg, stamp_ns
 from cliploc_ros.ros.handoff import HandOff, HandOffError
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
-from cliploc_ros.ros.inputs.odometry import OdometryPlace
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps, stamp_problem
@@ -106,8 +105,7 @@ class Watcher:
         self._cost_s = 0.0
         # The state and the problem that were logged last, and when (monotonic clock) [s].
         self._said, self._said_at = (WatchState.UNCERTAIN, ''), -math.inf
-        # Reaction to a lost robot, and whether it is at rest.
-        self._reaction, self._is_at_rest = '', False
+        self._reaction = ''  # to a lost robot
         self._rest_stamp: Time | None = None
         # Stamp of the newest checked image, and whether the localizer ever had a pose.
         self._image_stamp, self._had_pose = Time(), False
@@ -157,7 +155,6 @@ class Watcher:
         report = known.report
         health.values |= {
             'watch': str(known.state), 'watch reason': known.reason, 'on lost': self._reaction,
-            'lost and at rest': known.state is WatchState.LOST and self._is_at_rest,
             'watch look [ms]': f'{1e3 * self._cost_s:.1f}'}
         if report is not None:
             turned = '' if report.camera_turn is None else \
@@ -184,7 +181,11 @@ class Watcher:
                     stamp = self._look(stopped)
                 except PoselessError as error:
                     self._miss(stopped, str(error))
-                    self._wake_up(stopped)
+                    # the localizer has no pose, but had one before: it was restarted
+                    if self._node.settings.values.on_lost != 'report' and self._had_pose \
+                            and not self._handoff.missing():
+                        self._relocalize_at_rest(stopped, self._image_stamp,
+                                                 'the localizer has no pose')
                 else:  # relocalize a lost robot at rest if on_lost asks for it
                     if self._known.state is WatchState.LOST and stamp is not None:
                         self._relocalize_at_rest(stopped, stamp, 'lost')
@@ -263,8 +264,6 @@ class Watcher:
             self._state.publish(String(data=str(known.state)))
         if known.state is WatchState.LOCALIZED:
             self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
-        if known.state is not WatchState.LOST:
-            self._is_at_rest = False
         # stamps and ages make each problem a new text
         now, said = time.monotonic(), (known.state, re.sub(r'\d[\d.]*', '', known.problem))
         if said != self._said and (known.state is not before.state
@@ -297,18 +296,11 @@ class Watcher:
 
     # ---- what follows ---------------------------------------------------------------------------
 
-    def _wake_up(self, stopped: threading.Event) -> None:
-        """Relocalize after a restart of the localizer: it has no pose, but had one before."""
-        is_wanted = self._node.settings.values.on_lost != 'report' and self._had_pose
-        if is_wanted and not self._handoff.missing():
-            self._relocalize_at_rest(stopped, self._image_stamp, 'the localizer has no pose')
-
     def _relocalize_at_rest(self, stopped: threading.Event, stamp: Time, why: str) -> None:
         """Relocalize a robot at rest at increasing intervals, unless on_lost is report."""
         parameters = self._node.settings.values
         self._reaction = self._why_not_at_rest(parameters, stamp)
-        self._is_at_rest = not self._reaction
-        if not self._is_at_rest:
+        if self._reaction:
             return
         left_s = self._next_request_at - time.monotonic()
         if parameters.on_lost == 'report' or stopped.is_set():
@@ -443,7 +435,13 @@ class LocalizerPose:
         if shown is None:
             raise PoselessError(f'no pose on {topic} yet: AMCL publishes one when the robot '
                                 'drives; with watch: tf it is not needed')
-        pose, place = _pose_of(shown, topic), state.place
+        if why := stamp_problem(shown.header.stamp):
+            raise NoLocalizerPoseError(f'the stamp of {topic} {why}: the localizer must stamp its '
+                                       'pose')
+        pose, place = pose_from_msg(shown.pose.pose), state.place
+        if pose is None:
+            raise NoLocalizerPoseError(f'the pose on {topic} has NaN or a quaternion that is not '
+                                       "of unit length: see the localizer's log")
         shown_ns, frame_id = stamp_ns(shown.header.stamp), shown.header.frame_id.lstrip('/')
         if place is None:
             since_ns = stamp_ns(image.stamp) - shown_ns
@@ -452,38 +450,19 @@ class LocalizerPose:
                     f'{topic} is {since_ns / NS_PER_S:.1f} s older than the image, and odom does '
                     'not cover the time since: publish odom')
             return frame_id, pose @ invert_transform(state.camera_from_base)
-        anchor = self._anchored(shown, pose, image, place, parameters, topic)
-        if place.way_m - anchor.way_m > _SILENT_WAY_M:
-            raise NoLocalizerPoseError(
-                f'no message on {topic} for {place.way_m - anchor.way_m:.1f} m of driving: check '
-                'that the localizer is active and receives scans')
-        return frame_id, anchor.map_from_odom @ place.odom_from_frame
-
-    def _anchored(self, shown: PoseWithCovarianceStamped, pose: NDArray[np.float64],
-                  image: Header, place: OdometryPlace, parameters: RelocalizerParameters,
-                  topic: str) -> _Anchor:
-        """Return the pose of odometry's frame in the map, by the localizer's newest pose."""
-        shown_ns, anchor = stamp_ns(shown.header.stamp), self._anchor
+        anchor = self._anchor
         if anchor is None or (anchor.shown_ns, anchor.run) != (shown_ns, place.run):
             then = self._robot.at(Header(stamp=shown.header.stamp, frame_id=image.frame_id),
                                   parameters)
             if then.place is None or then.place.run != place.run:
                 raise LaterError(f'odom does not cover the time since {topic} was published: wait '
                                  'for the next pose')
-            map_from_camera = pose @ invert_transform(then.camera_from_base)
+            # the pose of odometry's frame in the map, by the localizer's newest pose
             anchor = self._anchor = _Anchor(
-                shown_ns, place.run, then.place.way_m,
-                map_from_camera @ invert_transform(then.place.odom_from_frame))
-        return anchor
-
-
-def _pose_of(shown: PoseWithCovarianceStamped, topic: str) -> NDArray[np.float64]:
-    """Return a pose of the localizer (4, 4). NoLocalizerPoseError: it is invalid."""
-    if why := stamp_problem(shown.header.stamp):
-        raise NoLocalizerPoseError(f'the stamp of {topic} {why}: the localizer '
-                                   'must stamp its pose')
-    pose = pose_from_msg(shown.pose.pose)
-    if pose is None:
-        raise NoLocalizerPoseError(f'the pose on {topic} has NaN or a quaternion that is not of '
-                                   "unit length: see the localizer's log")
-    return pose
+                shown_ns, place.run, then.place.way_m, pose @ invert_transform(
+                    then.place.odom_from_frame @ then.camera_from_base))
+        if place.way_m - anchor.way_m > _SILENT_WAY_M:
+            raise NoLocalizerPoseError(
+                f'no message on {topic} for {place.way_m - anchor.way_m:.1f} m of driving: check '
+                'that the localizer is active and receives scans')
+        return frame_id, anchor.map_from_odom @ place.odom_from_frame

@@ -7,8 +7,8 @@ from importlib import import_module
 
 import pytest
 
-PROGRAMS = ('build_map', 'check_map', 'demo', 'doctor', 'evaluate', 'import_map', 'prepare',
-            'replay', 'studio', 'tum_to_bag', 'wake_up')
+PROGRAMS = ('build_map', 'check_map', 'demo', 'doctor', 'evaluate', 'import_map', 'replay',
+            'studio', 'tum_to_bag', 'wake_up')
 #: Options without a limit may accept infinity.
 MAY_BE_INFINITE = {'--height-range'}
 

@@ -5,9 +5,7 @@
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from processes import PROJECT
-from std_msgs.msg import Header
 from tester import make_frame
-from vision_msgs.msg import Detection2DArray
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -55,24 +53,6 @@ def test_a_relocalizer_that_hears_everything_nothing_and_half(own_relocalizer, t
     status.wait(ERROR, 'nobody publishes /camera_info')
     tester.infos = tester.create_publisher(type(frame[1]), 'camera_info', 10)
     status.wait(OK, 'active', frame)
-
-
-def test_what_contradicts_itself_is_named_until_it_is_gone(own_relocalizer, tester, status):
-    """A doubt gives a warning, also in a refusal. A fault of the detector is an error."""
-    process = own_relocalizer()
-    image, info, detections = make_frame()
-    info.header = Header(stamp=image.header.stamp, frame_id='color_frame')
-    assert tester.relocalize((image, info, detections)).success
-    status.wait(WARN, "'color_frame'")
-    tester.wait(lambda: "'color_frame'" in process.output(), 'the log')
-    answer = tester.relocalize((image, info, Detection2DArray(header=image.header)))
-    assert not answer.success and "'color_frame'" in answer.message
-    assert tester.relocalize(make_frame(stamp_s=101.0)).success
-    status.wait(OK, 'active')
-    image, info, detections = make_frame(stamp_s=102.0)
-    info.k[:6] = [1000.0, 0.0, 640.0, 0.0, 1000.0, 480.0]
-    assert not tester.relocalize((image, info, detections)).success
-    status.wait(ERROR, '1280x960 px')
 
 
 def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):

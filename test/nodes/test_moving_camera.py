@@ -7,7 +7,6 @@ import time
 import numpy as np
 import pytest
 from scene import MAP_FROM_CAMERA
-from std_msgs.msg import Header
 from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error, transform_from_pose
@@ -71,32 +70,3 @@ def test_a_request_waits_for_a_late_transform(own_relocalizer, tester, lift):
     assert not answer.success
     assert "'base_link'" in answer.message
     assert process.alive
-
-
-def test_map_to_odom_is_broadcast_where_it_is_asked_for(own_relocalizer, tester):
-    own_relocalizer(expect='', base_frame='base_link', publish_tf=True,
-                    base_from_camera='[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]')
-    from tf2_msgs.msg import TFMessage
-    odom_from_base = transform_from_pose(np.array([5.0, 0.0, 0.0]), np.array([0, 0, 0.6, 0.8]))
-    publisher, heard = tester.create_publisher(TFMessage, '/tf', 100), []
-    subscription = tester.create_subscription(TFMessage, '/tf', lambda msg: heard.extend(
-        transform for transform in msg.transforms if transform.header.frame_id == 'map'), 100)
-    frame = make_frame(stamp_s=100.0)
-    moving = transform_msg(Header(frame_id='odom', stamp=frame[0].header.stamp), 'base_link',
-                           odom_from_base)
-    future = tester.ask()
-
-    def answered():
-        publisher.publish(TFMessage(transforms=[moving]))
-        return future.done()
-    tester.feed_until(answered, frame)
-    assert future.result().success, future.result().message
-    tester.wait(lambda: len(heard) > 2, 'map -> odom')
-    assert {message.child_frame_id for message in heard} == {'odom'}
-    t, q = heard[-1].transform.translation, heard[-1].transform.rotation
-    map_from_odom = transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
-    tester.wait(lambda: tester.poses, 'the pose')
-    map_from_base = transform_of(tester.poses[-1].pose.pose)
-    assert pose_error(map_from_odom @ odom_from_base, map_from_base) < (1e-6, 1e-3)
-    tester.destroy_publisher(publisher)
-    tester.destroy_subscription(subscription)

@@ -52,13 +52,3 @@ def test_a_dump_starts_the_same_relocalizer(start, tester, room_map, tmp_path):
     assert again['k'] == 5
     assert tester.relocalize(make_frame()).success
     assert 'unknown parameter' not in second.output()
-
-
-def test_one_file_serves_both_nodes(start, tester, tmp_path):
-    path = tmp_path / 'robot.yaml'
-    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {
-        'autostart': False, 'iou_threshold': 0.3, 'conf': 0.25, 'imgs': 320}}}))
-    for name in ('detector', 'relocalizer'):
-        node = start(f'nodes.{name}', '--ros-args', '--params-file', path)
-        node.wait_for_output("parameter 'imgs' ")
-        assert node.output().count('unknown parameter') == 1, node.output()

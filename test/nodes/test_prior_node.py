@@ -3,7 +3,6 @@
 """Priors of a relocalizer: the topic ~/prior, and its last pose."""
 
 
-import json
 
 import numpy as np
 import pytest
@@ -76,28 +75,3 @@ def test_the_topic_decides_between_rooms_that_look_alike(own_relocalizer, tester
     relocalized('accepted')
     tell(process, at(0.0, frame_id=''))
     relocalized('refused')
-
-
-def test_a_robot_wakes_where_it_was(own_relocalizer, tester, tell, twins_map, tmp_path):
-    file = tmp_path / 'last_pose.json'
-    known = {'map_file': twins_map, 'last_pose_file': file, **SEARCH}
-    first = own_relocalizer(**known)
-    assert 'refused' in tester.relocalize(make_frame()).message
-    tell(first, at(0.0), profile=RELIABLE)  # the next process does not receive it
-    ask_until(tester.relocalize, 'accepted', make_frame())
-    tester.wait(file.exists, 'the file')
-    kept = json.loads(file.read_text())
-    assert kept['frame_id'] == 'map' and len(kept['map_hash']) == 12
-    assert kept['map_from_robot'][0][3] == pytest.approx(0.3, abs=0.05)
-    # the localizer's present pose
-    shown = at(12.0, deviation=0.1)
-    tester.wait(lambda: tell(first, shown, topic='amcl_pose') or json.loads(file.read_text())[
-        'map_from_robot'][0][3] == 12.0, 'the pose of the localizer')
-    file.write_text(json.dumps(kept))
-    first.stop()
-
-    second = own_relocalizer(**known)
-    assert 'accepted: x 0.3' in tester.relocalize(make_frame()).message
-    again = tester.relocalize(make_frame()).message
-    assert 'refused' in again and 'prior' not in again, 'used up: the robot is awake'
-    assert second.stop()[0] == 0 and 'Traceback' not in second.output()

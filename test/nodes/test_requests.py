@@ -14,7 +14,6 @@ from scene import MAP_FROM_CAMERA, make_room, see_room
 from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.qos import LATCHED
 
 
@@ -77,14 +76,6 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     tester.destroy_subscription(subscription)
 
 
-def test_a_refusal_states_one_confidence(relocalizer, tester):
-    assert tester.set_parameter('min_confidence', 0.9999).successful
-    few = make_frame(see_room(make_room()).select(np.arange(5)))
-    message, usual = tester.relocalize(few).message, RelocalizerParameters().min_confidence
-    assert tester.set_parameter('min_confidence', usual).successful
-    assert re.match(r'refused: confidence 0\.\d+ < 0\.9999; .* \[score ', message), message
-
-
 def test_frames_out_of_order_and_time_going_back(relocalizer, tester):
     for stamp_s in (50.0, 10.0, 3600.0, 0.1):
         assert tester.relocalize(make_frame(stamp_s=stamp_s)).success
@@ -93,13 +84,3 @@ def test_frames_out_of_order_and_time_going_back(relocalizer, tester):
     tester.feed_until(future.done, [newer[0], older[0], older[1], newer[1], older[2]])
     assert future.result().success
     tester.wait(lambda: tester.poses[-1].header.stamp.sec == 70, 'the older frame')
-
-
-def test_requests_that_wait_together_reset_the_localizer_once(relocalizer, tester):
-    futures = [tester.ask() for _ in range(10)]
-    tester.wait(lambda: tester.listened_to() > 0, 'the relocalizer to subscribe')
-    tester.feed_until(lambda: all(future.done() for future in futures), make_frame())
-    assert all(future.result().success for future in futures)
-    tester.wait(lambda: tester.initial_poses, 'an initial pose')
-    # requests after the frame was taken share a newer frame
-    assert len(tester.initial_poses) <= 3

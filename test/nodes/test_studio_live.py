@@ -11,7 +11,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from processes import wait_for
 from tester import RELIABLE, make_frame
 
-from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.studio.live import LiveError, follow_relocalizer
 
 
@@ -42,17 +41,6 @@ def test_without_a_relocalizer(live):
     for request in (live.relocalize, live.reload_map):
         with pytest.raises(LiveError, match='/relocalizer'):
             request()
-
-
-def test_a_relocalizer_of_another_name_is_told(own_relocalizer):
-    own_relocalizer()
-    with follow_relocalizer('/robot_2/relocalizer') as live:
-        def refusal():
-            with pytest.raises(LiveError) as refused:
-                live.relocalize()
-            return str(refused.value)
-
-        wait_for(lambda: 'for another relocalizer' in refusal(), 'discovery')
 
 
 def test_answers_one_request_at_a_time(live, own_relocalizer, tester):
@@ -89,9 +77,3 @@ def test_invalid_poses_are_left_out(live, tester):
     wait_for(lambda: live.state.pose is not None, 'the valid pose')
     assert live.state.pose.map_from_body[1, 3] == 2.5
     tester.destroy_publisher(publisher)
-
-
-@pytest.mark.parametrize('name', ['two words', '1st', 'a//b', ''])
-def test_names_that_are_none(name):
-    with pytest.raises(OptionsError, match='--ros'), follow_relocalizer(name):
-        pass

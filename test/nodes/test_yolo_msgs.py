@@ -5,10 +5,8 @@
 import os
 from types import SimpleNamespace as Fields
 
-import pytest
-from processes import wait_for
 from rclpy.serialization import serialize_message
-from tester import RELIABLE, class_matching, make_frame
+from tester import class_matching, make_frame
 
 from cliploc_ros.ros.conversions import from_yolo_msg
 
@@ -30,27 +28,6 @@ def as_yolo(msg, array=Fields, detection=Fields):
 def test_all_that_counts_is_kept():
     expected = make_frame()[2]
     assert serialize_message(from_yolo_msg(as_yolo(expected))) == serialize_message(expected)
-
-
-@pytest.mark.needs('yolo_msgs')
-def test_a_request_with_detections_of_yolo_ros(own_relocalizer, tester):
-    from yolo_msgs.msg import Detection, DetectionArray
-    process = own_relocalizer('--ros-args', '-r', 'detections:=yolo/detections',
-                              detections_type='yolo_msgs')
-    publisher = tester.create_publisher(DetectionArray, 'yolo/detections', RELIABLE)
-    image, info, detections = make_frame()
-    yolo = as_yolo(detections, DetectionArray, Detection)
-    try:
-        future = tester.ask()
-
-        def work():
-            tester.publish([image, info])
-            publisher.publish(yolo)
-            tester.spin()
-        wait_for(future.done, 'an answer', work=work)
-        assert future.result().success, process.output()
-    finally:
-        tester.destroy_publisher(publisher)
 
 
 def test_without_yolo_msgs_the_node_says_so(start, tester, room_map, tmp_path):

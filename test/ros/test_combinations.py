@@ -153,20 +153,6 @@ def test_a_request_is_answered_and_its_record_is_answered_alike(cameras, known, 
     equal(again, found.found)
 
 
-@pytest.mark.parametrize('cameras', [1, 4])
-def test_a_refused_request_of_several_looks_is_refused_again_alike(cameras, tmp_path):
-    """The record contains looks that disagree, and their evidence on the cameras."""
-    drive = Drive(cameras, 'all', tmp_path)
-    drive.objects = 3
-    drive.parameters = replace(drive.parameters, min_confidence=1.0)
-    for number in range(4):
-        found, _ = drive.localize(10 * number)
-        assert not found.found.accepted
-    case, again = drive.recorded()
-    assert len(case.queries) == 4 and len(again.evidence.earlier) == 3
-    equal(again, found.found)
-
-
 @pytest.mark.parametrize('x_m', [0.0, 30.0])
 def test_where_a_prior_decides_the_record_has_it(x_m, tmp_path):
     drive = Drive(1, 'prior', tmp_path)

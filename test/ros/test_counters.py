@@ -11,7 +11,7 @@ from scene import make_room, write_map
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict, answer_msg
-from cliploc_ros.ros.frame_localizer import load_hashed_map
+from cliploc_ros.ros.frame_localizer import load_map
 
 
 def test_counts_add_up():
@@ -38,11 +38,11 @@ def test_a_withheld_answer_states_no_pose():
 def test_the_hash_of_a_file_is_that_of_sha256sum(tmp_path):
     path = tmp_path / 'map.yaml'
     write_map(make_room(), path)
-    loaded, digest = load_hashed_map(None, [str(path)])
+    loaded, digest = load_map(None, [str(path)])
     assert len(loaded) == 12
     assert hashlib.sha256(path.read_bytes()).hexdigest().startswith(digest)
     assert len(digest) == 12
     path.write_text(path.read_text() + '# another one\n')
-    assert load_hashed_map(None, [str(path)])[1] != digest
+    assert load_map(None, [str(path)])[1] != digest
     with pytest.raises(MapError, match='No such file'):
-        load_hashed_map(None, [str(tmp_path / 'none.yaml')])
+        load_map(None, [str(tmp_path / 'none.yaml')])

@@ -3,7 +3,6 @@
 """Handing a pose over: real subscribers, odometry, and services that answer or never do."""
 
 import math
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -12,11 +11,7 @@ import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from handing_over import PARAMETERS, TEN_HZ, Robot, make_pose, stamp, stand, tell
 
-from cliploc_ros.ros.handoff import (
-    HandOffError,
-    NoLocalizerError,
-    is_taken,
-)
+from cliploc_ros.ros.handoff import HandOffError, NoLocalizerError, difference
 from cliploc_ros.ros.inputs.stamps import TimeJumpError
 
 
@@ -31,15 +26,6 @@ def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
     robot.hand_over()
     robot.wait(lambda: robot.localizer.poses, 'the pose')
     assert len(robot.localizer.poses) == 1, 'the withheld pose is not delivered late'
-
-
-def test_a_localizer_that_starts_meanwhile_is_waited_for(robot):
-    """Discovery takes up to three seconds."""
-    starting = threading.Timer(3.0, robot.localizer.subscribe)
-    starting.start()
-    assert robot.hand_over() > 2.0
-    robot.wait(lambda: robot.localizer.poses, 'the pose')
-    starting.join()
 
 
 @pytest.fixture
@@ -215,17 +201,6 @@ def test_a_robot_that_drives_is_told_so_however_little_time_is_left(silent, whee
     assert not silent.localizer.poses
 
 
-def test_a_robot_that_moves_meanwhile_gets_the_pose_no_more(silent, wheels):
-    tell(silent, wheels, TEN_HZ)
-    with ThreadPoolExecutor(1) as pool:
-        handing_over = pool.submit(silent.hand_over)
-        silent.wait(lambda: silent.localizer.poses, 'the pose')
-        tell(silent, wheels, (1.0, 1.1, 1.2), twist_m_s=0.5)
-        with pytest.raises(HandOffError, match=r'moves at 0\.50'):
-            handing_over.result()
-    assert len(silent.localizer.poses) == 1
-
-
 @pytest.mark.parametrize(('end', 'error'), [
     (Robot.jump, TimeJumpError), (lambda robot: robot.handoff.stop(), HandOffError)])
 def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(silent, end, error):
@@ -253,6 +228,6 @@ def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
     shown.header.frame_id, shown.pose.pose.position.x = frame, x_m
     shown.pose.pose.orientation.z = math.sin(math.radians(yaw_deg) / 2)
     shown.pose.pose.orientation.w = math.cos(math.radians(yaw_deg) / 2)
-    assert is_taken(given, shown) == is_taken_over
+    assert (not difference(given, shown)) == is_taken_over
     shown.pose.pose.orientation.y = 1e200
-    assert not is_taken(given, shown)
+    assert difference(given, shown)

@@ -27,10 +27,3 @@ def test_records_come_out_of_the_node_at_their_level(logger, capfd, level, word)
     written = capfd.readouterr()
     line, = (written.out + written.err).splitlines()
     assert f'[{word}]' in line and '[spokesman]' in line and line.endswith('loaded 3 of cup')
-
-
-def test_levels_may_change_from_record_to_record(logger, capfd):
-    """All levels from the same line: rclpy rejects that unless the level is part of the call."""
-    for level in (logging.INFO, logging.ERROR, logging.WARNING, logging.INFO):
-        logger.log(level, 'text')
-    assert capfd.readouterr().err.count('text') == 4

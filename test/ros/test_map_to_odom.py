@@ -154,12 +154,3 @@ def test_transforms_from_before_a_jump_are_forgotten(robot, restart_s):
         robot.tell(seconds, x_m)
     assert robot.place(restart_s + 0.5) == pytest.approx(11.5)
     assert robot.place(restart_s + 2.0) is None, 'no interpolation across the jump'
-
-
-@pytest.mark.needs('tf2_ros')
-@pytest.mark.parametrize('restart_s', [95.0, 2.0])
-def test_a_bag_that_loops_without_a_clock_is_noticed(robot, restart_s):
-    for seconds, x_m in ((99.0, 1.0), (100.0, 2.0), (restart_s, 11.0), (restart_s + 1.0, 12.0)):
-        robot.tell(seconds, x_m)
-    assert robot.place(restart_s + 0.5) == pytest.approx(11.5)
-    assert robot.place(99.5) is None

@@ -7,11 +7,7 @@ from scene import make_layer, make_room
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
-from cliploc_ros.ros.visualization import (
-    class_color,
-    landmark_markers,
-    match_markers,
-)
+from cliploc_ros.ros.visualization import class_color, landmark_markers, match_markers
 
 
 def test_every_landmark_is_an_ellipsoid_with_its_label():

@@ -62,14 +62,6 @@ def test_the_camera_is_where_its_mount_has_it(robot, source):
                                odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
 
 
-def test_it_knows_the_way_driven_until_the_image(robot, source):
-    talk(source, *np.arange(9.0, 12.05, 0.1))
-    assert place(robot, 9.0).way_m == 0.0
-    assert place(robot, 11.05).way_m == pytest.approx(0.2, abs=0.03)
-    talk(source, 12.1, child_frame='camera')
-    assert place(robot, 12.1).way_m == 0.0, 'another run'
-
-
 def test_a_body_that_nobody_places_links_nothing(robot, source, capfd):
     talk(source, 10.0, child_frame='wheels')
     assert place(robot, 10.0) is None
@@ -130,22 +122,6 @@ def test_odometry_that_goes_on_is_no_restart_and_invalid_messages_change_nothing
     assert not restarts, 'a jump of the clock is reported by TimeJumps'
 
 
-def test_it_subscribes_while_it_is_open(make_node, spin_until):
-    listener, talker = make_node('listener'), make_node('wheels')
-    robot = RobotStateSource(listener)
-    source, publisher = robot.odometry, talker.create_publisher(Odometry, 'odom', 10)
-    source.open()
-    spin_until([talker, listener], lambda: place(robot, 10.0), 'a message',
-               work=lambda: publisher.publish(message(10.0)))
-    run = place(robot, 10.0).run
-    assert publisher.get_subscription_count() == 1
-    source.close()
-    spin_until([], lambda: publisher.get_subscription_count() == 0, 'the subscription to end')
-    assert source.recent(0.0, 0.0) is None
-    talk(source, 10.0)
-    assert place(robot, 10.0).run != run, 'the robot may have moved in between'
-
-
 @pytest.mark.parametrize('moments', [
     np.arange(9.5, 10.05, 0.05), [9.6, 10.0], [9.4, 10.0], [9.0, 10.0], [9.7, 9.8, 10.8],
     [7.0, 10.0]])
@@ -161,11 +137,3 @@ def test_it_tells_how_far_the_robot_is_from_where_it_was(source):
     assert source.moved_since(stamp(10.5), 0.0) == (0.0, 0.0)
     assert source.moved_since(stamp(9.4), 0.0) is None
     assert source.moved_since(stamp(10.6), 0.0) is None
-
-
-def test_no_speed_is_taken_across_a_restart(source):
-    talk(source, 9.0, 10.0)
-    restarted = message(11.0)
-    restarted.pose.pose.position.x = -100.0
-    source.take(restarted)
-    assert source.speeds_by_poses(0.0) is None

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The robot's pose at an instant, from odometry messages in their order of arrival."""
 
-import functools
 from copy import deepcopy
 from itertools import product
 
@@ -38,14 +37,6 @@ def test_between_two_messages_it_is_in_between():
         np.testing.assert_allclose(pose[:3, 3], [moment, 0, 0], atol=1e-6)
         assert np.cos(np.radians(heading(pose) - 30.0 * moment)) == pytest.approx(1.0, abs=1e-12)
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
-
-
-def test_it_turns_the_short_way():
-    """Quaternions of opposite sign are the same orientation."""
-    window = OdometryWindow(10.0)
-    window.add(0, np.zeros(3), turned(170.0))
-    window.add(S // 10, np.zeros(3), -turned(190.0))
-    assert abs(heading(window.pose_at(S // 20))) == pytest.approx(180.0, abs=1e-6)
 
 
 @pytest.mark.parametrize('speed_m_s', [1.0, 0.0])  # reset 51 m away, or detected by its heading
@@ -154,82 +145,67 @@ def test_a_slow_source_that_misses_two_messages_goes_on():
         assert not talk(window, moment, 0.3 * moment)
 
 
-def on_an_arc(seconds, speed_m_s, turn_rad_s=0.4):
-    """Return the position and heading [rad] of a robot that has driven along an arc."""
-    radius_m, angle = speed_m_s / turn_rad_s, turn_rad_s * seconds
-    return radius_m * np.array([np.sin(angle), 1.0 - np.cos(angle), 0.0]), angle
-
-
-@functools.cache
-def window_of_an_arc(rate_hz, speed_m_s, twist):
-    """Return a window of a robot that has driven for 3 s, and the time of its newest pose."""
-    window, moments = OdometryWindow(30.0), np.arange(3 * rate_hz) / rate_hz
-    for moment in moments:
-        assert not begins(window, moment, speed_m_s, twist)
-    return window, moments[-1]
-
-
-def begins(window, seconds, speed_m_s, twist, aside_m=0.0, degrees=0.0):
+def on_an_arc(window, seconds, speed_m_s, aside_m=0.0, degrees=0.0):
     """Add a pose of a robot on an arc, shifted and turned; return whether a run starts."""
-    run, (position, angle) = window.run, on_an_arc(seconds, speed_m_s)
-    window.add(round(seconds * S), position - np.array([aside_m, 0.0, 0.0]),
-               turned(np.degrees(angle) + degrees),
-               twist * np.array([[speed_m_s, 0.0, 0.0], [0.0, 0.0, 0.4]]))
+    run, radius_m, angle = window.run, speed_m_s / 0.4, 0.4 * seconds
+    window.add(round(seconds * S), np.array(
+        [radius_m * np.sin(angle) - aside_m, radius_m * (1.0 - np.cos(angle)), 0.0]),
+        turned(np.degrees(angle) + degrees))
     return window.run != run
 
 
-@pytest.mark.parametrize('rate_hz', [5, 10, 30, 100])
+def driven(rate_hz, speed_m_s):
+    """Return a window of a robot that has driven for 3 s, and the time of its newest pose."""
+    window, moments = OdometryWindow(30.0), np.arange(3 * rate_hz) / rate_hz
+    for moment in moments:
+        assert not on_an_arc(window, moment, speed_m_s)
+    return window, moments[-1]
+
+
+@pytest.mark.parametrize('rate_hz', [5, 30])
 @pytest.mark.parametrize('speed_m_s', [0.0, 0.3, 1.0])
-@pytest.mark.parametrize(('twist', 'aside_m'), [(1.0, 0.7), (0.0, 1.2)], ids=['true', 'empty'])
-def test_a_driver_that_restarts_in_a_gap_is_told_by_its_twist(rate_hz, speed_m_s, twist, aside_m):
-    """At another place or with another heading, whatever its twist is."""
-    former, newest = window_of_an_arc(rate_hz, speed_m_s, twist)
-    for gap_s, (moved_m, turned_deg), first_twist in product(
-            (0.0, 0.15, 0.4), ((2.0, 0.0), (aside_m, 0.0), (0.0, 90.0), (0.0, -90.0)),
-            (twist, 0.0, -10.0)):
+def test_a_driver_that_restarts_in_a_gap_is_noticed(rate_hz, speed_m_s):
+    """At another place or with another heading."""
+    former, newest = driven(rate_hz, speed_m_s)
+    for gap_s, moved in product((0.0, 0.4), ((1.2, 0.0), (0.0, 90.0), (0.0, -90.0))):
         window = deepcopy(former)
-        assert begins(window, newest + max(gap_s, 1 / rate_hz), speed_m_s, first_twist, moved_m,
-                      turned_deg)
+        assert on_an_arc(window, newest + max(gap_s, 1 / rate_hz), speed_m_s, *moved)
         assert len(window) == 1
 
 
-@pytest.mark.parametrize('rate_hz', [5, 10, 30, 100])
-@pytest.mark.parametrize('speed_m_s', [0.0, 0.3, 2.0])
-@pytest.mark.parametrize('twist', [1.0, 0.8, 0.0, -1.0, 1000.0])
-def test_a_robot_that_goes_on_after_lost_messages_does_not_restart(rate_hz, speed_m_s, twist):
-    """Whatever twist its driver sends; it slips, and its stamps are also late."""
-    former, newest = window_of_an_arc(rate_hz, speed_m_s, twist)
-    for gap_s in (1 / rate_hz, 0.15, 0.4):
+@pytest.mark.parametrize('rate_hz', [5, 30])
+@pytest.mark.parametrize('speed_m_s', [0.0, 2.0])
+def test_a_robot_that_goes_on_after_lost_messages_does_not_restart(rate_hz, speed_m_s):
+    """It slips, and its stamps are also late."""
+    former, newest = driven(rate_hz, speed_m_s)
+    for gap_s in (1 / rate_hz, 0.4):
         window = deepcopy(former)
-        assert not begins(window, newest + gap_s, speed_m_s, twist, 0.04, 3.0)
-        assert not begins(window, newest + 2 * gap_s, speed_m_s, twist)
+        assert not on_an_arc(window, newest + gap_s, speed_m_s, 0.04, 3.0)
+        assert not on_an_arc(window, newest + 2 * gap_s, speed_m_s)
 
 
-@pytest.mark.parametrize('rate_hz', [5, 10, 50])
+@pytest.mark.parametrize('rate_hz', [5, 50])
 def test_a_robot_that_starts_and_stops_does_not_restart(rate_hz):
-    """It accelerates at 2 m/s^2; the driver sends a twist or none."""
-    for twist in (0.0, 1.0):
-        window, place_m = OdometryWindow(30.0), 0.0
-        for moment in np.arange(0.0, 12.0, 1 / rate_hz):
-            speed_m_s = np.clip(2.0 * min(moment % 4.0 - 1.0, 3.0 - moment % 4.0), 0.0, 1.5)
-            place_m += speed_m_s / rate_hz
-            window.add(round(moment * S), np.array([place_m, 0.0, 0.0]), UPRIGHT,
-                       twist * np.array([[speed_m_s, 0.0, 0.0], [0.0, 0.0, 0.0]]))
-        assert window.run == 0
+    """It accelerates at 2 m/s^2."""
+    window, place_m = OdometryWindow(30.0), 0.0
+    for moment in np.arange(0.0, 12.0, 1 / rate_hz):
+        speed_m_s = np.clip(2.0 * min(moment % 4.0 - 1.0, 3.0 - moment % 4.0), 0.0, 1.5)
+        place_m += speed_m_s / rate_hz
+        window.add(round(moment * S), np.array([place_m, 0.0, 0.0]), UPRIGHT)
+    assert window.run == 0
 
 
-@pytest.mark.parametrize('rate_hz', [5, 10, 50])
-@pytest.mark.parametrize('back_s', [0.25, 0.5, 0.8])
+@pytest.mark.parametrize('rate_hz', [5, 50])
+@pytest.mark.parametrize('back_s', [0.25, 0.8])
 def test_a_clock_set_back_by_less_than_a_second_begins_anew(rate_hz, back_s):
     """Repeated or nearly repeated stamps with other poses."""
-    former, newest = window_of_an_arc(rate_hz, 1.0, 0.0)
-    window = deepcopy(former)
-    moments = newest + np.arange(1, 2 + round(back_s * rate_hz)) / rate_hz
-    for moment in moments:
-        position, angle = on_an_arc(moment, 1.0)
-        window.add(round((moment - back_s) * S), position, turned(np.degrees(angle)))
+    window, newest = driven(rate_hz, 1.0)
+    for moment in newest + np.arange(1, 2 + round(back_s * rate_hz)) / rate_hz:
+        angle = 0.4 * moment
+        place = np.array([2.5 * np.sin(angle), 2.5 * (1.0 - np.cos(angle)), 0.0])
+        window.add(round((moment - back_s) * S), place, turned(np.degrees(angle)))
     assert window.run >= 1
-    assert window.pose_at(round((moments[-1] - back_s) * S))[0, 3] == pytest.approx(position[0])
+    assert window.pose_at(round((moment - back_s) * S))[0, 3] == pytest.approx(place[0])
 
 
 @pytest.mark.parametrize('step_s', [0.0, -0.01])
@@ -247,17 +223,6 @@ def test_one_of_two_poses_of_a_stamp_stays():
     assert window.pose_at(S)[0, 3] == 1.0 and window.run == 0
     window.add(S, np.array([1.2, 0.0, 0.0]), UPRIGHT)
     assert window.run == 1
-
-
-def test_it_tells_what_it_may_know_of():
-    window = OdometryWindow(10.0)
-    assert not window.spans(0, S) and not window.is_ahead(0)
-    drive(window, (5.0, 7.0))
-    for moment, spans, is_ahead in ((3.9, False, False), (4.1, True, False), (6.0, True, False),
-                                    (6.9, True, False), (7.3, True, True), (7.5, True, False),
-                                    (8.0, False, False)):
-        assert window.spans(round(moment * S), S) == spans
-        assert window.is_ahead(round(moment * S)) == is_ahead
 
 
 def test_the_way_is_what_was_driven_not_how_far_it_led():

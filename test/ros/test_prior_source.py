@@ -117,13 +117,3 @@ def test_a_file_that_is_none_is_not_used(make_node, tmp_path, content):
     source.open(RelocalizerParameters(last_pose_file=str(tmp_path / 'last.json')))
     assert region_of(source) is None
     source.close()
-
-
-def test_it_listens_from_open_to_close(make_node, source):
-    node = source._node
-    for _ in range(2):
-        source.open(RelocalizerParameters())
-        source.open(RelocalizerParameters())
-        assert node.count_subscribers(node.resolve_topic_name('~/prior')) == 2
-        source.close()
-        assert node.count_subscribers(node.resolve_topic_name('~/prior')) == 0

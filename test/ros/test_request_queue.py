@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests in a real node with a real frame source; the localizer is a function of the test."""
 
-import array
-import re
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -19,9 +17,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from vision_msgs.msg import Detection2DArray
 
-from cliploc_ros.core.acceptance.verdict import RefusalKind
-from cliploc_ros.core.query import Query
-from cliploc_ros.errors import MapError
+from cliploc_ros.errors import MapError, StoppedError
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict
 from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.rig import CameraRig
@@ -171,55 +167,6 @@ def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, cl
     assert took_s < 1.0
 
 
-def test_4k_images_wait_for_a_slow_detector(node, camera, clients, wait):
-    """Ten images fit into memory; the boxes of the first arrive after twelve, or never."""
-    infos, boxes, images = camera.publishers
-    data = array.array('B', bytes(3840 * 2160 * 3))
-
-    def take(number):
-        """Publish an image, and wait until the node has it."""
-        header = Header(stamp=Time(sec=number))
-        before = node.frames.sources['']._pairing.received['image']
-        infos.publish(CameraInfo(header=header))
-        images.publish(Image(header=header, height=2160, width=3840, step=3840 * 3,
-                             encoding='rgb8', data=data))
-        wait(lambda: node.frames.sources['']._pairing.received['image'] > before, 'the image')
-
-    request = clients.submit(node.requests.answer)
-    wait(lambda: all(each.get_subscription_count() for each in camera.publishers), 'the node')
-    for number in range(1, 13):
-        take(number)
-    boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=1))))
-    wait(request.done, 'the answer')
-    assert request.result().message == 'refused: nothing known'
-    set_values(node, timeout_s=5.0)
-    request = clients.submit(node.requests.answer)
-    for number in range(13, 27):
-        take(number)
-    boxes.publish(Detection2DArray(header=Header(stamp=Time(sec=15))))
-    wait(request.done, 'the answer')
-    assert re.search('12 images late.* 256 MiB', request.result().message)
-
-
-@pytest.mark.parametrize(('kind', 'advice'), [
-    (RefusalKind.TOO_FEW_OBJECTS, 'turn the camera'),
-    (RefusalKind.AMBIGUOUS, 'turn the camera; time is up: waiting for an image with detections '
-     'took [0-9.]+ of [0-9.]+ s; raise the rate of the camera or of the detector, or raise '
-     'timeout_s')])
-def test_more_images_are_no_remedy_where_nothing_is_detected(node, camera, clients, wait, kind,
-                                                             advice):
-    set_values(node, timeout_s=0.6)
-    node.robot.is_linked_soon = lambda stamp, deadline: True
-    node.localize = lambda frame: Answer(
-        Verdict.REFUSED, 'turn the camera', received_at=frame.received_at, kind=kind,
-        query=Query((), run=0),
-        stages_ms={'image': 200.0, 'search': 1.0})
-    request = clients.submit(node.requests.answer)
-    shoot_until(camera, wait, request)
-    assert re.fullmatch(rf'refused: {advice} \[\d+ frames in 0\.[567] s\]; kind {kind}',
-                        request.result().message)
-
-
 def test_an_answer_keeps_to_the_time_out_without_any_frame(node, clients, wait):
     set_values(node, timeout_s=0.3)
     start = time.monotonic()
@@ -291,3 +238,17 @@ def test_a_failing_start_is_logged_once_and_retried_by_requests(node, capfd, wai
     node.loads = lambda: 'a map'
     set_values(node, timeout_s=0.2)
     assert 'no new frame' in node.requests.answer().message
+
+
+def test_a_start_that_is_cancelled_ends_the_wait_for_it(node, clients, wait):
+    """The node is destroyed while its start waits: concurrent.futures.wait would never return."""
+    wait(lambda: node.active, 'the node to be active')
+    node.trigger_deactivate()
+    release, former = threading.Event(), node._start
+    node._starting.submit(release.wait, 10.0)
+    starting = clients.submit(node.bring_up)
+    wait(lambda: node._start is not former, 'the start')
+    node._starting.shutdown(wait=False, cancel_futures=True)
+    with pytest.raises(StoppedError):
+        starting.result(10.0)
+    release.set()

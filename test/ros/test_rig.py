@@ -100,18 +100,6 @@ def test_frames_of_one_instant_come_together(rig, cameras, wait, late_s, togethe
     assert {heard.image.header.frame_id for heard in (frame, *frame.beside)} == set(together)
 
 
-def test_silent_inputs_are_named_by_camera(rig, cameras, wait):
-    since = time.monotonic()
-    ask(rig, cameras, {'front': 0.0}, wait)
-    for name, source in rig.sources.items():
-        assert set(source.unheard(since)) == (
-            set() if name == 'front' else {'image', 'camera_info', 'detections'})
-        assert source.missing() == []  # all are published
-        assert source.image_topic == f'/{name}/image'
-        assert [*source.topics.values()] == [
-            f'{name}/image', f'{name}/camera_info', f'{name}/detections']
-
-
 def test_nothing_in_time_and_a_rig_that_is_closed(rig, cameras, wait):
     now = time.monotonic()
     with pytest.raises(NoFrameError):
@@ -189,36 +177,3 @@ def test_a_frame_that_is_too_late_makes_no_instant_of_its_own(rig, cameras, wait
     assert names(rig.next_frame(now, now + 30.0)) == ['left']
     time.sleep(0.7)  # all waiting times have passed
     assert len(heard) == count and heard[-1].left_out == ('left',)
-
-
-@pytest.mark.parametrize('rig', [0.2], indirect=True)
-def test_a_request_stays_subscribed_until_the_last_cameras_detections(rig, cameras, wait):
-    """Each camera's detections arrive 1.2 s after those of the previous camera."""
-    now, found = time.monotonic(), []
-    asking = threading.Thread(target=lambda: found.append(rig.next_frame(now, now + 60.0)))
-    asking.start()
-
-    def images():
-        cameras(now_s(), ALL, (CameraInfo, Image))
-        time.sleep(0.05)
-    wait(lambda: all(source._pairing.received['image'] >= 5 for source in rig.sources.values()),
-         'images', images)
-    at_s = now_s()
-    cameras(at_s, ALL, (CameraInfo, Image))
-    for name in NAMES:
-        time.sleep(1.2)
-        cameras(at_s, {name: 0.0}, (Detection2DArray,))
-    asking.join(30.0)
-    assert names(found[0]) == list(NAMES)
-
-
-def test_the_first_camera_alone_is_subscribed_where_no_other_is_wanted(rig, cameras, wait):
-    now, found = time.monotonic(), []
-    asking = threading.Thread(
-        target=lambda: found.append(rig.next_frame(now, now + 30.0, 0.0, 1)))
-    asking.start()
-    wait(lambda: not asking.is_alive(), 'a frame',
-         lambda: cameras(now_s(), ALL) or asking.join(0.05))
-    assert names(found[0]) == ['front'] and found[0].left_out == ()
-    assert 'image' in rig.sources['front'].heard
-    assert not any(rig.sources[name].heard for name in NAMES[1:])

@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.ros.visualization import Visualization
+from cliploc_ros.ros.visualization import SeenImage, Visualization
 
 ROOM = make_room()
 HEADER = Header(frame_id='map')
@@ -49,6 +49,12 @@ def test_each_is_made_for_itself(visualization, make_node, spin_until, topic, me
     if topic == 'debug_image':
         spin_until([node, viewer], lambda: shown.wants_debug_image, 'a subscriber')
         shown.show(HEADER, None, None, None)  # the others have no subscriber
+        seen = SeenImage(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8),
+                         Observation(CAMERA, see_room(ROOM)))
+        spin_until([node, viewer], lambda: heard, 'the image', lambda: shown.show_debug_image(
+            HEADER, seen, ROOM, found, 'accepted'))
+        assert heard[0].header == HEADER and heard[0].width == CAMERA.width
+        assert np.any(heard[0].data)
         return
     spin_until([node, viewer], lambda: heard, 'what is shown',
                lambda: shown.show(HEADER, ROOM, found, CAMERA_FROM_BASE))

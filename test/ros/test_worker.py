@@ -102,39 +102,19 @@ def test_stop_does_not_wait_for_a_long_task_but_drops_what_waits(worker, gate):
     assert ran == []
 
 
-class Announcing(Worker):
-    """Signals that a task is in the queue."""
-
-    def __init__(self, report):
-        super().__init__(report)
-        self.queued = threading.Event()
-
-    def submit(self, task):
-        future = super().submit(task)
-        self.queued.set()
-        return future
-
-
-@pytest.mark.parametrize('is_running', [False, True])
-def test_whoever_waits_in_run_learns_that_the_node_stops(gate, is_running):
-    worker = Announcing(print)
-    if not is_running:
-        gate.hold(worker)
-    worker.queued.clear()
+def test_whoever_waits_in_run_learns_that_the_node_stops(worker, gate):
     learned = []
 
     def ask():
-        try:
-            worker.run(gate if is_running else lambda: None)
-        except CliplocError as error:
-            learned.append(error)
+        with pytest.raises(CliplocError) as raised:
+            worker.run(gate)
+        learned.append(raised.type)
     asker = threading.Thread(target=ask)
     asker.start()
-    assert worker.queued.wait(PATIENCE_S)
+    assert gate.entered.wait(PATIENCE_S)
     worker.stop()
     asker.join(PATIENCE_S / 2)  # before the gate times out
-    assert [type(error) for error in learned] == [StoppedError]
-    gate.open()
+    assert learned == [StoppedError]
 
 
 def test_only_the_newest_waits_while_the_worker_is_busy(worker, gate):
@@ -147,21 +127,6 @@ def test_only_the_newest_waits_while_the_worker_is_busy(worker, gate):
     gate.open()
     worker.run(lambda: None)
     assert done == [99]
-
-
-def test_work_that_fails_does_not_end_the_flow(worker, reports):
-    done = []
-
-    def work(item):
-        if item < 0:
-            raise ValueError(item)
-        done.append(item)
-    latest = LatestOnly(worker, work)
-    for item in (1, -2, 3):
-        latest.offer(item)
-        worker.run(lambda: None)
-    assert done == [1, 3]
-    assert len(reports) == 1 and 'ValueError: -2' in reports[0]
 
 
 @given(st.lists(st.booleans(), max_size=40))

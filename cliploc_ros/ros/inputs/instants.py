@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.detector_check import DetectorCheck
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.errors import CliplocError
@@ -52,7 +51,7 @@ class Instants:
     def __init__(self, landmark_map: LandmarkMap, by_class: bool) -> None:
         self._detector = DetectorCheck(landmark_map, by_class)
         self._faults: dict[str, list[Fault]] = {}  # of the newest frame of each camera
-        self._notes: set[str] = set()
+        self.notes: list[str] = []  #: All warnings that are no faults, each once
 
     @property
     def faults(self) -> list[Fault]:
@@ -97,16 +96,26 @@ class Instants:
 
     def note(self, text: str) -> None:
         """Log a warning once."""
-        if text and text not in self._notes:
-            self._notes.add(text)
+        if text and text not in self.notes:
+            self.notes.append(text)
             logger.warning('%s', text)
 
     def _observed(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                   by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
         """Return the image of a frame and its detections, without crops."""
         with self._keeping(frame.camera):
-            image, camera, given = read_frame(frame, parameters)
-            faults = faults_of_frame(frame, camera, parameters, state)
+            image = image_from_msg(frame.image)
+            height, width = image.shape[:2]
+            camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
+            given = detections_from_msg(frame.detections, parse_class_map(parameters.class_map))
+            image_frame, info = frame.image.header.frame_id, frame.camera_info
+            faults = [
+                *faults_of_headers(image_frame, info.header.frame_id,
+                                   frame.detections.header.frame_id),
+                *faults_of_camera_info(info, camera, parameters.rectified),
+                *faults_of_rectified(frame.image_topic, parameters.rectified, info),
+                *(faults_of_axes(image_frame, state.camera_from_base)
+                  if parameters.base_frame not in ('', image_frame) else [])]
             check_faults(faults)
         self._faults[frame.camera] = faults
         detections = given.usable(camera.width, camera.height, parameters.max_detections)
@@ -118,7 +127,14 @@ class Instants:
             odom_from_camera = place.odom_from_frame
         depths = None
         try:
-            depths = frame_depths(frame, camera, detections, state)
+            if frame.depth is not None:
+                depths = depths_from_msg(
+                    frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
+                    frame.depth_camera_info, state.camera_from_depth)
+            elif parameters.depth_transport != 'none':
+                self.note('an image without depth: no depth within depth_tolerance_s '
+                          f'({parameters.depth_tolerance_s:g} s) of it: remap depth, start its '
+                          'publisher, or set depth_transport to none')
         except CliplocError as error:
             self.note(f'localizing without depth: {error}')
         return image, Observation(
@@ -136,40 +152,8 @@ class Instants:
             raise
 
 
-def read_frame(frame: Frame, parameters: RelocalizerParameters
-               ) -> tuple[NDArray[np.uint8], Camera, Detections]:
-    """Return image, camera and all detections of a frame; CliplocError: one is invalid."""
-    image = image_from_msg(frame.image)
-    height, width = image.shape[:2]
-    camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
-    return image, camera, detections_from_msg(frame.detections,
-                                              parse_class_map(parameters.class_map))
-
-
-def frame_depths(frame: Frame, camera: Camera, detections: Detections, state: RobotState
-                 ) -> NDArray[np.float64] | None:
-    """Return the depth of each box (n,) [m]; None without depth.
-
-    CliplocError: the depth image is invalid.
-    """
-    return None if frame.depth is None else depths_from_msg(
-        frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
-        frame.depth_camera_info, state.camera_from_depth)
-
-
 def _run_of(state: RobotState) -> int | None:
     return None if state.place is None else state.place.run
-
-
-def faults_of_frame(frame: Frame, camera: Camera, parameters: RelocalizerParameters,
-                    state: RobotState) -> list[Fault]:
-    """Return the contradictions in a frame, given its camera and the robot's state."""
-    image, info = frame.image.header.frame_id, frame.camera_info
-    return [*faults_of_headers(image, info.header.frame_id, frame.detections.header.frame_id),
-            *faults_of_camera_info(info, camera, parameters.rectified),
-            *faults_of_rectified(frame.image_topic, parameters.rectified, info),
-            *(faults_of_axes(image, state.camera_from_base)
-              if parameters.base_frame not in ('', image) else [])]
 
 
 def faults_of_axes(frame_id: str, camera_from_base: NDArray[np.float64],

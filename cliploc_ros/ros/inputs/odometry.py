@@ -39,15 +39,10 @@ _MAX_GAP_NS = NS_PER_S // 2
 _MAX_LATE_NS, _MOST_LATE = NS_PER_S, 5
 # Tolerance of moves [m] and turns [rad]: slipping wheels, pose noise and stamps cause less.
 _SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
-# Greatest speeds of a robot of unknown speed [m/s], [rad/s]; greatest accelerations by poses and
-# between two twists [m/s^2], [rad/s^2]; longest time of an acceleration [s]. Not measured. With
-# these values no run of a Husky is cut at 5 Hz or more, see python -m studies.sensors.
-_FASTEST, _CHANGE = np.array([3.0, 3.0]), np.array([3.0, 8.0])
-_TWIST_CHANGE, _CHANGE_S = np.array([3.0, 4.0]), 0.5
-# Twists are used if they miss at most this share of the motion, after at least this much motion
-# [m], [rad]. Sums are limited to the greatest motion, so that old motion loses weight.
-_MISSED_SHARE, _LEAST_MOTION, _MOST_MOTION = 0.25, np.array([0.3, 0.5]), np.array([4.0, 6.0])
-_NO_TWIST, _MOST_TWIST = np.zeros((2, 3)), 1e3
+# Greatest speeds of a robot of unknown speed [m/s], [rad/s]; greatest accelerations [m/s^2],
+# [rad/s^2]; longest time of an acceleration [s]. Not measured. With these values no run of a Husky
+# is cut at 5 Hz or more, see python -m studies.sensors.
+_FASTEST, _CHANGE, _CHANGE_S = np.array([3.0, 3.0]), np.array([3.0, 8.0]), 0.5
 # A gap of more than this many usual periods is a silence. The period of odometry that has just
 # begun is unknown, and taken to be that of a slow source. Not measured.
 _MOST_PERIODS, _SLOW_NS = 3.25, NS_PER_S
@@ -75,7 +70,6 @@ class NoOdometryError(CliplocError):
 class _Pose(NamedTuple):
     stamp_ns: int
     odom_from_body: NDArray[np.float64]  #: (4, 4)
-    twist: NDArray[np.float64]  #: (2, 3): of the robot in its own coordinate frame [m/s], [rad/s]
     way_m: float = 0.0
 
 
@@ -98,8 +92,6 @@ class OdometryWindow:
         self._way_m, self._step_end = 0.0, np.zeros(3)
         # Number of successive messages that are older than the newest.
         self._late = 0
-        # Sums over this run: moves and turns by the poses, and errors of the twists.
-        self._motion, self._missed = np.zeros(2), np.zeros(2)
         #: Number of the current run of odometry. Poses of different runs are not related.
         self.run = 0
 
@@ -111,7 +103,6 @@ class OdometryWindow:
         """Forget all poses, and begin a new run."""
         self._poses.clear()
         self._way_m, self._late = 0.0, 0
-        self._motion, self._missed = np.zeros(2), np.zeros(2)
         self.run += 1
 
     def is_ahead(self, stamp_ns: int) -> bool:
@@ -128,8 +119,8 @@ class OdometryWindow:
         row = bisect_left(self._poses, stamp_ns, key=_stamp_of)
         return stamp_ns - self._poses[row - 1].stamp_ns if row else 0
 
-    def add(self, stamp_ns: int, position: NDArray[np.float64], quat_xyzw: NDArray[np.float64],
-            twist: NDArray[np.float64] = _NO_TWIST) -> bool:
+    def add(self, stamp_ns: int, position: NDArray[np.float64], quat_xyzw: NDArray[np.float64]
+            ) -> bool:
         """Add a pose; return whether it is valid.
 
         If the stamp or the position jumps, all earlier poses are forgotten: the clock was set
@@ -141,16 +132,13 @@ class OdometryWindow:
             Position of the robot in odometry's coordinate frame [m].
         quat_xyzw : ndarray (4,)
             Its orientation, as odom_from_robot.
-        twist : ndarray (2, 3)
-            Twist in the robot's coordinate frame [m/s], [rad/s]. Many drivers leave it at 0.
         """
         values = np.concatenate([position, quat_xyzw])
         length = float(np.linalg.norm(quat_xyzw))
         if not np.isfinite(values).all() or abs(length - 1.0) > _UNIT_TOLERANCE \
                 or np.abs(position).max() > _FARTHEST_M:
             return False
-        pose = _Pose(stamp_ns, transform_from_pose(position, quat_xyzw),
-                     twist if (np.abs(twist) < _MOST_TWIST).all() else _NO_TWIST)
+        pose = _Pose(stamp_ns, transform_from_pose(position, quat_xyzw))
         poses = self._poses
         self._late = self._late + 1 if poses and stamp_ns < poses[-1].stamp_ns else 0
         row = bisect_left(poses, stamp_ns, key=_stamp_of)
@@ -160,8 +148,6 @@ class OdometryWindow:
             row = 0
         if row < len(poses) and poses[row].stamp_ns == stamp_ns:
             return True
-        if row == len(poses):
-            self._learn(pose)
         poses.insert(row, pose._replace(way_m=self._way_to(position) if row == len(poses)
                                         else poses[max(row - 1, 0)].way_m))
         oldest = poses[-1].stamp_ns - self._length_ns
@@ -235,23 +221,9 @@ class OdometryWindow:
         poses = self._poses
         if row < len(poses) and poses[row].stamp_ns == pose.stamp_ns:
             return bool((_lengths(_step(poses[row], pose)) <= _SLACK).all())
-        twists_fit = (self._motion >= _LEAST_MOTION) & (
-            self._missed <= _MISSED_SHARE * self._motion)
-        if row == len(poses):
-            return _is_explained(poses, pose, twists_fit)
         before = poses[:row]
-        return ((not before or _is_explained(before, pose, twists_fit))
-                and _is_explained([*before, pose], poses[row], twists_fit))
-
-    def _learn(self, pose: _Pose) -> None:
-        """Update the sums that show how well the twists predict the poses."""
-        if self._poses:
-            newest = self._poses[-1]
-            step, seconds = _step(newest, pose), (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
-            self._motion += _lengths(step)
-            self._missed += _lengths(step - _driven((newest.twist + pose.twist) / 2, seconds))
-            share = np.minimum(1.0, _MOST_MOTION / np.maximum(self._motion, _MOST_MOTION))
-            self._motion, self._missed = share * self._motion, share * self._missed
+        return (not before or _is_explained(before, pose)) and (
+            row == len(poses) or _is_explained([*before, pose], poses[row]))
 
 
 def _stamp_of(pose: _Pose) -> int:
@@ -266,75 +238,37 @@ def _step(before: _Pose, after: _Pose) -> NDArray[np.float64]:
                      cv2.Rodrigues(back @ last[:3, :3])[0].ravel()])
 
 
-def _driven(speed: NDArray[np.float64], seconds: float, since_s: float = 0.0
-            ) -> NDArray[np.float64]:
-    """Return move and turn (2, 3) in `seconds` at a speed, the mean since `since_s` ago."""
-    move, turn = seconds * speed
-    heading = cv2.Rodrigues((since_s + seconds) / 2 * speed[1])[0]
-    return np.array([heading @ move, turn])
-
-
 def _lengths(step: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the lengths (2,) of a move and a turn (2, 3)."""
     return np.array([math.hypot(*step[0]), math.hypot(*step[1])])
 
 
-def _is_explained(poses: Sequence[_Pose], pose: _Pose, twists_fit: NDArray[np.bool_]) -> bool:
+def _is_explained(poses: Sequence[_Pose], pose: _Pose) -> bool:
     """Return whether a robot can have moved from the newest of `poses` to a later pose.
 
-    The motion is predicted by the twists if they match the poses of this run. `twists_fit` (2,) is
-    the result of that comparison for moves and turns. Many drivers leave the twist empty or fill
-    it with other values. Then the robot is expected to continue at the speed of its poses, or to
-    stop.
-
-    After a silence only this second prediction is used: the driver may have restarted at another
-    origin that the robot could also have reached by driving.
+    The robot is expected to continue at the speed of its poses, or to stop. Twists are not used,
+    because many drivers leave them empty or fill them with other values. After a silence the
+    driver may have restarted at another origin that the robot could also have reached by driving,
+    so no acceleration is allowed. After a long silence, the robot must not have moved.
     """
-    is_silence = _is_silence(poses, pose.stamp_ns - poses[-1].stamp_ns)
-    return bool(np.where(twists_fit & (not is_silence), _explained_by_twists(poses[-1], pose),
-                         _explained_by_poses(poses, pose, is_silence)).all())
-
-
-def _explained_by_twists(newest: _Pose, pose: _Pose) -> NDArray[np.bool_]:
-    """Return whether move and turn (2,) match a speed between the two twists."""
-    gap_s = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
-    change, most = pose.twist - newest.twist, _TWIST_CHANGE * gap_s
-    # limit the change: a restarted driver may compute a wrong twist from its jump
-    change *= (most / np.maximum(_lengths(change), most))[:, None]
-    first, last = _driven(newest.twist, gap_s), _driven(newest.twist + change, gap_s)
-    return _lies_between(_step(newest, pose), first, last,
-                         _SLACK + _TWIST_CHANGE * gap_s * min(gap_s, _CHANGE_S) / 8
-                         + _MISSED_SHARE * _lengths(first + last) / 2)
-
-
-def _explained_by_poses(poses: Sequence[_Pose], pose: _Pose, is_silence: bool
-                        ) -> NDArray[np.bool_]:
-    """Return whether move and turn (2,) match a robot that continues or stops.
-
-    After a long silence, the robot must not have moved.
-    """
-    newest = poses[-1]
+    newest, at_rest = poses[-1], np.zeros((2, 3))
     gap_s = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
     row = bisect_right(poses, newest.stamp_ns - MOMENT_NS, key=_stamp_of)
     before = poses[max(row - 1, 0)]
     moment_s = (newest.stamp_ns - before.stamp_ns) / NS_PER_S
-    speed = -_step(newest, before) / moment_s if moment_s else _NO_TWIST
+    speed = -_step(newest, before) / moment_s if moment_s else at_rest
     slack = _CHANGE * gap_s * min((moment_s + gap_s) / 2, _CHANGE_S)
-    if is_silence:
-        slack, speed = np.zeros(2), speed if gap_s <= LONG_NS / NS_PER_S else _NO_TWIST
+    if _is_silence(poses, pose.stamp_ns - newest.stamp_ns):
+        slack, speed = np.zeros(2), speed if gap_s <= LONG_NS / NS_PER_S else at_rest
     elif not row:  # the run has just begun: its poses are too close in time for a speed
-        slack, speed = _FASTEST * gap_s, _NO_TWIST
-    return _lies_between(_step(newest, pose), _driven(speed, gap_s, moment_s), _NO_TWIST,
-                         _SLACK + slack)
-
-
-def _lies_between(step: NDArray[np.float64], one: NDArray[np.float64],
-                  other: NDArray[np.float64], slack: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of move and turn (2,) lie in a ball around two others, with some slack.
-
-    The two others are the ends of the ball's diameter.
-    """
-    return np.asarray(_lengths(step - (one + other) / 2) <= _lengths(one - other) / 2 + slack)
+        slack, speed = _FASTEST * gap_s, at_rest
+    move, turn = gap_s * speed
+    # the speed is that of half of both times ago, in the frame of that moment
+    heading = cv2.Rodrigues((moment_s + gap_s) / 2 * speed[1])[0]
+    ahead = np.array([heading @ move, turn])
+    # move and turn lie in balls, with rest and constant speed at the ends of their diameters
+    return bool((_lengths(_step(newest, pose) - ahead / 2)
+                 <= _lengths(ahead) / 2 + _SLACK + slack).all())
 
 
 def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
@@ -402,7 +336,6 @@ class OdometrySource(qos.Listener):
     def take(self, msg: Odometry) -> None:
         """Process a message."""
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
-        v, w = msg.twist.twist.linear, msg.twist.twist.angular
         at_ns = stamp_ns(msg.header.stamp)
         with self._heard:
             run, had_poses = self._window.run, bool(len(self._window))
@@ -415,9 +348,8 @@ class OdometrySource(qos.Listener):
             self.problem = why and \
                 f'the stamp of {self.topic} {why}: its driver must stamp each pose'
             if not why:
-                self._window.add(
-                    at_ns, np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]),
-                    np.array([[v.x, v.y, v.z], [w.x, w.y, w.z]]))
+                self._window.add(at_ns, np.array([p.x, p.y, p.z]),
+                                 np.array([q.x, q.y, q.z, q.w]))
             has_restarted = had_poses and self._window.run != run
             self._heard.notify_all()
         if has_restarted:

@@ -26,11 +26,7 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.odometry import (
-    NoOdometryError,
-    OdometryPlace,
-    OdometrySource,
-)
+from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometryPlace, OdometrySource
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.stamps import StampOrder, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health
@@ -270,6 +266,8 @@ class RobotStateSource:
         self.vertical = VerticalSource(node, self.transforms)
         self.prior = PriorSource(node, self.transforms)
         self._unknown = set[str]()  # coordinate frames that tf2 did not know the last time
+        #: Why optional inputs were not used for the newest image, by input
+        self.problems: dict[str, str] = {}
 
     def open(self) -> None:
         """Subscribe to the inputs that the parameters select."""
@@ -327,7 +325,7 @@ class RobotStateSource:
                                               parameters.of_camera(other.camera), soon,
                                               other.depth_frame)))
             except NoTransformError as error:
-                self._warn(f'localizing without {other.camera}: {error}')
+                self._warn(other.camera, f'localizing without {other.camera}: {error}')
         return KnownBefore(state, beside, self.prior.region(
             header.stamp, parameters, state.camera_from_base, frame_ids, map_hash))
 
@@ -347,11 +345,12 @@ class RobotStateSource:
         try:
             up_in_camera = self.vertical.up_in_camera(parameters, camera_from_base,
                                                        image.frame_id, image.stamp)
+            self.problems.pop('vertical', None)
         except (NoVerticalError, NoTransformError) as error:
-            self._warn(f'localizing without the vertical: {error}')
+            self._warn('vertical', f'localizing without the vertical: {error}')
         camera_from_depth = None
         if depth_frame not in ('', image.frame_id):
-            with suppress(NoTransformError):  # frame_depths reports it
+            with suppress(NoTransformError):  # depths_from_msg reports it
                 camera_from_depth = self._lookup(image, depth_frame, parameters)
         return RobotState(camera_from_base, up_in_camera,
                           self._place(image, parameters, camera_from_base), camera_from_depth)
@@ -379,15 +378,17 @@ class RobotStateSource:
             return None
         try:
             body = self.odometry.pose_at(image.stamp)
+            self.problems.pop('odometry', None)
             if body.frame == image.frame_id:
                 return body
             camera_from_body = camera_from_base if body.frame == parameters.base_frame else \
                 self._lookup(image, body.frame, parameters)
         except NoOdometryError as error:
-            self._node.get_logger().debug(f'localizing without odometry: {error}')
+            if self.odometry.is_published:
+                self.problems['odometry'] = f'localizing without odometry: {error}'
             return None
         except NoTransformError as error:
-            self._warn(f'localizing without odometry: {error}')
+            self._warn('odometry', f'localizing without odometry: {error}')
             return None
         return body._replace(
             odom_from_frame=body.odom_from_frame @ invert_transform(camera_from_body),
@@ -402,5 +403,6 @@ class RobotStateSource:
         self._unknown.discard(frame)
         return found
 
-    def _warn(self, text: str) -> None:
+    def _warn(self, what: str, text: str) -> None:
+        self.problems[what] = text
         self._node.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_S)

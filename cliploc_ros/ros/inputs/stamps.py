@@ -81,10 +81,6 @@ class TimeJumps:
                                            and ahead_ns > _MAX_AHEAD_NS):
             raise TimeJumpError(f'{jump.name}: the frame is from before the jump')
 
-    def close(self) -> None:
-        """Stop monitoring the clock."""
-        self._handle.unregister()
-
     def _on_jump(self, jump: TimeJump) -> None:
         if jump.clock_change in (ClockChange.ROS_TIME_ACTIVATED, ClockChange.ROS_TIME_DEACTIVATED):
             name = 'use_sim_time changed'

@@ -17,7 +17,7 @@ import time
 import traceback
 from abc import abstractmethod
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, NoReturn
 
@@ -66,25 +66,6 @@ parameters, each with its default and meaning: config/{name}.yaml in
   install/share/cliploc_ros, or with ROS in $(ros2 pkg prefix --share cliploc_ros)
 
 ros2 launch cliploc_ros relocalization.launch.py starts detector and relocalizer together."""
-
-
-def start_bond(node: Node) -> Any:
-    """Start and return a bond with the lifecycle manager; None if bondpy is not installed.
-
-    Parameters
-    ----------
-    node : Node
-        The node, by whose name the manager identifies the bond.
-    """
-    try:
-        from bondpy.bondpy import Bond
-    except ImportError:
-        return None
-    bond = Bond(node, 'bond', node.get_name())
-    bond.set_heartbeat_period(_HEARTBEAT_PERIOD_S)
-    bond.set_heartbeat_timeout(_HEARTBEAT_TIMEOUT_S)
-    bond.start()
-    return bond
 
 
 class RosLogHandler(logging.Handler):
@@ -232,10 +213,13 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         """
         if self._self_managed and not self.active:
             left_s = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
-            start = self._begin_start()
-            if not wait([start], left_s).done:
-                raise NotActiveError(f'the node is {self.state}: it is still loading; retry')
-            start.result()
+            try:  # not concurrent.futures.wait, which never returns after cancel()
+                self._begin_start().result(left_s)
+            except TimeoutError as error:
+                raise NotActiveError(f'the node is {self.state}: it is still loading; retry'
+                                     ) from error
+            except CancelledError as error:
+                raise StoppedError('the node is shutting down') from error
         self.check_active()
 
     def check_active(self) -> None:
@@ -332,7 +316,12 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
             raise
         self.active = True
         if not self._self_managed:
-            self._bond = start_bond(self)
+            with suppress(ImportError):  # without bondpy, the manager has no bond
+                from bondpy.bondpy import Bond
+                self._bond = Bond(self, 'bond', self.get_name())
+                self._bond.set_heartbeat_period(_HEARTBEAT_PERIOD_S)
+                self._bond.set_heartbeat_timeout(_HEARTBEAT_TIMEOUT_S)
+                self._bond.start()
 
     def _deactivate(self) -> None:
         self.active = False
@@ -448,15 +437,8 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
             # Otherwise other nodes see the node for another 20 s, and requests to it are lost.
             node.destroy_node()
         rclpy.try_shutdown()
-    _leave()
-
-
-def _leave() -> NoReturn:
-    """End the process immediately.
-
-    A thread that runs a network cannot be stopped. Python would wait for it, and then need
-    seconds to unload torch.
-    """
+    # End the process immediately. A thread that runs a network cannot be stopped. Python would
+    # wait for it, and then need seconds to unload torch.
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError, AttributeError):
