@@ -197,6 +197,12 @@ def test_looks_from_one_view_count_once(rng):
     for number in range(3):
         views = views.with_look(found[number].cameras[0]._replace(vector=np.full(ERRORS, number)))
     assert views.counts.tolist()[1:] == [1, 1, 1, 3]
+    look = found[0].cameras[0]
+    middle = look._replace(map_from_camera=views.poses[-1] @ make_transform(np.eye(3), np.full(
+        3, 0.1)))
+    beside = look._replace(map_from_camera=views.poses[-1] @ make_transform(np.eye(3), np.full(
+        3, 0.2)))
+    assert views.with_look(beside).with_look(middle).counts.tolist()[1:] == [1, 1, 1, 4, 1]
     np.testing.assert_allclose(views.vectors[-1], 1.0, err_msg='their mean')
 
 
@@ -262,11 +268,13 @@ def test_nothing_is_known_of_a_new_camera():
     share, covariance, fault = CameraCheck().judge([], np.eye(6))
     assert (share, fault) == (1.0, '') and (covariance == np.eye(6)).all()
     moves = np.zeros((6, ERRORS))
-    moves[0, 0] = 100.0  # the camera moves by 1 m if the focal length changes by 1 %
+    # the camera moves by 1 m if the focal length, or the ratio of fx to fy, changes by 1 %
+    moves[0, 0] = moves[1, 1] = 100.0
     share, covariance, fault = CameraCheck().judge([CameraLook(
         '', True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS), moves)], np.eye(6))
     terms = CALIBRATION.camera
-    expected = np.diag([1.0 + terms.unverified * (100.0 * terms.wrong_focal) ** 2, *[1.0] * 5])
+    expected = np.diag([*(1.0 + terms.unverified * (100.0 * error) ** 2
+                          for error in (terms.wrong_focal, terms.wrong_aspect)), *[1.0] * 4])
     np.testing.assert_allclose(covariance, expected)
     # a right camera, whose errors are in the covariance, remains
     assert 1.0 - terms.wrong < share < 0.6 and not fault
@@ -278,10 +286,24 @@ def test_nothing_is_known_of_a_new_camera():
 def test_the_error_of_a_wrong_camera_is_named(error, size, said, rng):
     check, information = CameraCheck(), 1e4 * np.eye(ERRORS)
     check.see(query(rng).observation)
-    check.add([CameraLook('', True, place(rng), information, information[error] * size,
-                          np.zeros((6, ERRORS))) for _ in range(12)])
+    looks = [CameraLook('', True, place(rng), information, information[error] * size,
+                        np.zeros((6, ERRORS))) for _ in range(12)]
+    check.add([look._replace(is_new=False) for look in looks])
+    assert not check.faults, 'these frames were seen before'
+    check.add(looks)
     (fault,) = check.faults
     assert said in fault
+    assert check.judge([], np.eye(6))[2] == fault, 'whatever the next pose depends on'
+
+
+def test_each_camera_of_a_rig_may_be_wrong(rng):
+    moves = np.zeros((6, ERRORS))
+    moves[0, 0] = 100.0
+    looks = [CameraLook(name, True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS), errors)
+             for name, errors in (('front', moves), ('back', 0.0 * moves))]
+    alone, both = (CameraCheck().judge(some, np.eye(6)) for some in (looks[:1], looks))
+    assert both[0] == alone[0] < 0.6
+    np.testing.assert_array_equal(both[1], alone[1])
 
 
 @pytest.mark.parametrize('focal', [1.0, 1.3])

@@ -11,9 +11,13 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room, see_room
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.acceptance.confidence import Setting, none_right
+from cliploc_ros.core.acceptance.contenders import join_frames
 from cliploc_ros.core.acceptance.depth_check import DepthCheck
+from cliploc_ros.core.acceptance.links import weakest_link
 from cliploc_ros.core.acceptance.looks import EarlierLook, Look, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
@@ -206,10 +210,12 @@ def test_odometry_carries_the_looks(camera, turned_deg, driven_m):
 
 
 @pytest.mark.parametrize(('way_m', 'agrees'), [(0.0, False), (10.0, False), (33.0, True)])
-def test_the_further_a_robot_drove_the_less_exactly_looks_have_to_agree(camera, way_m, agrees):
+@pytest.mark.parametrize('off', [(1.0, 0.0), (0.0, 100.0)])
+def test_the_further_a_robot_drove_the_less_exactly_looks_have_to_agree(camera, off, way_m,
+                                                                        agrees):
     """After 33 m, odometry with 3 % drift is off by 1 m; the robot is back at its start."""
     camera.look(0.0, 0.0)
-    assert (camera.look(60.0, 1.0, way_m=way_m) == 1.0) == agrees
+    assert (camera.look(60.0, *off, way_m=way_m) == 1.0) == agrees
 
 
 def test_a_blocked_view_is_forgotten_after_twenty_looks(camera):
@@ -352,6 +358,8 @@ def test_the_same_view_again_is_no_more_evidence(refine, room):
     assert often.score == pytest.approx(5 * once.score, rel=0.02)
     assert often.confidence == pytest.approx(once.confidence, rel=0.05)
     assert (np.diag(often.covariance) > 0.9 * np.diag(once.covariance)).all()
+    if refine:  # all frames of a camera have its errors
+        np.testing.assert_allclose(often.cameras[-1].moves, once.cameras[0].moves, atol=0.1)
 
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -451,6 +459,69 @@ def test_earlier_frames_alone_do_not_decide(room, walk, shown):
     assert (found.accepted, found.frames, found.refusal_kind) == (False, 4, 'frames_disagree')
 
 
+UNEXPLAINED = 3 * CALIBRATION.objects.unexplained
+NO_POSE = none_right(Setting(len(ROOM)))
+EVEN = -np.log1p(np.exp(-NO_POSE))
+
+
+def broken(gap_s, before=False):
+    terms = CALIBRATION.links
+    return min(terms.most_broken, (terms.broken_before if before else terms.broken)
+               + terms.broken_per_s * gap_s)
+
+
+@pytest.mark.parametrize(('shown', 'stamps_s', 'met', 'kept', 'odds_broken', 'after', 'before'), [
+    ('gggg', (0, 1, 2, 6), (), 1, broken(4), 0.0, 0.0),
+    ('gggg', (0, 30, 31, 32), (), 3, broken(30, True), 0.0, 0.0),
+    ('gggn', (0, 1, 2, 3), (), 1, broken(1), EVEN - NO_POSE, 0.0),
+    ('gggb', (0, 1, 2, 3), (), 1, broken(1), UNEXPLAINED - np.log1p(np.exp(
+        UNEXPLAINED - NO_POSE)) - NO_POSE, 0.0),
+    ('bbgg', (0, 1, 21, 22), (), 2, broken(20, True), 0.0, UNEXPLAINED - NO_POSE),
+    ('gggn', (0, 1, 2, 3), (5.0, 'elsewhere'), 1, broken(1), -np.log1p(
+        np.exp(5.0) + np.exp(-NO_POSE)) - NO_POSE, 0.0),
+    ('gggn', (0, 1, 2, 3), (5.0, 'here'), 1, broken(1), 5.0 - np.log1p(np.exp(5.0)), 0.0)])
+def test_the_evidence_for_the_weakest_link(shown, stamps_s, met, kept, odds_broken, after, before,
+                                           room, walk):
+    """Frames show all objects (g), nothing (n), or boxes of no landmark (b)."""
+    found = link_of(room, walk, shown, stamps_s, met)
+    odds = np.log(1 / odds_broken - 1) + NO_POSE + after + before
+    assert found.kept == kept
+    assert found.holds == pytest.approx(1 / (1 + np.exp(-odds)), rel=1e-6)
+    if found.kept == 1:
+        assert found.chance == pytest.approx(
+            found.holds + (1 - found.holds) * np.exp(after), rel=1e-6)
+
+
+def link_of(room, walk, shown, stamps_s=(0, 1, 2, 3), met=(), seen=None):
+    frames = []
+    for pose, what, stamp_s in zip(walk, shown, stamps_s, strict=True):
+        one = see(room, pose, {'g': None, 'n': [], 'b': [0, 1, 2]}[what])
+        if what == 'b':
+            one = replace(one, detections=replace(one.detections, bboxes_xyxy=np.tile(
+                [600.0, 0.0, 640.0, 20.0], (3, 1))))
+        frames.append(RELOCALIZER.search(replace(one, stamp_ns=round(1e9 * stamp_s))))
+    others = [SimpleNamespace(pose=moved(walk[-1], 3.0, 90.0) if met[1] == 'elsewhere'
+                              else walk[-1], odds=NO_POSE + met[0])] if met else []
+    return weakest_link(join_frames(room, OPTIONS, frames), walk[-1], seen, lambda _: others)
+
+
+def test_any_link_may_be_broken(room, walk):
+    """The first frame contradicts the others, and the last one shows nothing."""
+    found = link_of(room, walk, 'bggn')
+    assert found.kept == 3 and found.holds < found.chance
+    assert found.chance == link_of(room, walk, 'gggn').chance
+
+
+def test_keyframes_and_inexact_odometry_hold_a_link(room, walk):
+    place = RecognizedPlace(walk[-1], np.eye(6) * 1e-4, np.eye(6) * 1e-4, 200, 0.9, 0.9)
+    assert link_of(room, walk, 'gggn').holds < 0.8
+    assert link_of(room, walk, 'gggn', seen=Recognition((place,))).holds > 0.99
+    first, last = see(room, walk[0]), see(room, walk[1])
+    last = replace(last, odom_from_camera=last.odom_from_camera @ moved(np.eye(4), 0.2, 0.0))
+    joined = join_frames(room, OPTIONS, [RELOCALIZER.search(frame) for frame in (first, last)])
+    assert weakest_link(joined, walk[1], None, lambda _: ()).holds > 0.99
+
+
 def test_frames_before_a_carry_are_dropped(room, walk):
     """Two frames of the old place, two of the new one."""
     there = moved(MAP_FROM_CAMERA, 1.5, 25.0)
@@ -483,6 +554,20 @@ def test_a_look_repeats_a_view_as_far_as_odometry_has_not_moved(degrees, metres,
     looks = Looks().with_look(Look(frame(0.0), pose(), 0.8, None, 0.6))
     found, = looks.earlier(frame(1.0, degrees, metres), pose(degrees, metres))
     assert found == pytest.approx((0.8, 0.6, same), abs=1e-6)
+    found, = looks.earlier(frame(1.0, degrees, metres), pose(degrees, metres + 9.0))
+    assert found == pytest.approx((0.0, 0.0, same), abs=1e-6), 'another pose'
+    assert looks.earlier(frame(0.0), pose()) == (), 'the same frame'
+
+
+def test_looks_by_keyframes_remain_and_the_farthest_is_compared():
+    place = RecognizedPlace(pose(), np.eye(6), np.eye(6), 99, 0.9, 0.9)
+    looks = Looks()
+    for seconds, metres in ((0.0, 0.0), (1.0, -3.0), (2.0, 1.0)):
+        looks = looks.with_look(Look(frame(seconds, 0.0, metres), pose(), 0.8, place), True)
+    passed, then_from_now = looks.passed(frame(3.0, 0.0, 2.0))
+    assert passed.observation.stamp_ns == 10**9 and then_from_now[0, 3] == 5.0
+    alone = looks.with_look(Look(replace(frame(4.0), odom_from_camera=None), pose(), 0.8))
+    assert len(alone) == 1 and alone.recognized == ()
 
 
 def test_doubts_about_the_camera_count_for_the_view_alone(office_map, office_frames):

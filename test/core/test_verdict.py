@@ -23,6 +23,7 @@ from cliploc_ros.core.acceptance.confidence import (
     compared_frame,
     confidences,
     none_right,
+    objects_utility,
     one_thing,
     support,
     tilt_handicaps,
@@ -110,6 +111,7 @@ def test_a_picture_needs_motion_to_be_told_from_the_place_and_motion_tells():
     assert chance_genuine(in_doubt, moved_like_the_place) > chance_genuine(in_doubt)
     assert chance_genuine(in_doubt, only_turned) == chance_genuine(in_doubt)
     assert chance_genuine(GENUINE, moved_like_a_picture) < 1e-6
+    assert chance_genuine(SMALL, Motion(0.0, 1e4)) < 1.0 - 1e-6, 'the keyframes may be wrong'
 
 
 def test_the_confidence_counts_the_published_covariance(verified_camera):
@@ -627,6 +629,11 @@ def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng, 
     groups = [ask(see_room(replace(desk, centers=desk.centers + shift), camera))[0]
               for shift in shifts]
     assert min(groups) >= terms.unmapped and np.sum(np.array(groups) > 1.0) >= 3
+    against = [confidence._of_group(OFFICE.centers[:4], things, terms.fits * things + misfit)
+               for things, misfit in ((4.0, 0.0), (4.5, 0.0), (4.0, 1.0))]
+    assert against == pytest.approx(terms.unmapped + np.array([0.0, -0.15, terms.misfit]))
+    most = CALIBRATION.keyframes.most_objects
+    assert objects_utility(Support(99.0)) == objects_utility(Support(most))
     monkeypatch.setattr(confidence, '_of_group', lambda *_: 0.0)
     assert ask(see_room(replace(desk, centers=desk.centers + shifts[-1]), camera))[0] == 0.0
     assert likely[-2] < likely[-1] < 0.9999
