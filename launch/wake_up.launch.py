@@ -18,6 +18,8 @@ ARGUMENTS = {
     'spin': ('spin', "action of Nav2's behavior_server"),
     'wake_up_timeout': ('60.0', 'after this time, no further turn starts [s]'),
     'wake_up_turn_deg': ('45.0', 'angle of the turn between requests [deg]; 0: do not turn'),
+    'wake_up_watch': ('false', 'true: wake up again whenever the relocalizer finds the robot '
+                               'lost'),
     'log_level': ('info', 'debug, info, warn or error'),
 }
 MEANINGS = {0: 'accepted', 1: 'refused', 2: 'not ready'}
@@ -32,7 +34,8 @@ def generate_launch_description() -> LaunchDescription:
         namespace=LaunchConfiguration('namespace'),
         arguments=['--relocalizer', LaunchConfiguration('relocalizer'),
                    '--timeout', LaunchConfiguration('wake_up_timeout'),
-                   '--turn-deg', LaunchConfiguration('wake_up_turn_deg')],
+                   '--turn-deg', LaunchConfiguration('wake_up_turn_deg'),
+                   '--watch', LaunchConfiguration('wake_up_watch')],
         remappings=[('spin', LaunchConfiguration('spin'))],
         ros_arguments=['--log-level', LaunchConfiguration('log_level')])
     return LaunchDescription([*declared, RegisterEventHandler(

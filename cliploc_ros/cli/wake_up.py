@@ -43,6 +43,9 @@ def make_parser() -> argparse.ArgumentParser:
            command.positive, 60.0)
     option(parser, '--turn-deg DEG', 'turn counterclockwise by this angle between requests; 0: '
            'never (%(default)g)', command.within(-180.0, 180.0), 45.0)
+    option(parser, '--watch', 'keep running: wake up again whenever the relocalizer, whose '
+           'parameter watch has to be set, finds the robot lost and at rest', default='false',
+           nargs='?', choices=('true', 'false'), const='true')
     return parser
 
 
@@ -57,7 +60,8 @@ def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: comma
         from cliploc_ros.ros.wake_up import WakeUp
     check_name(options.relocalizer)
     with command.running_ros(ros_args):
-        node = WakeUp(interrupted, options.relocalizer, options.timeout, options.turn_deg)
+        node = WakeUp(interrupted, options.relocalizer, options.timeout, options.turn_deg,
+                      options.watch == 'true')
         try:
             return node.run()
         finally:

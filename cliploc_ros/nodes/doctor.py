@@ -213,7 +213,7 @@ class Doctor(RelocalizerNode):
 def report_map(localizer: FrameLocalizer, parameters: RelocalizerParameters, report: Report
                ) -> None:
     """Report a loaded map and its keyframes."""
-    report.add('map', State.PASS, f'{localizer.description}, on {localizer.device}')
+    report.add('map', State.PASS, f'{localizer.description}')
     keyframes, file = localizer.keyframes, keyframes_path(parameters)
     if file is None:
         return report.add('keyframes', State.NOT_CHECKED,

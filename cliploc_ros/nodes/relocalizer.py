@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer node: computes the robot's pose from image and detections, on request."""
 
+import importlib
 import math
+import os
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -12,9 +15,10 @@ from typing import Any, NoReturn
 
 from diagnostic_msgs.msg import DiagnosticArray
 from diagnostic_msgs.srv import SelfTest
+from rclpy.parameter import Parameter
 from std_srvs.srv import Empty, Trigger
 
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer
@@ -26,7 +30,7 @@ from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import ManagedNode, run_node
 from cliploc_ros.ros.node.threads import MAX_REQUESTS, BoundedCallbackGroup, LatestOnly
-from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
+from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
 from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.ros.watch import Watcher
 
@@ -86,12 +90,17 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         self._answers = self.create_publisher(DiagnosticArray, '~/answer', qos.LATCHED)
         self._last_verdict = 'none yet'
         self._verdicts: dict[str, int] = dict.fromkeys(Verdict, 0)
+        # Locked from the change of the map parameters until the map is loaded.
+        self._map_lock = threading.Lock()
         services: list[tuple[Any, str, Callable[[Any, Any], Any]]] = [
             (Trigger, '~/relocalize', self._on_relocalize),
             (SelfTest, '~/relocalize_fields', self._on_relocalize_fields),
             (Trigger, '~/record', self._on_record),
             (Trigger, '~/reload_map', self._on_reload_map),
             (Empty, 'reinitialize_global_localization', self._on_reinitialize)]
+        with suppress(ImportError):  # without nav2_msgs, map_file and reload_map do the same
+            load_map = importlib.import_module('nav2_msgs.srv').LoadMap
+            services.append((load_map, '~/load_map', self._on_load_map))
         group = BoundedCallbackGroup(MAX_REQUESTS)
         for service_type, name, callback in services if delivers else ():
             self.create_service(service_type, name, callback, qos_profile=qos.SERVICE,
@@ -208,13 +217,37 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
     def _on_reload_map(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Read the map again in the worker's thread, and so never during a search."""
         try:
-            read = self.worker.run(self._pipeline.reload_map)
+            with self._map_lock:
+                read = self.worker.run(self._pipeline.reload_map)
             response.message = f'loaded: {read.description}; map {read.map_hash}'
             response.success = True
         except CliplocError as error:
             response.message = f'not loaded: {error}'
         self.get_logger().info(f'map {response.message}')
         return response
+
+    def _on_load_map(self, request: Any, response: Any) -> Any:
+        """Load another map. After a failure, parameters and maps are unchanged."""
+        with self._map_lock:
+            values = self.settings.values
+            before = {'map_file': values.map_file, 'map_files': values.map_files}
+            try:
+                self._set(map_file=request.map_url, map_files=[''])
+                read = self.worker.run(self._pipeline.reload_map)
+                self.get_logger().info(f'map loaded: {read.description}')
+                response.result = response.RESULT_SUCCESS
+            except CliplocError as error:
+                self._set(**before)
+                self.get_logger().error(f'map not loaded: {error}')
+                response.result = response.RESULT_MAP_DOES_NOT_EXIST
+                with suppress(MapError):
+                    if os.path.exists(path_of(request.map_url)):  # noqa: PTH110 - never raises
+                        response.result = response.RESULT_INVALID_MAP_DATA
+        return response
+
+    def _set(self, **values: Any) -> None:
+        self.set_parameters_atomically(
+            [Parameter(name, value=value) for name, value in values.items()])
 
     def _answer(self) -> Answer:
         began_at = time.monotonic()

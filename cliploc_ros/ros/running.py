@@ -51,6 +51,10 @@ class RelocalizerStatus:
         """Return the time limit of a request [s]; infinite if unknown."""
         return float(self.values.get('time limit [s]', math.inf))
 
+    def has_reported_since(self, moment: float) -> bool:
+        """Return whether it is active and has reported since `moment` (monotonic clock) [s]."""
+        return self._received_at > moment and self.values.get('state') == 'active'
+
     def problem(self) -> str:
         """Return why the relocalizer cannot answer a request, and the remedy; empty if it can."""
         state, silent_s = self.values.get('state'), self.silent_s

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wake up a robot: request its pose, turning between requests, until accepted or time is up.
 
+With --watch, repeat this whenever the relocalizer finds the robot lost.
+
 The robot turns by Nav2's action `spin`, the only part that needs nav2_msgs.
 """
 
@@ -38,6 +40,8 @@ _SPIN_S = 0.05
 _SERVICE = 'relocalize_fields'
 # Discovery takes time: nodes and topics appear late.
 _DISCOVERY_S = 2.0
+# The diagnostics report a change within this time.
+_ON_DIAGNOSTICS_S = 1.5
 # The reason for waiting is printed again after this time.
 _AGAIN_S = 5.0
 # Pause between requests if the robot does not turn.
@@ -148,10 +152,12 @@ class WakeUp(Node):
         No turn begins after this time [s]. One more request may follow the last turn.
     turn_deg : float
         Angle of the turn between requests; 0: do not turn.
+    watch : bool
+        After an accepted pose, wait until the robot is lost and at rest, then start again.
     """
 
     def __init__(self, interrupted: Interruption, relocalizer: str, timeout_s: float,
-                 turn_deg: float) -> None:
+                 turn_deg: float, watch: bool) -> None:
         super().__init__('wake_up', start_parameter_services=False)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
@@ -160,17 +166,23 @@ class WakeUp(Node):
         self._status = RelocalizerStatus(self, self._service.removesuffix(f'/{_SERVICE}'))
         self._turning = Turning(self, self._wait, math.radians(turn_deg))
         self._began_at = time.monotonic()
-        self._timeout_s = timeout_s
+        self._timeout_s, self._watches = timeout_s, watch
         self._interrupted = interrupted
         self._said: dict[str, tuple[str, float]] = {}
 
     def run(self) -> Outcome:
         """Request until a pose is accepted or time is up, then cancel any turn.
 
+        With `watch`, repeat this until a wake-up fails.
+
         KeyboardInterrupt: the flag was set; the turn was cancelled.
         """
         try:
-            return self._look_about()
+            while (outcome := self._look_about()) is Outcome.ACCEPTED and self._watches:
+                if problem := self._until_lost():
+                    return _end(Outcome.NOT_READY, f'not ready: {problem}')
+                self._began_at = time.monotonic()
+            return outcome
         finally:
             self._interrupted = Interruption()  # the first interruption is handled
             self._turning.stop()
@@ -205,6 +217,22 @@ class WakeUp(Node):
             if not problem or self._is_time_up:
                 return problem
             self._spin()
+
+    def _until_lost(self) -> str:
+        """Wait until the robot is lost and at rest; return the reason if this cannot be known."""
+        accepted_at = time.monotonic() + _ON_DIAGNOSTICS_S  # earlier reports may be outdated
+        while True:
+            self._spin()
+            self._say('waiting', self._status.problem())
+            if not self._status.has_reported_since(accepted_at):
+                continue
+            values = self._status.values
+            if 'watch' not in values:
+                return 'the relocalizer does not watch: set its parameter watch to tf or amcl_pose'
+            self._say('watch', values['watch'] if values['watch'] != 'lost' else
+                      f'{values["watch reason"]}; {values["on lost"]}')
+            if values['lost and at rest'] == 'True':
+                return ''
 
     def _look(self) -> tuple[Verdict, str, str]:
         """Request the pose once; return the verdict, the kind of a refusal, and the answer."""

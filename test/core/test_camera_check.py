@@ -299,7 +299,8 @@ def test_the_error_of_a_wrong_camera_is_named(error, size, said, rng):
 def test_each_camera_of_a_rig_may_be_wrong(rng):
     moves = np.zeros((6, ERRORS))
     moves[0, 0] = 100.0
-    looks = [CameraLook(name, True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS), errors)
+    looks = [CameraLook(name, True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS),
+                        errors)
              for name, errors in (('front', moves), ('back', 0.0 * moves))]
     alone, both = (CameraCheck().judge(some, np.eye(6)) for some in (looks[:1], looks))
     assert both[0] == alone[0] < 0.6

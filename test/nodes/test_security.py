@@ -11,8 +11,8 @@ from tester import make_frame
 pytestmark = pytest.mark.full
 
 POLICY = PROJECT / 'config/security_policy.xml'
-# Topics of tf2_ros, which is not installed on all test machines.
-FOREIGN = {'/tf', '/tf_static'}
+# Topics and services of tf2_ros and nav2_msgs, which are not installed on all test machines.
+FOREIGN = {'/tf', '/tf_static', '/relocalizer/load_map'}
 GRAPH = {('topics', 'publish'): 'get_publisher_names_and_types_by_node',
          ('topics', 'subscribe'): 'get_subscriber_names_and_types_by_node',
          ('services', 'reply'): 'get_service_names_and_types_by_node',

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A relocalizer that searches two floors, and whose maps change at run time."""
 
+import importlib
 import os
 from dataclasses import replace
 
@@ -69,26 +70,46 @@ def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
     assert not tester.relocalize(frame).success
 
 
+@pytest.mark.needs('nav2_msgs')
+def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors, tmp_path):
+    srv = importlib.import_module('nav2_msgs.srv')
+    first, second = floors(ROOM, other_room())
+    own_relocalizer(map_file="''", map_files=listed([first, second]))
+
+    def load(url):
+        return tester.call(srv.LoadMap, '/relocalizer/load_map',
+                           srv.LoadMap.Request(map_url=url)).result
+    for url in ('/nowhere.yaml', 'package://nowhere/map.yaml'):
+        assert load(url) == srv.LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+    (tmp_path / 'broken.yaml').write_text('no map')
+    assert load(str(tmp_path / 'broken.yaml')) == srv.LoadMap.Response.RESULT_INVALID_MAP_DATA
+    assert tester.relocalize(make_frame(see_room(other_room()))).success
+    assert load(f'file://{first}') == srv.LoadMap.Response.RESULT_SUCCESS
+    assert tester.relocalize(make_frame()).success
+    assert not tester.relocalize(make_frame(see_room(other_room()))).success
+
+
 @pytest.mark.full
-def test_no_name_of_a_map_keeps_the_relocalizer_from_answering(own_relocalizer, tester, floors,
-                                                               tmp_path):
+@pytest.mark.needs('nav2_msgs')
+def test_no_url_keeps_the_relocalizer_from_answering(own_relocalizer, tester, floors, tmp_path):
     """Pipes, devices, sparse files, floods, and impossible names."""
+    srv = importlib.import_module('nav2_msgs.srv')
     first, _ = floors(ROOM, other_room())
     process = own_relocalizer(map_file=first)
 
-    def load(name):
-        assert tester.set_parameter('map_file', name).successful
-        return tester.trigger('reload_map').success
+    def load(url):
+        return tester.call(srv.LoadMap, '/relocalizer/load_map',
+                           srv.LoadMap.Request(map_url=url)).result
     os.mkfifo(tmp_path / 'pipe')
     with (tmp_path / 'holes').open('wb') as file:
         file.truncate(3 * 2**30)
     (tmp_path / 'flood').write_text(f'a: [{"[]," * 1_600_000}1]')
     for name in ('pipe', 'holes', 'flood', '', 'x' * 300, 'x' * 1_000_000):
-        assert not load(str(tmp_path / name))
+        assert load(str(tmp_path / name)) != srv.LoadMap.Response.RESULT_SUCCESS
     for url in ('/dev/zero', '/dev/stdin', 'package://', 'package://nowhere/map.yaml',
                 f'package://{"x" * 300}/map.yaml'):
-        assert not load(url)
-    assert load(f'file://{first}')
+        assert load(url) != srv.LoadMap.Response.RESULT_SUCCESS
+    assert load(first) == srv.LoadMap.Response.RESULT_SUCCESS
     assert tester.relocalize(make_frame()).success
     assert process.memory_mib('VmHWM') < 1000
     assert max(map(len, process.output().splitlines())) < 2000

@@ -164,6 +164,12 @@ def test_an_interrupt_stops_the_robot(relocalizer, start, end, tester, serve_spi
     assert tester.relocalize(make_frame()).success
 
 
+def test_a_relocalizer_that_does_not_watch_is_named(relocalizer, start, end):
+    process = start('cli.wake_up', '--watch')
+    assert end(process, make_frame) == NOT_READY
+    assert 'parameter watch' in process.output()
+
+
 def test_without_a_relocalizer_it_is_not_ready(start, end):
     process = start('cli.wake_up', '--relocalizer', '/nowhere/relocalizer', '--timeout', 1)
     assert end(process) == NOT_READY

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The watch of a localizer that is correct, kidnapped, silent or broken, with real nodes."""
 
+import signal
 from dataclasses import replace
 
 import pytest
@@ -174,6 +175,25 @@ def test_a_dead_localizer_is_logged_once_however_long_it_is_dead(watch):
     watched.robot.has_localizer = watched.robot.has_odom = True
     watched.until_state('localized')
     assert watched.process.output().count('watch: localized') == 2, 'changes are logged'
+
+
+@pytest.mark.full
+def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
+    """The robot continues to drive, and nothing is done until it stands."""
+    watched = watch()
+    watched.robot.speed_m_s = 0.0
+    process = start('cli.wake_up', '--watch', '--turn-deg', 0)
+    watched.until(lambda: 'look 1 ' in process.output(), 'a look')
+    watched.robot.speed_m_s = 0.3
+    watched.until(lambda: 'watch: localized' in process.output(), 'localized')
+    watched.robot.carry(3.0)
+    watched.until(lambda: ' moves at 0.' in process.output(), 'lost')
+    assert process.output().count('accepted: ') == 1
+    watched.robot.speed_m_s = 0.0
+    watched.until(lambda: process.output().count('accepted: ') == 2, 'another wake-up')
+    said = process.output().count('watch: localized')
+    watched.until(lambda: process.output().count('watch: localized') > said, 'localized')
+    assert process.stop(signal.SIGTERM)[0] == 130
 
 
 @pytest.mark.needs('tf2_ros')
