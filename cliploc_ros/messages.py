@@ -16,15 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.depth_image import (
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults, check_faults
+from cliploc_ros.core.geometry.depth_image import (
     PLAUSIBLE_DEPTH_M,
     DepthCamera,
     DepthImage,
     depth_from_counts,
     depths_of_boxes,
 )
-from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults, check_faults
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 

@@ -23,7 +23,7 @@ LAYERS = (
     ('core.kernels',),
     ('core.geometry',),
     ('core.map',),
-    ('core.observation', 'core.options', 'core.depth_image'),
+    ('core.observation', 'core.options'),
     ('core.search',),
     ('core.keyframes',),
     ('core.fit',),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.cli.options import check_folder_options, folder_of
 from cliploc_ros.command import positive
-from cliploc_ros.core.depth_image import DepthCamera
+from cliploc_ros.core.geometry.depth_image import DepthCamera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, OptionsError

@@ -21,7 +21,7 @@ observation, options
 map
     One map or several, and their files; indices of landmarks by class, label and place.
 geometry
-    Transforms, camera, ellipses, ellipsoids, minimal solvers.
+    Transforms, camera, ellipses, ellipsoids, depth, minimal solvers.
 kernels
     Functions compiled to machine code.
 calibration

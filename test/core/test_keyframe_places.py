@@ -213,6 +213,7 @@ def test_the_layer_of_another_map_is_named(file, other, message):
     ({'header': {'descriptors': []}}, r"kind '\[\]', expected rootsift"),
     ({'header': {'camera': 7}}, 'camera'), ({'points': None}, 'points'),
     ({'points': np.zeros((3, 3), np.float32)}, r'points has shape'),
+    ({'camera_rows': np.ones(KEYFRAMES, np.int64)}, 'outside the 1 cameras'),
     ({'offsets': np.zeros(KEYFRAMES + 1, np.int64)}, 'offsets'),
     ({'map_from_camera': np.full((KEYFRAMES, 4, 4), np.nan)}, 'in row 0'),
     ({'words': np.full(KEYFRAMES * POINTS, 60_000, np.uint16)}, 'words')])
@@ -233,7 +234,9 @@ def test_another_camera_is_noted():
     layer = make_layer(ROOM)
     assert layer.camera_note(CAMERA) == ''
     assert layer.camera_note(Camera(1280, 960, 1000.0, 1000.0, 640.0, 480.0)) == ''
-    assert 'fx 700.0' in layer.camera_note(Camera(640, 480, 700.0, 700.0, 320.0, 240.0))
+    other = Camera(640, 480, 700.0, 700.0, 320.0, 240.0)
+    assert 'fx 700.0' in layer.camera_note(other)
+    assert replace(layer, cameras=(CAMERA, other)).camera_note(other) == ''
 
 
 LENS = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)

@@ -147,7 +147,7 @@ def test_what_was_written_is_read_as_yaml_reads_it(tmp_path, details, label):
     ('0.7500', '0.0000'), ('source: "build', 'source: "  " #'), ('label: "', 'label: "\\x41'),
     ('frame_id: "', 'frame_id: "" #'), ('orientation: [', 'orientation: [9'), ('\n', '\r\n'),
     ('          label', '\t  label'), ('landmarks:', 'landmarks: # all'),
-    ('class_id: "', "class_id: '")])
+    ('class_id: "', "class_id: '"), ('"thing_1":', '"thing_0":'), ('"wine glass":', '"cup":')])
 def test_a_changed_file_is_read_or_refused_as_by_yaml(tmp_path, before, after):
     path = tmp_path / 'map.yaml'
     write_map(path, replace(make_room(), details=(FULL,) * 12))
@@ -208,7 +208,7 @@ def test_a_nearly_unit_quaternion_is_normalized(tmp_path):
     ({'labels': [{'text': 'a', 'weight': 0.0}]}, 'labels: .*above 0'),
     ({'class_weights': ['cup']}, 'class_weights'), ({'seen_ratio': -0.5}, 'seen_ratio: -0.5'),
     ({'position_sigma': float('nan')}, 'position_sigma: nan'),
-    ({'seen_ratio': 10**400}, 'seen_ratio: 10')])
+    ({'seen_ratio': 10**400}, 'seen_ratio: 10'), ({'class_id': 1001 * 'x'}, 'class_id: longer')])
 def test_bad_fields_are_named_with_file_and_landmark(change, message):
     with pytest.raises(MapError, match=f"here: landmark 'cup_1': {message}"):
         read(WITH_LABEL | change)

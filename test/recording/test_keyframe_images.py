@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.depth_image import DepthImage
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.depth_image import DepthImage
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, load_layer_of_map, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError

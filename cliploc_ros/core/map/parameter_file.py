@@ -7,7 +7,7 @@ Size and depth are limited, so a hostile file causes an error and not a crash.
 
 PyYAML creates an object for each token of a file: 100,000 landmarks take 10 to 30 s. Files of
 build_map, import_map and the studio have a fixed layout: a regular expression that matches one
-landmark reads them ten times faster. It accepts only a small subset of YAML, for which its result
+landmark reads them four times faster. It accepts only a small subset of YAML, for which its result
 equals the parser's. For any other file, such as a handwritten or invalid file, parse_written_map
 returns None. The parser then reads the file and reports errors.
 """

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.agreement import (
     AXES,

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.depth_image import depths_of_boxes
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.depth_image import depths_of_boxes
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.clip_encoder import ClipEncoder

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from cliploc_ros.core.depth_image import PLAUSIBLE_DEPTH_M, depths_of_boxes
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.depth_image import PLAUSIBLE_DEPTH_M, depths_of_boxes
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.log import Log

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.depth_image import MILLIMETRE
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.depth_image import MILLIMETRE
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import parsing
