@@ -149,18 +149,24 @@ def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
     assert_equal(load_observations(file), load_observations(recorded))
 
 
-def test_other_options_use_the_boxes_again_and_depth_is_stored(walk, tmp_path, caplog):
+def test_other_poses_use_the_boxes_again_and_depth_is_stored(walk, recorded, tmp_path, caplog):
     file = tmp_path / 'depth.npz'
     command = ('--rgbd', walk, *NETWORKS, '--no-clip', *ALL, '--record-to', file, '--out',
                tmp_path / 'map.yaml')
     assert main(arguments(*command, '--depth-unit', '1')) == 1
     outputs, = tmp_path.glob('.*.outputs')
-    code = main(arguments(*command, '--keyframes', '1', '180'))
+    rows, moved = np.loadtxt(walk / 'groundtruth.txt'), tmp_path / 'moved.txt'
+    rows[:, 1] += 1.0
+    np.savetxt(moved, rows, fmt='%.9f')
+    code = main(arguments(*command, '--keyframes', '1', '180', '--trajectory', moved))
     assert code in (0, 1)  # few keyframes may give no map
     assert f'boxes of 1 images of earlier runs: {outputs}' in caplog.text
     content = load_observations(file)
     assert 2 <= len(content) < 15
     assert content.embeddings is None
+    np.testing.assert_allclose(
+        content.map_from_camera[0, :3, 3],
+        load_observations(recorded).map_from_camera[0, :3, 3] + [1.0, 0.0, 0.0], atol=1e-6)
     # 10,000 counts of TUM are 2 m, without variation
     np.testing.assert_allclose(content.depths, 2.0, atol=1e-6)
     np.testing.assert_allclose(content.depth_spreads, 0.0, atol=1e-6)
