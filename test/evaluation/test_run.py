@@ -223,8 +223,7 @@ def make_summary(errors, method='auto', accepted=None, confidence=None, **more):
         method, tuple(range(shape[1])), errors, 10.0 * errors,
         np.zeros(shape, bool) if accepted is None else np.atleast_2d(accepted),
         np.zeros(shape) if confidence is None else np.atleast_2d(confidence), np.full(shape, 2.0),
-        np.ones(shape), np.ones(shape, int), np.full(shape, 500), np.full(shape[1], 5),
-        **more)
+        np.ones(shape), np.ones(shape, int), **more)
 
 
 def make_result(**changes):

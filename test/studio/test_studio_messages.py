@@ -52,8 +52,7 @@ def page(tmp_path):
     ('show_view', [{'view': view} for view in ('x', None, [1], {}, NAN, 10**400, 1e300, -1e300)]),
     *((name, [{'ids': ids} for ids in ('mug_1', {'mug_1': 1}, [1], [['mug_1']], 5, ['more'])])
       for name in ('lock', 'hide')),
-    ('flatten', [{'is_flat': NAN}, {'client': 1}]), ('fly', [{'name': 1, 'is_flat': True}]),
-    ('mode', [{'mode': {}}, {}]),
+    ('fly', [{'name': 1}, {}]), ('mode', [{'mode': {}}, {}]),
     ('relocalize_robot', [{}]), ('reload_robot', [{}]), ('check_map', [{'limit_s': NAN}]),
     ({'x': []}, [{}]), ('x' * 100_000, [{}]), ('_start', [{'name': 'save', 'values': {}}])],
     ids=lambda value: '' if isinstance(value, list) else str(value)[:20])

@@ -183,14 +183,7 @@ def check_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str
         parts.append(html.fold(f'{len(report.look_alikes)} pairs of places that look alike',
                                _look_alikes(report)))
     if report.recording is not None:
-        rows = [(str(number), str(fold.frames), str(fold.landmarks), str(fold.boxes.boxes),
-                 f'{fold.boxes.explained:.1%}', f'{fold.boxes.median_iou:.3f}')
-                for number, fold in enumerate(report.recording.folds, start=1)]
-        parts += [html.fold('Held-out boxes', html.note(
-            'The recording is split into blocks of time. The boxes of each block are compared '
-            'with the landmarks fitted to the other blocks.'), html.table((
-                '#fold', '#frames', '#landmarks', '#boxes', '#explained', '#median IoU'), rows)),
-                  html.fold('Systematic residuals', _corrections(report.recording))]
+        parts.append(html.fold('Systematic residuals', _corrections(report.recording)))
     return html.page(f'Check of {name}', *parts,
                      html.fold('How these figures were computed', html.items(report.notes)))
 

@@ -52,12 +52,7 @@ class Summary:
     confidence: NDArray[np.float64]  #: (t, q)
     search_ms: NDArray[np.float64]  #: (t, q)
     coverage: NDArray[np.float64]  #: (t, q)
-    #: (t, q)
-    best_iterations: NDArray[np.int64]
-    hypotheses: NDArray[np.int64]
-    boxes: NDArray[np.int64]  #: (q,)
-    #: (t, q): infinite if no pose was found; empty if not computed
-    nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    best_iterations: NDArray[np.int64]  #: (t, q)
     #: Mean share of a query's crops that were compared with labels
     crops_share: float = 1.0
     #: Number of refusals by kind, the most frequent first
@@ -185,7 +180,6 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
     return Summary(
         method, queries, column('error_m'), column('error_deg'), column('accepted'),
         column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
-        column('hypotheses'), column('boxes')[0], column('nees'),
         float(column('crops_share').mean()), dict(kinds.most_common()),
         is_given=results[0].source == GIVEN, **keyframes)
 

@@ -58,7 +58,7 @@ class Page:
 
     def __init__(self, studio: Studio, server: viser.ViserServer):
         self._studio, self._server = studio, server
-        self.desk, self.board = Desk(studio, server), Board()
+        self.desk, self.board = Desk(studio, server), Board(studio.changed.set)
         self._stopped = threading.Event()
         self._drag = 0
         self._clicked: tuple[object, float] = None, 0.0
@@ -171,7 +171,7 @@ class Page:
             is_here = state.pose is not None and state.pose.frame_id == document.frame_id
             show('Robot', state if is_here else None, draw_robot)
         # before the image of the scene, which takes time
-        self.board.show(parts_of(self.desk))
+        self.board.show({**parts_of(self.desk), 'people': self.board.people})
         if recording is not None:
             show('Image', studio.view, self._draw_image)
 
@@ -208,13 +208,9 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
         return pages[0].picture(path) if pages else None
 
     async def talk(connection: Any, person: str) -> None:
-        if not pages:
-            return
-        desk = pages[0].desk
-        try:
+        if pages:
+            desk = pages[0].desk
             await pages[0].board.serve(connection, lambda message: desk.do(person, message))
-        finally:
-            desk.show_mode(person, '')
 
     with gate.guard(answer, talk), redirect_stdout(io.StringIO()):  # viser prints another URL
         server = viser.ViserServer(host, port, verbose=False)

@@ -41,7 +41,6 @@ def parts_of(desk: Desk) -> dict[str, Any]:
         'selection': {'ids': document.selection, 'one': _selected_part(studio)},
         'review': {**review.counts(), 'running': list(desk.running)},
         'log': {'lines': desk.lines, 'is_old': desk.is_old},
-        'people': len(desk.modes),
         'layers': desk.layers,
         'test': {
             'share': round(studio.share, 2), 'running': list(desk.running),

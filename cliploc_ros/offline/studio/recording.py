@@ -54,8 +54,6 @@ LEAST_BOXES = 3
 _MARGIN = 0.25
 # Time between the pictures of the film [s].
 _PICTURE_S = 0.2
-# Tolerance of the entries of two pose matrices of the same image, which differ by rounding.
-_SAME_POSE = 1e-3
 
 
 class Outline(NamedTuple):
@@ -136,12 +134,6 @@ class Recording:
         if self.images is None or not 0 <= view < len(self.detections):
             return None
         return self.images.of(self.detections, view)
-
-    def image_at(self, map_from_camera: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        """Return the image of the view with a pose (4, 4); None without an image."""
-        poses = self.detections.map_from_camera
-        views = np.nonzero(np.abs(poses - map_from_camera).max(axis=(1, 2)) < _SAME_POSE)[0]
-        return self.image(int(views[0])) if len(views) else None
 
     def crop(self, view: int, box: NDArray[np.float64]) -> NDArray[np.uint8] | None:
         """Return the crop of a box (4,) [px] with a margin.

@@ -34,7 +34,6 @@ from cliploc_ros.offline.mapping.check.relocalization import (
     try_recording,
 )
 from cliploc_ros.offline.mapping.check.report import (
-    BlockQuality,
     CheckReport,
     GridCheck,
     RecordingCheck,
@@ -163,14 +162,13 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
                      witness: Witness, models: Sequence[DetectorModel], options: CheckOptions,
                      tell: Progress, keyframes: RecordedKeyframes | None) -> RecordingCheck:
     tell('cross-validating', 0.0)
-    folds, blocks, held_out = [], [], []
+    folds, held_out = [], []
     for fold in make_folds(views, witness, options):
         # a box whose landmark no other part of the recording shows does not test the map
         is_known = (witness.shown < 0) | np.isin(witness.shown, fold.rows)
         ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames) & is_known]
         folds.append(fold)
         held_out.append(ious)
-        blocks.append(BlockQuality(len(fold.frames), len(fold.rows), BoxQuality.of(ious)))
         tell('cross-validating', len(folds) / options.folds)
     trials = try_recording(landmark_map, detections, witness.shown, folds, options,
                            partial(tell, 'relocalizing recorded frames'), keyframes)
@@ -185,7 +183,7 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         duration_s=float(detections.stamps_s[-1] - detections.stamps_s[0]),
         path_xyz=detections.map_from_camera[:, :3, 3],
         as_given=explained_boxes(views, witness.landmarks),
-        held_out=BoxQuality.of(np.concatenate(held_out)), folds=tuple(blocks),
+        held_out=BoxQuality.of(np.concatenate(held_out)),
         trials=tuple(trials), simulated=tuple(simulated),
         corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
         edge_scale=models[0].edge_scale)

@@ -59,15 +59,6 @@ class Measure(NamedTuple):
 
 
 @dataclass(frozen=True)
-class BlockQuality:
-    """The boxes of one fold, judged with landmarks fitted to the other folds."""
-
-    frames: int
-    landmarks: int  #: Landmarks that the other folds suffice to fit
-    boxes: BoxQuality
-
-
-@dataclass(frozen=True)
 class RecordingCheck:
     """The check of a map against a recording."""
 
@@ -78,7 +69,6 @@ class RecordingCheck:
     #: With the map as it is. A map built from this recording was fitted to these boxes.
     as_given: BoxQuality
     held_out: BoxQuality  #: Cross-validated over time
-    folds: tuple[BlockQuality, ...]
     trials: tuple[Trial, ...]  #: Recorded frames in cross-validated maps, in the order of time
     #: The same poses in the map as it is, with simulated boxes. As many should be accepted as with
     #: recorded boxes: otherwise the grid is too optimistic or too pessimistic.
