@@ -40,7 +40,7 @@ def page(tmp_path):
     ('create', [{'label': {}, 'class_id': []}, {'label': None}]),
     ('show_layer', [{'name': 'more', 'is_shown': True}, {'name': ['Cameras'], 'is_shown': True},
                     {'name': 'Cameras', 'is_shown': NAN},
-                    {'name': 'Labels', 'is_shown': 10**100}]),
+                    {'name': 'Cameras', 'is_shown': 10**100}]),
     ('edit', [*({'field': field, 'value': value}
                 for field in ('center', 'by', 'angles', 'semi_axes', 'orientation', 'fields', {})
                 for value in (None, 'abc', {'x': 1}, [1, 2], [[1, 2, 3]], [1, 2, NAN],
@@ -69,7 +69,7 @@ def test_hostile_messages_are_refused(page, caplog, action, hostile):
         with document.lock:
             page._redraw()
             json.dumps(parts_of(desk), allow_nan=False)
-        assert set(desk.layers) <= {'Labels', 'Cameras', 'Surfaces'}
+        assert set(desk.layers) <= {'Cameras', 'Surfaces'}
     desk.do('person', {'do': 'save'})
     assert not [line for line in desk.lines if line[0] == 'error']
     assert all(len(text) <= 600 for _, text in desk.lines)

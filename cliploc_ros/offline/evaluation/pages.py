@@ -111,7 +111,7 @@ def _data(report: CheckReport) -> dict[str, Any]:
         'overlaps': [{'first': report.map_ids[overlap.first],
                       'second': report.map_ids[overlap.second], 'distance': overlap.distance,
                       'is_duplicate': overlap.is_duplicate} for overlap in report.overlaps],
-        'queries': report.queries, 'recording': None, 'keyframes': None,
+        'recording': None, 'keyframes': None,
         'grid': {**vars(grid), 'headings': grid.headings, 'poses': None,
                  'accepted_positions_near_recording': grid.accepted_positions,
                  'verdicts': count_verdicts(grid.trials),
@@ -226,8 +226,6 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
               if any(trial.by_objects for trial in recording.trials) else []),
             ('the same poses with simulated boxes', _verdicts(recording.simulated)),
             ('noise of box edges', f'{recording.edge_scale:.2f} times that assumed by build_map')]
-    if report.queries:
-        rows.append(('queries with recorded similarities', _verdicts(report.queries)))
     near = ' near the recording' if report.recording else ''
     rows += [('grid views, by objects alone', _verdicts(report.grid.trials)),
              (f'grid positions{near} with a heading accepted by objects alone',

@@ -293,11 +293,11 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     lines += [f'{summary.method} refused: {_kinds(summary)}.'
               for summary in summaries if summary.refusals]
     lines += [f'{summary.method} compared {summary.crops_share:.0%} of the crops of a query with '
-              'labels on average; --crops all compares all crops.'
+              'labels on average.'
               for summary in summaries if 0.0 < summary.crops_share < 1.0]
     if any(summary.has_keyframes for summary in summaries):
         lines.append('Keyframes: number of poses from each source, median number of inlier '
-                     'points, mean time outside the search; --no-keyframes does without them.')
+                     'points, mean time outside the search.')
     if len(summaries) > 1:
         lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')

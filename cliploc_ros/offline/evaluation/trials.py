@@ -295,7 +295,7 @@ def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_
             found[query.number] = replace(query, observation=joined[row], neighbours=tuple(
                 joined[other] for other in sorted(near)))
     if not any(query.neighbours for query in found.values()):
-        raise OptionsError('--fuse: no query of this input has neighbouring frames in its group')
+        raise OptionsError('no query of this input has neighbouring frames in its group to fuse')
     return tuple(found[query.number] for query in queries)
 
 

@@ -70,13 +70,13 @@ class Page:
         self._all = Ellipsoids(scene, '/landmarks', self._click, 0.2, has_outlines=True)
         self._selected = Ellipsoids(scene, '/selection', self._click, 0.6, _AROUND)
         self._missing = Ellipsoids(scene, '/live/missing', self._click, 0.5, _MISSING_SCALE)
-        self._labels = Labels(server, extent.up)
+        self._labels = Labels(scene, extent.up)
         self._gizmo = Gizmo(scene, self._drag_gizmo)
         camera = server.initial_camera
         camera.fov, camera.up = viewpoint.FOV_RAD, tuple(extent.up)
         camera.look_at = tuple(extent.middle)
         camera.position = tuple(viewpoint.overview(extent, viewpoint.USUAL_ASPECT))
-        self.desk.layers = {'Labels': True} | {
+        self.desk.layers = {
             name: is_shown for name, what, is_shown in (
                 ('Cameras', studio.recording, True), ('Keyframes', studio.layer, False),
                 ('Walls', studio.walls, True)) if what is not None}
@@ -155,7 +155,7 @@ class Page:
         # also the selected landmarks: both clicks of a double click must have the same index
         self._all.show(shown, studio.color_of)
         self._selected.show(chosen, lambda class_id: _SELECTED_RGB)
-        self._labels.show(shown if is_on('Labels') else {}, list(chosen))
+        self._labels.show(chosen)
         selected = None if document.selected is None else document.selected[1]
         self._gizmo.show(None if selected is None or selected.is_locked else selected)
         recording = None if studio.recording is None else studio.recording.detections

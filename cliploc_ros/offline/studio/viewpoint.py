@@ -143,17 +143,6 @@ def look_through(client: Any, pose: NDArray[np.float64], intrinsics: Camera) -> 
         camera.fov = 2.0 * float(np.arctan(1.1 * half))
 
 
-def pixels_of(camera: Any, points: Sequence[NDArray[np.float64]] | NDArray[np.float64]
-              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the pixels (n, 2) of points (n, 3) in a browser, and their depths (n,)."""
-    rotation = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix()
-    seen = (np.reshape(points, (-1, 3)) - camera.position) @ rotation
-    focal = camera.image_height / 2.0 / np.tan(camera.fov / 2.0)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        return seen[:, :2] / seen[:, 2:] * focal + (
-            camera.image_width / 2.0, camera.image_height / 2.0), seen[:, 2]
-
-
 def wxyz_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation of a pose (4, 4) or matrix (3, 3) as viser's quaternion w, x, y, z."""
     return np.asarray(np.roll(Rotation.from_matrix(rotation[:3, :3]).as_quat(), 1))

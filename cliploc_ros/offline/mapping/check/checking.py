@@ -30,7 +30,6 @@ from cliploc_ros.offline.mapping.check.relocalization import (
     make_folds,
     measure_detector,
     sample_frames,
-    try_queries,
     try_recording,
 )
 from cliploc_ros.offline.mapping.check.report import (
@@ -47,12 +46,11 @@ from cliploc_ros.offline.mapping.sizes import scale_by_sizes
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
-from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.simulation import DetectorModel, guess_detector
 
 _NOTES = (
-    'similarities of crops and labels are simulated, except for queries: labels of equal text '
-    'look equal, and labels that share words look alike',
+    'similarities of crops and labels are simulated: labels of equal text look equal, and labels '
+    'that share words look alike',
     'the grid assumes that the map is correct and that walls hide only landmarks that were hidden '
     'in the recording')
 _NO_RECORDING = (
@@ -63,18 +61,15 @@ _HEIGHT_MARGIN_M = 0.3
 
 
 def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
-              queries: Sequence[PosedQuery] = (), options: CheckOptions | None = None,
-              thresholds: Thresholds | None = None, progress: Progress | None = None,
-              layer: KeyframeLayer | None = None, image_of: ImageOf | None = None
-              ) -> CheckReport:
+              options: CheckOptions | None = None, thresholds: Thresholds | None = None,
+              progress: Progress | None = None, layer: KeyframeLayer | None = None,
+              image_of: ImageOf | None = None) -> CheckReport:
     """Check a map.
 
     Parameters
     ----------
     detections : PosedDetections, optional
         A recording of the place. Without one, the report is shorter.
-    queries : sequence of PosedQuery
-        Observations with recorded similarities to the map's labels.
     thresholds : Thresholds, optional
         The thresholds that the map has to reach.
     layer : KeyframeLayer, optional
@@ -123,8 +118,6 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         landmarks=tuple(check_landmarks(landmark_map, witness, overlaps)),
         overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map)),
         grid=grid, recording=recording,
-        queries=tuple(_told(try_queries(landmark_map, queries, options), len(queries),
-                            partial(tell, 'relocalizing queries'))),
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
         keyframes=None if layer is None else check_keyframes(layer, grid, recorded),
         scale=scale_by_sizes(landmark_map))

@@ -152,8 +152,6 @@ class CheckReport:
     look_alikes: tuple[LookAlike, ...]
     grid: GridCheck
     recording: RecordingCheck | None = None
-    #: Recorded queries with recorded similarities; empty without any
-    queries: tuple[Trial, ...] = ()
     measures: tuple[Measure, ...] = ()  #: The figures that determine the verdict
     to_do: tuple[Advice, ...] = ()  #: Advice, the most urgent first
     notes: tuple[str, ...] = ()  #: Assumptions behind the figures
@@ -255,7 +253,7 @@ def _tell_localized(what: str, by_objects: NDArray[np.bool_], by_any: NDArray[np
 
 def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
     """Return the figures of a report that have a threshold."""
-    views, recording = [*report.grid.trials, *report.queries], report.recording
+    views, recording = [*report.grid.trials], report.recording
     measures = [
         Measure('landmarks with a serious fault', report.faulty, limits.max_faulty, True),
         Measure('pairs of duplicates', report.duplicates, limits.max_duplicates, True, 'count'),
