@@ -52,8 +52,6 @@ from cliploc_ros.offline.studio.landmark import Landmarks, map_of
 LEAST_BOXES = 3
 # Margin of a crop around a box, as a share of its size.
 _MARGIN = 0.25
-# Time between the pictures of the film [s].
-_PICTURE_S = 0.2
 
 
 class Outline(NamedTuple):
@@ -75,14 +73,6 @@ class Recording:
     def views(self) -> Views:
         """The arrays for the kernels of mapping."""
         return make_views(self.detections)
-
-    @cached_property
-    def film_step(self) -> int:
-        """Return the number of views between two pictures of the film."""
-        gaps_s = np.diff(np.unique(self.detections.stamps_s))
-        if not len(gaps_s):
-            return 1
-        return max(1, round(_PICTURE_S / max(float(np.median(gaps_s)), 1e-3)))
 
     def witness(self, landmark_map: LandmarkMap) -> Witness:
         """Return the evidence of the boxes about a map."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.offline.studio.landmark import Landmark, Landmarks, fields_of
+from cliploc_ros.offline.studio.landmark import Landmark, Landmarks
 from cliploc_ros.offline.studio.layers import SPHERE, linear
 from cliploc_ros.offline.studio.viewpoint import Bounds, wxyz_of
 
@@ -52,7 +52,7 @@ class Ellipsoids:
 
     def show(self, landmarks: Landmarks, rgb_of: Callable[[str], tuple[int, int, int]]) -> None:
         """Show the given landmarks in the colours of their classes."""
-        if list(fields_of(landmarks).items()) == list(fields_of(self._shown).items()):
+        if list(landmarks.items()) == list(self._shown.items()):
             return
         before, self._shown = self._shown, landmarks
         shown = list(landmarks.values())

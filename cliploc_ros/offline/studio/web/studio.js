@@ -9,8 +9,8 @@ const SVG = 'http://www.w3.org/2000/svg';
 const MODES = ['review', 'edit', 'create', 'test'];
 // Greatest number of rows in the list. A search finds the other landmarks.
 const MOST_ROWS = 300;
-// Time between the pictures of the film. The server sends the number of views between two pictures.
-const PICTURE_MS = 200;
+// Time between the pictures of the film, and their greatest number.
+const PICTURE_MS = 200, MOST_PICTURES = 600;
 const STEPS_M = [0.01, 0.05, 0.1, 0.5];
 const person = Array.from(crypto.getRandomValues(new Uint8Array(12)),
                           byte => byte.toString(16).padStart(2, '0')).join('');
@@ -534,7 +534,7 @@ function followView(isOn) {
 function playOrStop() {
   if (film) { clearInterval(film); film = null; } else {
     film = setInterval(() => {
-      if (state.view.view >= state.file.views - 1) playOrStop(); else stepView(state.file.step);
+      if (state.view.view >= state.file.views - 1) playOrStop(); else stepView(Math.max(1, Math.round(state.file.views / MOST_PICTURES)));
     }, PICTURE_MS);
   }
   showLayers();
