@@ -79,8 +79,7 @@ def test_views_that_look_alike_are_warned_of(office):
 
 
 @pytest.mark.parametrize(('second', 'distance_m', 'message'), [
-    (None, 0.0, 'boxes drawn: 1'), ((10.0, 10.0, 12.0, 50.0), 1.0, '4 pixels'),
-    ((300.0, 220.0, 340.0, 260.0), 0.0, 'along one line'),
+    (None, 0.0, 'boxes drawn: 1'), ((300.0, 220.0, 340.0, 260.0), 0.0, 'along one line'),
     ((500.0, 220.0, 540.0, 260.0), 1.0, 'behind a camera')])
 def test_what_is_no_object_is_refused(second, distance_m, message):
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)

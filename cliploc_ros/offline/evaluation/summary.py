@@ -405,5 +405,5 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def as_json(results: Sequence[Result]) -> str:
     """Return JSON with one result on each line."""
-    lines = ',\n'.join(json.dumps(result.as_dict()) for result in results)
+    lines = ',\n'.join(json.dumps(vars(result)) for result in results)
     return f'[\n{lines}\n]\n'

@@ -113,8 +113,6 @@ def set_fields(landmarks: Landmarks, landmark_ids: Iterable[str], **fields: Any)
     replaces all weighted phrases, a class replaces all class weights.
     """
     ids = list(landmark_ids)
-    if unknown := fields.keys() - _FIELDS.keys():
-        raise EditError(f'{unknown} are not fields of a landmark')
     if (quat_xyzw := fields.get('orientation')) is not None:
         norm = float(np.linalg.norm(quat_xyzw))
         if not 1e-6 <= norm < np.inf:
