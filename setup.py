@@ -66,6 +66,7 @@ setup(
     package_data={
         f'{PACKAGE}.offline.datasets': ['vision_msgs/msg/*.msg'],
         f'{PACKAGE}.core': ['calibration.yaml'],
+        f'{PACKAGE}.offline': ['page.css'],
         f'{PACKAGE}.offline.studio': ['web/studio.*'],
         f'{PACKAGE}.offline.vocabulary': ['*.yaml'],
     },

@@ -52,7 +52,6 @@ def make_parser() -> argparse.ArgumentParser:
            'those that the map was built from, as named by NAME.recording.json next to the map)')
     option(parser, '--images BAG|DIR', 'the images of this recording (default: those named by '
            'NAME.recording.json, or those next to the observations)')
-    option(parser, '--queries NPZ', 'a query file of this map: frames with similarities')
     option(parser, '--out DIR', 'folder of check.html and check.json (NAME_check next to the map)')
     option(parser, '--every N', 'use only every N-th frame of the observations (%(default)s)',
            command.positive_int, 1)
@@ -105,10 +104,8 @@ def check(options: argparse.Namespace) -> int:
     # Imported late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.offline.datasets.observations import load_queries
     from cliploc_ros.offline.evaluation import pages
     from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
-    from cliploc_ros.offline.evaluation.trials import make_queries
     from cliploc_ros.offline.mapping.check.checking import check_map
     from cliploc_ros.offline.mapping.tilt import tilt_note
 
@@ -132,13 +129,11 @@ def check(options: argparse.Namespace) -> int:
     layer = read_layer(options.map, landmark_map, options.keyframes)
     if not len(landmark_map):
         return _check_keyframes(layer, detections)
-    queries = make_queries(load_queries(options.queries, landmark_map.landmark_ids),
-                           landmark_map) if options.queries else ()
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)
     with command.StageBar() as bar:
-        report = check_map(landmark_map, detections, queries, check_options, thresholds, bar.show,
-                           layer, None if options.observations else image_of)
+        report = check_map(landmark_map, detections, check_options, thresholds, bar.show, layer,
+                           None if options.observations else image_of)
         pages.write_check(out, options.map.name, report, draw_pictures(landmark_map, report),
                           None if painter is None else painter.of)
     print('\n'.join([f'verdict: {report.verdict}', *report.localized,

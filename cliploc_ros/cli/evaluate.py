@@ -44,7 +44,6 @@ examples:
   evaluate --queries office.npz --map office.yaml --methods all --trials 5
   evaluate --folder second_walk --map office.yaml --methods auto --every 5
   evaluate --bag office --map office.yaml --image /camera/image_raw --save-queries office.npz
-  evaluate --bag office --map office.yaml --methods class_bf auto --no-clip
   evaluate --queries office.npz --map office.yaml --methods auto --gravity --height-range 0.8 2.2
   evaluate --queries office.npz --map office.yaml --methods auto --fuse --odometry-noise 0.01 0.5
   evaluate --queries office.npz --map office.yaml --methods auto --poses hloc=hloc.txt

@@ -8,6 +8,7 @@ Functions escape the texts in their arguments. Parts are already HTML.
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -18,48 +19,8 @@ from numpy.typing import NDArray
 ACCEPTED, REFUSED, MISLED = '#0072B2', '#E69F00', '#D55E00'
 LOOK_ALIKE, GOOD, BAD = '#CC79A7', ACCEPTED, MISLED
 _QUALITY = 85
+_COLORS = f':root {{ --accepted: {ACCEPTED}; --refused: {REFUSED}; --misled: {MISLED} }}'
 _TYPES = {b'\x89PNG': 'png', b'\xff\xd8\xff\xe0': 'jpeg'}
-_STYLE = f"""\
-body {{ font: 15px/1.45 system-ui, sans-serif; color: #222; margin: 0 auto; max-width: 1480px;
-  padding: 1rem 1.5rem 3rem }}
-h1 {{ font-size: 1.5rem; margin: 0 0 .6rem }} h2 {{ font-size: 1.15rem; margin: 1rem 0 .4rem }}
-img {{ max-width: 100%; max-height: 92vh; display: block }}
-p {{ margin: .5rem 0; max-width: 62rem }}
-table {{ border-collapse: collapse; font-size: 14px; font-variant-numeric: tabular-nums;
-  margin: .6rem 0 }}
-th, td {{ text-align: left; vertical-align: top; padding: .2rem .7rem;
-  border-bottom: 1px solid #ddd; unicode-bidi: isolate }}
-td {{ max-width: 26rem; overflow-wrap: anywhere }} td.text {{ min-width: 11rem }}
-td.number, th.number {{ text-align: right; white-space: nowrap }}
-li, h1, figcaption, .card {{ overflow-wrap: anywhere; unicode-bidi: isolate }}
-li {{ margin: .25rem 0 }} .scroll {{ overflow-x: auto }}
-.note, figcaption {{ font-size: 13.5px; color: #555 }} figure {{ margin: .8rem 0 }}
-.verdict {{ font-size: 1.05rem; border-left: 6px solid; padding: .4rem .9rem; background: #f4f4f4;
-  margin-bottom: .8rem }}
-.accepted {{ color: {ACCEPTED} }} .refused, .misled {{ color: {MISLED} }}
-td.faulty {{ border-left: 4px solid {MISLED} }} td.minor {{ border-left: 4px solid {REFUSED} }}
-.first {{ display: grid; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 0 2rem;
-  align-items: start }}
-.first figure {{ margin: 0 }} .first figure img {{ max-height: 72vh; margin: auto }}
-@media (max-width: 900px) {{ .first {{ grid-template-columns: minmax(0, 1fr) }} }}
-.tiles {{ display: flex; gap: .8rem }}
-.tiles div {{ flex: 1; border-top: 4px solid; background: #f4f4f4; padding: .3rem .8rem .5rem;
-  font-size: 13.5px; color: #444 }}
-.tiles b {{ display: block; font-size: 1.7rem; line-height: 1.3; color: #222 }}
-.bars {{ display: grid; grid-template-columns: auto minmax(6rem, 1fr) auto; gap: .2rem .8rem;
-  align-items: center; font-size: 13.5px; margin: .9rem 0 }}
-.bar {{ position: relative; height: .8rem; background: #eee }}
-.bar i {{ position: absolute; height: 100%; background: {GOOD} }}
-.bar i.over {{ background: {BAD} }}
-.bar u {{ position: absolute; top: -.2rem; height: 1.2rem; border-left: 2px solid #222 }}
-.good, .tiles .good {{ border-color: {GOOD} }} .bad, .tiles .bad {{ border-color: {BAD} }}
-.card {{ display: flex; gap: 1rem; align-items: flex-start; padding: .45rem 0;
-  border-top: 1px solid #ddd }}
-.card img {{ width: 8.6rem }} .card p {{ margin: 0 }}
-.row {{ display: flex; flex-wrap: wrap; gap: 1rem }} .row figure {{ flex: 1 1 28rem }}
-details {{ margin: .5rem 0; border-top: 1px solid #ddd; padding-top: .4rem }}
-summary {{ font-weight: 600; cursor: pointer }}
-"""
 
 
 class Bar(NamedTuple):
@@ -75,10 +36,11 @@ class Bar(NamedTuple):
 
 def page(title: str, *parts: str) -> str:
     """Return a page."""
+    style = Path(__file__).with_suffix('.css').read_text()
     return '\n'.join([
         '<!DOCTYPE html>', '<html lang="en">', '<meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width">', f'<title>{escape(title)}</title>',
-        f'<style>{_STYLE}</style>', f'<h1>{escape(title)}</h1>', *parts, '</html>', ''])
+        f'<style>{_COLORS}\n{style}</style>', f'<h1>{escape(title)}</h1>', *parts, '</html>', ''])
 
 
 def first_screen(left: Iterable[str], right: Iterable[str]) -> str:

@@ -52,8 +52,7 @@ def test_a_doubled_map_fails(check_map, tmp_path):
 @pytest.mark.parametrize(('args', 'named'), [
     (('{folder}/missing.yaml', '--out', '{folder}/out'), 'missing.yaml'),
     (('{room}', '--observations', '{room}', '--out', '{folder}/out'), 'npz'),
-    (('{room}', '--images', '{folder}', '--out', '{folder}/out'), '--observations'),
-    (('{room}', '--queries', '{folder}/gone.npz', '--out', '{folder}/out'), 'gone.npz')])
+    (('{room}', '--images', '{folder}', '--out', '{folder}/out'), '--observations')])
 def test_what_to_correct_is_named(check_map, room_file, tmp_path, args, named):
     done = check_map(*(argument.format(folder=tmp_path, room=room_file) for argument in args))
     assert done.returncode == 1
@@ -66,7 +65,7 @@ def test_what_to_correct_is_named(check_map, room_file, tmp_path, args, named):
 def test_the_office_passes_but_for_its_doubles(check_map, shared_data, tmp_path):
     office = shared_data / 'tum_fr3_office'
     done = check_map(office / 'map.yaml', '--observations', office / 'observations.npz',
-                     '--queries', office / 'queries.npz', '--every', 20, '--frames', 10,
+                     '--every', 20, '--frames', 10,
                      '--min-positions', 0, '--max-duplicates', 3, '--max-faulty', 0.25,
                      '--out', tmp_path, *FAST)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -77,4 +76,3 @@ def test_the_office_passes_but_for_its_doubles(check_map, shared_data, tmp_path)
                if overlap['is_duplicate']]
     assert len(doubles) == 3
     assert {'teddy_bear_1', 'chair_3'} in doubles and {'refrigerator_1', 'book_5'} in doubles
-    assert len(checked['queries']) == 52

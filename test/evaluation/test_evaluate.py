@@ -126,7 +126,7 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
                      for trial in range(2))
     assert first != second and len(first) == len(second) == 2
     assert_error(evaluate_here(*small(files, '--methods', 'auto', '--fuse', '--out', tmp_path)),
-                 '--fuse', 'neighbouring')
+                 'neighbouring', 'fuse')
 
 
 def test_the_files_say_what_was_compared(files, recording, tmp_path, evaluate_here):

@@ -178,25 +178,15 @@ def test_all_are_the_papers_ten_and_auto():
         assert method.draws_nothing == method.name.endswith('_bf')
 
 
-def test_auto_is_what_the_node_does():
-    method, = parse_methods(['auto'], FIVE, 40)
-    assert method.options == RelocalizerOptions(random_seed=4)
-
-
-def test_named_sets_of_options(tmp_path):
+def test_named_sets_of_options_and_their_keyframes(tmp_path):
     path = tmp_path / 'mine.yaml'
-    path.write_text('wide: {base: hybrid_b-prosac, k: 9}\nstrict: {min_confidence: 0.9}\n')
-    wide, strict = parse_methods([str(path)], FIVE, 40)
+    path.write_text('wide: {base: hybrid_b-prosac, k: 9}\nstrict: {min_confidence: 0.9}\n'
+                    'objects: {keyframes: false}\n')
+    auto, _, wide, strict, objects = parse_methods(['auto', 'clip_bf', str(path)], FIVE, 40)
     assert (wide.name, wide.options.k, wide.options.iterations) == ('wide', 9, 500)
     assert (strict.options.min_confidence, strict.options.iterations) == (0.9, 10_000)
-
-
-def test_keyframes_are_for_auto_and_what_is_based_on_it(tmp_path):
-    path = tmp_path / 'mine.yaml'
-    path.write_text('strict: {min_confidence: 0.9}\nobjects: {keyframes: false}\n'
-                    'wide: {base: hybrid_b-prosac}\n')
-    methods = parse_methods(['auto', 'clip_bf', str(path)], FIVE, 40)
-    assert [method.name for method in methods if method.keyframes] == ['auto', 'strict']
+    assert auto.keyframes and strict.keyframes and not wide.keyframes and not objects.keyframes
+    assert auto.options == RelocalizerOptions(random_seed=4)
 
 
 @pytest.mark.parametrize(('text', 'named'), [
@@ -223,8 +213,7 @@ def make_summary(errors, method='auto', accepted=None, confidence=None, **more):
         method, tuple(range(shape[1])), errors, 10.0 * errors,
         np.zeros(shape, bool) if accepted is None else np.atleast_2d(accepted),
         np.zeros(shape) if confidence is None else np.atleast_2d(confidence), np.full(shape, 2.0),
-        np.ones(shape), np.ones(shape, int), np.full(shape, 500), np.full(shape[1], 5),
-        **more)
+        np.ones(shape), np.ones(shape, int), **more)
 
 
 def make_result(**changes):

@@ -124,19 +124,6 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
     assert all(other.severity == 0.0 for other in others)
 
 
-@pytest.mark.parametrize(('label', 'class_id', 'other'), [
-    ('a red cup', 'book', 'cup'), ('two books', 'cup', 'book'), ('a cup by a book', 'book', None),
-    ('a phone by a cup', 'cell phone', None), ('a cupboard', 'book', None)])
-def test_a_label_of_another_class_is_a_fault(label, class_id, other):
-    ids = ('cup', class_id, 'book', *TABLE.class_ids[3:])
-    named = replace(TABLE, class_ids=ids, labels=('a cup', label, 'a book', *TABLE.labels[3:]))
-    faults = {check.landmark_id: check.faults for check in check_landmarks(named, None, [])}
-    own = faults.pop(TABLE.landmark_ids[1])
-    assert [f"is labelled '{label}', which names a {other}," in fault for fault in own
-            ] == [True] * (other is not None)
-    assert not any(faults.values())
-
-
 def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detections):
     """The image cuts three sides of the boxes, so they fit anywhere along their rays."""
     _, witness = witness_of(TABLE, detections)

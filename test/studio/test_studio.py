@@ -183,7 +183,7 @@ def test_the_check_of_the_edited_map_is_stopped_and_grows_old(tmp_path):
     assert picture_of(studio, '/check').content.decode() == studio.check_page
     studio.document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
     assert not studio.is_stale, 'a lock changes nothing'
-    studio.document.edit(edits.delete, ['cup_0'])
+    studio.document.edit(edits.delete, ['cup_3'])
     assert studio.is_stale
     studio.document.undo()
     assert not studio.is_stale, 'the map is unchanged'

@@ -40,7 +40,7 @@ def page(tmp_path):
     ('create', [{'label': {}, 'class_id': []}, {'label': None}]),
     ('show_layer', [{'name': 'more', 'is_shown': True}, {'name': ['Cameras'], 'is_shown': True},
                     {'name': 'Cameras', 'is_shown': NAN},
-                    {'name': 'Labels', 'is_shown': 10**100}]),
+                    {'name': 'Cameras', 'is_shown': 10**100}]),
     ('edit', [*({'field': field, 'value': value}
                 for field in ('center', 'by', 'angles', 'semi_axes', 'orientation', 'fields', {})
                 for value in (None, 'abc', {'x': 1}, [1, 2], [[1, 2, 3]], [1, 2, NAN],
@@ -52,8 +52,7 @@ def page(tmp_path):
     ('show_view', [{'view': view} for view in ('x', None, [1], {}, NAN, 10**400, 1e300, -1e300)]),
     *((name, [{'ids': ids} for ids in ('mug_1', {'mug_1': 1}, [1], [['mug_1']], 5, ['more'])])
       for name in ('lock', 'hide')),
-    ('flatten', [{'is_flat': NAN}, {'client': 1}]), ('fly', [{'name': 1, 'is_flat': True}]),
-    ('mode', [{'mode': {}}, {}]),
+    ('fly', [{'name': 1}, {}]), ('mode', [{'mode': {}}, {}]),
     ('relocalize_robot', [{}]), ('reload_robot', [{}]), ('check_map', [{'limit_s': NAN}]),
     ({'x': []}, [{}]), ('x' * 100_000, [{}]), ('_start', [{'name': 'save', 'values': {}}])],
     ids=lambda value: '' if isinstance(value, list) else str(value)[:20])
@@ -70,7 +69,7 @@ def test_hostile_messages_are_refused(page, caplog, action, hostile):
         with document.lock:
             page._redraw()
             json.dumps(parts_of(desk), allow_nan=False)
-        assert set(desk.layers) <= {'Labels', 'Cameras', 'Surfaces'}
+        assert set(desk.layers) <= {'Cameras', 'Surfaces'}
     desk.do('person', {'do': 'save'})
     assert not [line for line in desk.lines if line[0] == 'error']
     assert all(len(text) <= 600 for _, text in desk.lines)

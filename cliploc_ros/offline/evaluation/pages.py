@@ -25,7 +25,6 @@ from cliploc_ros.offline.mapping.check.report import (
     Advice,
     CheckReport,
     Measure,
-    RecordingCheck,
     count_by_objects,
     share,
 )
@@ -46,7 +45,7 @@ ViewOf = Callable[[Advice], tuple[bytes, str] | None]
 #: Words and colour of each grade of a landmark.
 GRADES = {'faulty': ('serious fault', html.MISLED), 'minor': ('minor fault', html.REFUSED),
           'sound': ('sound', '#009E73')}
-_MOST_LANDMARKS, _MOST_MATCHED = 300, 12
+_MOST_LANDMARKS = 300
 # Numbers of figures and of pieces of advice on the first screen.
 _NUMBERS, FIRST_ADVICE = 3, 3
 # Beginnings of the names of figures in large type, the most important first.
@@ -111,7 +110,7 @@ def _data(report: CheckReport) -> dict[str, Any]:
         'overlaps': [{'first': report.map_ids[overlap.first],
                       'second': report.map_ids[overlap.second], 'distance': overlap.distance,
                       'is_duplicate': overlap.is_duplicate} for overlap in report.overlaps],
-        'queries': report.queries, 'recording': None, 'keyframes': None,
+        'recording': None, 'keyframes': None,
         'grid': {**vars(grid), 'headings': grid.headings, 'poses': None,
                  'accepted_positions_near_recording': grid.accepted_positions,
                  'verdicts': count_verdicts(grid.trials),
@@ -180,17 +179,14 @@ def check_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str
               html.fold(f'Landmarks, worst first: {faulty} of {len(report.landmarks)} with a '
                         'serious fault', _landmarks(report.landmarks))]
     if report.look_alikes:
-        parts.append(html.fold(f'{len(report.look_alikes)} pairs of places that look alike',
-                               _look_alikes(report)))
-    if report.recording is not None:
-        rows = [(str(number), str(fold.frames), str(fold.landmarks), str(fold.boxes.boxes),
-                 f'{fold.boxes.explained:.1%}', f'{fold.boxes.median_iou:.3f}')
-                for number, fold in enumerate(report.recording.folds, start=1)]
-        parts += [html.fold('Held-out boxes', html.note(
-            'The recording is split into blocks of time. The boxes of each block are compared '
-            'with the landmarks fitted to the other blocks.'), html.table((
-                '#fold', '#frames', '#landmarks', '#boxes', '#explained', '#median IoU'), rows)),
-                  html.fold('Systematic residuals', _corrections(report.recording))]
+        parts.append(html.fold(
+            f'{len(report.look_alikes)} pairs of places that look alike', html.items(
+                f'{number}: around x {pair.first[0]:.1f}, y {pair.first[1]:.1f} and x '
+                f'{pair.second[0]:.1f}, y {pair.second[1]:.1f}, turned by {pair.turn_deg:.0f} '
+                f'degrees; {len(pair.matched)} of {pair.landmarks} landmarks match, '
+                f'{pair.same_labels} with equal labels: '
+                + ', '.join(f'{first} = {second}' for first, second in pair.matched)
+                for number, pair in enumerate(report.look_alikes, start=1))))
     return html.page(f'Check of {name}', *parts,
                      html.fold('How these figures were computed', html.items(report.notes)))
 
@@ -233,8 +229,6 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
               if any(trial.by_objects for trial in recording.trials) else []),
             ('the same poses with simulated boxes', _verdicts(recording.simulated)),
             ('noise of box edges', f'{recording.edge_scale:.2f} times that assumed by build_map')]
-    if report.queries:
-        rows.append(('queries with recorded similarities', _verdicts(report.queries)))
     near = ' near the recording' if report.recording else ''
     rows += [('grid views, by objects alone', _verdicts(report.grid.trials)),
              (f'grid positions{near} with a heading accepted by objects alone',
@@ -286,32 +280,3 @@ def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
         'centre and the centre of a fit to the boxes. IoU: median over the boxes. thinness: '
         'smallest semi-axis divided by the largest. In brackets: normalized distance of '
         'overlapping landmarks.')
-
-
-def _look_alikes(report: CheckReport) -> str:
-    rows = []
-    for number, pair in enumerate(report.look_alikes, start=1):
-        pairs = ', '.join(f'{first} = {second}' for first, second in pair.matched[:_MOST_MATCHED])
-        if len(pair.matched) > _MOST_MATCHED:
-            pairs += f' and {len(pair.matched) - _MOST_MATCHED} more'
-        rows.append((str(number), f'{pair.first[0]:.1f}, {pair.first[1]:.1f}',
-                     f'{pair.second[0]:.1f}, {pair.second[1]:.1f}', f'{pair.turn_deg:.0f}',
-                     f'{len(pair.matched)} of {pair.landmarks}', str(pair.same_labels), pairs))
-    return html.table(('#pair', 'a: x, y [m]', 'b: x, y [m]', '#turn [deg]', '#matched landmarks',
-                       '#with equal labels', 'pairs'), rows)
-
-
-def _corrections(recording: RecordingCheck) -> str:
-    if not recording.corrections:
-        return html.note('There are too few boxes to estimate corrections.')
-    rows = [(correction.cause, correction.name, f'{correction.value:+.2f} {correction.unit}',
-             f'{correction.deviation:.2f} {correction.unit}', f'{correction.effect_px:.1f}',
-             f'{correction.explained:.1%}', '' if not correction.is_significant else (
-                 'may be an effect of the strongest cause' if correction.follows
-                 else 'significant'))
-            for correction in recording.corrections]
-    return (html.note('The correction that fits the edges of the boxes best, estimated for each '
-                      'cause alone. A turned mount and a shifted principal point have nearly '
-                      'the same effect.')
-            + html.table(('cause', 'quantity', '#correction', '#deviation', '#effect [px]',
-                          '#explained cost', ''), rows))

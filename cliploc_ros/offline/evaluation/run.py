@@ -95,7 +95,7 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
             if found is None:
                 raise WorkersError(
                     f'workers died repeatedly at {part.method.name}, trial {part.trial}, queries '
-                    f'{part.places[0]}-{part.places[-1]}; run again with fewer --workers')
+                    f'{part.places[0]}-{part.places[-1]}; run again with fewer workers')
             results += found
             advance(found)
     order = {method.name: number for number, method in enumerate(methods)}

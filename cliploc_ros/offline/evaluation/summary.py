@@ -52,12 +52,7 @@ class Summary:
     confidence: NDArray[np.float64]  #: (t, q)
     search_ms: NDArray[np.float64]  #: (t, q)
     coverage: NDArray[np.float64]  #: (t, q)
-    #: (t, q)
-    best_iterations: NDArray[np.int64]
-    hypotheses: NDArray[np.int64]
-    boxes: NDArray[np.int64]  #: (q,)
-    #: (t, q): infinite if no pose was found; empty if not computed
-    nees: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    best_iterations: NDArray[np.int64]  #: (t, q)
     #: Mean share of a query's crops that were compared with labels
     crops_share: float = 1.0
     #: Number of refusals by kind, the most frequent first
@@ -185,7 +180,6 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
     return Summary(
         method, queries, column('error_m'), column('error_deg'), column('accepted'),
         column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
-        column('hypotheses'), column('boxes')[0], column('nees'),
         float(column('crops_share').mean()), dict(kinds.most_common()),
         is_given=results[0].source == GIVEN, **keyframes)
 
@@ -299,11 +293,11 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     lines += [f'{summary.method} refused: {_kinds(summary)}.'
               for summary in summaries if summary.refusals]
     lines += [f'{summary.method} compared {summary.crops_share:.0%} of the crops of a query with '
-              'labels on average; --crops all compares all crops.'
+              'labels on average.'
               for summary in summaries if 0.0 < summary.crops_share < 1.0]
     if any(summary.has_keyframes for summary in summaries):
         lines.append('Keyframes: number of poses from each source, median number of inlier '
-                     'points, mean time outside the search; --no-keyframes does without them.')
+                     'points, mean time outside the search.')
     if len(summaries) > 1:
         lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')
@@ -411,5 +405,5 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def as_json(results: Sequence[Result]) -> str:
     """Return JSON with one result on each line."""
-    lines = ',\n'.join(json.dumps(result.as_dict()) for result in results)
+    lines = ',\n'.join(json.dumps(vars(result)) for result in results)
     return f'[\n{lines}\n]\n'

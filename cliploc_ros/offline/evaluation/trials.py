@@ -4,7 +4,7 @@
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -77,10 +77,6 @@ class Result:
     keyframe_inliers: int = 0
     keyframes_ms: float = 0.0  #: Time of features, matching and the pose from them [ms]
     keyframe_search: str = 'none'  #: The last pass over keyframes: 'none', 'fast' or 'thorough'
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the fields, for JSON."""
-        return asdict(self)
 
 
 def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool = False
@@ -295,7 +291,7 @@ def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_
             found[query.number] = replace(query, observation=joined[row], neighbours=tuple(
                 joined[other] for other in sorted(near)))
     if not any(query.neighbours for query in found.values()):
-        raise OptionsError('--fuse: no query of this input has neighbouring frames in its group')
+        raise OptionsError('no query of this input has neighbouring frames in its group to fuse')
     return tuple(found[query.number] for query in queries)
 
 

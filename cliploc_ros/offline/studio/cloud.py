@@ -54,7 +54,7 @@ def find_cloud(recording: Recording | None, layer: KeyframeLayer | None, extent:
         recording.detections, recording.images)
     size = _DEPTH_SIZE if parts else _KEYFRAME_SIZE
     if not parts and layer is not None:
-        parts = [_points_of_keyframe(layer, row, recording, extent) for row in range(len(layer))]
+        parts = [_points_of_keyframe(layer, row, extent) for row in range(len(layer))]
     if not parts:
         return None
     points = np.concatenate([part[0] for part in parts]).astype(np.float32)
@@ -84,12 +84,10 @@ def _points_of_depth(detections: PosedDetections, images: Images
     return parts
 
 
-def _points_of_keyframe(layer: KeyframeLayer, keyframe: int, recording: Recording | None,
-                        extent: Bounds) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Return points with colours of the keyframe's or the recording's image, else by height."""
+def _points_of_keyframe(layer: KeyframeLayer, keyframe: int, extent: Bounds
+                        ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return points with the colours of the keyframe's image, without an image by height."""
     points, image = layer.points_in_map(keyframe), layer.image_rgb(keyframe)
-    if image is None and recording is not None:
-        image = recording.image_at(layer.map_from_camera[keyframe])
     if image is None:
         levels = np.linspace(extent.floor_m, extent.top_m, len(_HEIGHT_RGB))
         return points, np.column_stack([np.interp(points @ extent.up, levels, channel)

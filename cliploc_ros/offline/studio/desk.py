@@ -45,12 +45,10 @@ class Desk:
         The slow actions that are running.
     layers : dict of str to bool
         Whether each layer of the scene is visible, by name.
-    modes : dict of str to str
-        The mode of each user's page.
     """
 
     ACTIONS = ('show_layer', 'export')
-    LOOKS = ('fly', 'overview', 'from_above', 'look_through', 'look_at_robot', 'flatten')
+    LOOKS = ('fly', 'overview', 'from_above', 'look_through', 'look_at_robot')
 
     def __init__(self, studio: Studio, server: viser.ViserServer):
         self.studio, self.server = studio, server
@@ -58,7 +56,6 @@ class Desk:
         self.is_old = False
         self.running: dict[str, threading.Thread] = {}
         self.layers: dict[str, bool] = {}
-        self.modes: dict[str, str] = {}
         self._lock = threading.Lock()
 
     def stop(self) -> None:
@@ -74,21 +71,12 @@ class Desk:
         values = dict(message)
         name = str(values.pop('do', ''))
         if name in self.LOOKS:
-            self.look(self._client_of(person), name, values.get('is_flat') is True)
-        elif name == 'mode':
-            self.show_mode(person, str(values.get('mode')))
+            self.look(self._client_of(person), name)
         else:
             # show_view is no action of the user: pages send it after each selection
             self.act(lambda: self._start(name, values), name != 'show_view')
             if name in _BRING_ANOTHER and not values.get('joins'):
                 self.look(self._client_of(person), 'fly')
-
-    def show_mode(self, person: str, mode: str) -> None:
-        """Set the mode of a user's page; '' when the page is closed."""
-        with self._lock:
-            others = {key: other for key, other in self.modes.items() if key != person}
-            self.modes = {**others, person: mode} if mode else others
-        self.studio.changed.set()
 
     def _start(self, name: str, values: dict[str, Any]) -> str | None:
         """Run an action; slow actions run in a thread."""
@@ -177,12 +165,12 @@ class Desk:
         return extent_of([landmark.center for landmark in studio.document.landmarks.values()],
                          None if source is None else source.map_from_camera)
 
-    def look(self, client: viser.ClientHandle | None, name: str, is_flat: bool = False) -> None:
+    def look(self, client: viser.ClientHandle | None, name: str) -> None:
         """Move the camera of a user in a thread, because it takes a fraction of a second."""
         if client is not None:
-            threading.Thread(target=self._look, args=(client, name, is_flat), daemon=True).start()
+            threading.Thread(target=self._look, args=(client, name), daemon=True).start()
 
-    def _look(self, client: viser.ClientHandle, name: str, is_flat: bool) -> None:
+    def _look(self, client: viser.ClientHandle, name: str) -> None:
         studio = self.studio
         with studio.document.lock:
             extent, selected = self.extent(), studio.document.selected
@@ -196,8 +184,6 @@ class Desk:
             viewpoint.look_through(client, studio.map_from_camera, studio.camera)
         elif name == 'look_at_robot' and pose is not None:
             client.camera.look_at = pose.map_from_body[:3, 3]
-        elif name == 'flatten':
-            viewpoint.set_flat(client, is_flat)
 
     def _client_of(self, person: str) -> viser.ClientHandle | None:
         """Return the scene's client of a user, by the path of its connection."""

@@ -21,7 +21,6 @@ from cliploc_ros.offline.studio.landmark import (
     KNOWN_FIELDS,
     Landmark,
     Landmarks,
-    fields_of,
     map_of,
 )
 from cliploc_ros.offline.studio.map_file import (
@@ -127,7 +126,7 @@ class Document:
     @property
     def is_saved(self) -> bool:
         """Return whether the file contains all edits."""
-        return fields_of(self._saved) == fields_of(self.landmarks)
+        return self._saved == self.landmarks
 
     @property
     def to_undo(self) -> str | None:

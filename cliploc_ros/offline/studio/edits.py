@@ -79,11 +79,11 @@ def change_from_json(tree: Mapping[str, Any], landmarks: Landmarks) -> Change:
 
 def _change_of(what: str, landmarks: Landmarks, after: Mapping[str, Landmark | None]) -> Change:
     """Return the change to the landmarks `after`; raise for locked and invalid landmarks."""
-    changed = {key: landmark for key, landmark in after.items() if landmark != landmarks.get(key)}
+    changed = {key: landmark for key, landmark in after.items()
+               if landmark is not landmarks.get(key)}
     for landmark_id, landmark in changed.items():
         old = landmarks.get(landmark_id)
-        if old is not None and old.is_locked and (
-                landmark is None or landmark.fields != old.fields):
+        if old is not None and old.is_locked and landmark != old:
             raise EditError(f"landmark '{landmark_id}' is locked: unlock it first")
         if landmark is not None:
             map_of({landmark_id: landmark}, source=what)
@@ -113,8 +113,6 @@ def set_fields(landmarks: Landmarks, landmark_ids: Iterable[str], **fields: Any)
     replaces all weighted phrases, a class replaces all class weights.
     """
     ids = list(landmark_ids)
-    if unknown := fields.keys() - _FIELDS.keys():
-        raise EditError(f'{unknown} are not fields of a landmark')
     if (quat_xyzw := fields.get('orientation')) is not None:
         norm = float(np.linalg.norm(quat_xyzw))
         if not 1e-6 <= norm < np.inf:

@@ -52,14 +52,17 @@ def merge_looks(looks: Sequence[LandmarkEmbeddings | None], weights: Sequence[fl
 
 @dataclass(frozen=True)
 class Landmark:
-    """A landmark of the edited map. No file stores the marks."""
+    """A landmark of the edited map. It equals one of equal fields; no file stores the marks."""
 
     fields: Mapping[str, Any]  #: As in the map file, below the landmark's id
     #: From the file next to the map: the embeddings of this landmark alone
     look: LandmarkEmbeddings | None = field(default=None, compare=False)
-    is_locked: bool = False  #: Edits are refused
-    is_hidden: bool = False  #: The landmark is not shown in the scene and the views
-    decision: str = ''  #: Decision in the review: accepted, fixed; '' without a decision
+    #: Edits are refused
+    is_locked: bool = field(default=False, compare=False)
+    #: The landmark is not shown in the scene and the views
+    is_hidden: bool = field(default=False, compare=False)
+    #: Decision in the review: accepted, fixed; '' without a decision
+    decision: str = field(default='', compare=False)
 
     @cached_property
     def details(self) -> LandmarkDetails:
@@ -118,11 +121,6 @@ def map_of(landmarks: Landmarks, frame_id: Any = 'map', source: str = 'studio') 
     known = {landmark_id: {name: value for name, value in landmark.fields.items()
                            if name in KNOWN_FIELDS} for landmark_id, landmark in landmarks.items()}
     return LandmarkMap.from_mapping({'frame_id': frame_id, 'landmarks': known}, source)
-
-
-def fields_of(landmarks: Landmarks) -> dict[str, Mapping[str, Any]]:
-    """Return the fields of landmarks. A map is edited if they differ; marks do not matter."""
-    return {key: landmark.fields for key, landmark in landmarks.items()}
 
 
 def rounded(values: Iterable[float]) -> list[float]:

@@ -186,16 +186,12 @@ def fit_boxes(cameras: Sequence[Camera], map_from_camera: NDArray[np.float64],
 
     The boxes (n, 4) lie in undistorted images [px] of n cameras with poses (n, 4, 4).
 
-    EditError: there are fewer than two boxes, a box is too small, or the rays do not meet in front
-    of the cameras.
+    EditError: there are fewer than two boxes, or the rays do not meet in front of the cameras.
     """
     count = len(bboxes_xyxy)
     if count < 2:
         raise EditError(f'create: boxes drawn: {count}; draw a box in at least two images, '
                         'preferably three')
-    if small := [box.tolist() for box in bboxes_xyxy if (box[2:] - box[:2]).min() < MIN_BOX_PX]:
-        raise EditError(f'create: the box {small[0]} is smaller than {MIN_BOX_PX:g} pixels; draw '
-                        'it around the whole object')
     views = make_views(PosedDetections(
         cameras=tuple(cameras), map_from_camera=map_from_camera,
         stamps_s=np.arange(count, dtype=np.float64), frame_offsets=np.arange(count + 1),

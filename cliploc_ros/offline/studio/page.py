@@ -58,7 +58,7 @@ class Page:
 
     def __init__(self, studio: Studio, server: viser.ViserServer):
         self._studio, self._server = studio, server
-        self.desk, self.board = Desk(studio, server), Board()
+        self.desk, self.board = Desk(studio, server), Board(studio.changed.set)
         self._stopped = threading.Event()
         self._drag = 0
         self._clicked: tuple[object, float] = None, 0.0
@@ -70,13 +70,13 @@ class Page:
         self._all = Ellipsoids(scene, '/landmarks', self._click, 0.2, has_outlines=True)
         self._selected = Ellipsoids(scene, '/selection', self._click, 0.6, _AROUND)
         self._missing = Ellipsoids(scene, '/live/missing', self._click, 0.5, _MISSING_SCALE)
-        self._labels = Labels(server, extent.up)
+        self._labels = Labels(scene, extent.up)
         self._gizmo = Gizmo(scene, self._drag_gizmo)
         camera = server.initial_camera
         camera.fov, camera.up = viewpoint.FOV_RAD, tuple(extent.up)
         camera.look_at = tuple(extent.middle)
         camera.position = tuple(viewpoint.overview(extent, viewpoint.USUAL_ASPECT))
-        self.desk.layers = {'Labels': True} | {
+        self.desk.layers = {
             name: is_shown for name, what, is_shown in (
                 ('Cameras', studio.recording, True), ('Keyframes', studio.layer, False),
                 ('Walls', studio.walls, True)) if what is not None}
@@ -155,7 +155,7 @@ class Page:
         # also the selected landmarks: both clicks of a double click must have the same index
         self._all.show(shown, studio.color_of)
         self._selected.show(chosen, lambda class_id: _SELECTED_RGB)
-        self._labels.show(shown if is_on('Labels') else {}, list(chosen))
+        self._labels.show(chosen)
         selected = None if document.selected is None else document.selected[1]
         self._gizmo.show(None if selected is None or selected.is_locked else selected)
         recording = None if studio.recording is None else studio.recording.detections
@@ -171,7 +171,7 @@ class Page:
             is_here = state.pose is not None and state.pose.frame_id == document.frame_id
             show('Robot', state if is_here else None, draw_robot)
         # before the image of the scene, which takes time
-        self.board.show(parts_of(self.desk))
+        self.board.show({**parts_of(self.desk), 'people': self.board.people})
         if recording is not None:
             show('Image', studio.view, self._draw_image)
 
@@ -208,13 +208,9 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
         return pages[0].picture(path) if pages else None
 
     async def talk(connection: Any, person: str) -> None:
-        if not pages:
-            return
-        desk = pages[0].desk
-        try:
+        if pages:
+            desk = pages[0].desk
             await pages[0].board.serve(connection, lambda message: desk.do(person, message))
-        finally:
-            desk.show_mode(person, '')
 
     with gate.guard(answer, talk), redirect_stdout(io.StringIO()):  # viser prints another URL
         server = viser.ViserServer(host, port, verbose=False)

@@ -30,7 +30,6 @@ def parts_of(desk: Desk) -> dict[str, Any]:
             'name': document.path.name, 'frame': document.frame_id, 'is_saved': document.is_saved,
             'notes': document.notes, 'undo': document.to_undo, 'redo': document.to_redo,
             'conflict': document.has_conflict, 'views': studio.views,
-            'step': 1 if studio.recording is None else studio.recording.film_step,
             'has_boxes': review.has_boxes, 'images': studio.recording is not None
             and studio.recording.images is not None,
             'classes': sorted({landmark.class_id for landmark in document.landmarks.values()})},
@@ -41,7 +40,6 @@ def parts_of(desk: Desk) -> dict[str, Any]:
         'selection': {'ids': document.selection, 'one': _selected_part(studio)},
         'review': {**review.counts(), 'running': list(desk.running)},
         'log': {'lines': desk.lines, 'is_old': desk.is_old},
-        'people': len(desk.modes),
         'layers': desk.layers,
         'test': {
             'share': round(studio.share, 2), 'running': list(desk.running),

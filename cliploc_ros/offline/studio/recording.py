@@ -52,10 +52,6 @@ from cliploc_ros.offline.studio.landmark import Landmarks, map_of
 LEAST_BOXES = 3
 # Margin of a crop around a box, as a share of its size.
 _MARGIN = 0.25
-# Time between the pictures of the film [s].
-_PICTURE_S = 0.2
-# Tolerance of the entries of two pose matrices of the same image, which differ by rounding.
-_SAME_POSE = 1e-3
 
 
 class Outline(NamedTuple):
@@ -77,14 +73,6 @@ class Recording:
     def views(self) -> Views:
         """The arrays for the kernels of mapping."""
         return make_views(self.detections)
-
-    @cached_property
-    def film_step(self) -> int:
-        """Return the number of views between two pictures of the film."""
-        gaps_s = np.diff(np.unique(self.detections.stamps_s))
-        if not len(gaps_s):
-            return 1
-        return max(1, round(_PICTURE_S / max(float(np.median(gaps_s)), 1e-3)))
 
     def witness(self, landmark_map: LandmarkMap) -> Witness:
         """Return the evidence of the boxes about a map."""
@@ -136,12 +124,6 @@ class Recording:
         if self.images is None or not 0 <= view < len(self.detections):
             return None
         return self.images.of(self.detections, view)
-
-    def image_at(self, map_from_camera: NDArray[np.float64]) -> NDArray[np.uint8] | None:
-        """Return the image of the view with a pose (4, 4); None without an image."""
-        poses = self.detections.map_from_camera
-        views = np.nonzero(np.abs(poses - map_from_camera).max(axis=(1, 2)) < _SAME_POSE)[0]
-        return self.image(int(views[0])) if len(views) else None
 
     def crop(self, view: int, box: NDArray[np.float64]) -> NDArray[np.uint8] | None:
         """Return the crop of a box (4,) [px] with a margin.

@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The 3D scene: landmarks as ellipsoids with labels, the gizmo, and the selected image."""
 
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,15 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.offline.studio.landmark import Landmark, Landmarks, fields_of
+from cliploc_ros.offline.studio.landmark import Landmark, Landmarks
 from cliploc_ros.offline.studio.layers import SPHERE, linear
-from cliploc_ros.offline.studio.viewpoint import Bounds, pixels_of, wxyz_of
+from cliploc_ros.offline.studio.viewpoint import Bounds, wxyz_of
 
-# Greatest number of labels: more hide the map.
-_MAX_LABELS = 60
-_MAX_LABEL_LENGTH, _SHORT_LABEL_LENGTH = 60, 24
-# Width of a letter, and height of a line with its margins, in a label of scale 1 [px].
-_LETTER_PX, _LINE_PX = 6.5, 28.0
+_MAX_LABEL_LENGTH = 60
 # Distance of the image of the selected view from its camera [m].
 _IMAGE_DEPTH_M = 0.1
 _RING_POINTS = 40
@@ -57,7 +52,7 @@ class Ellipsoids:
 
     def show(self, landmarks: Landmarks, rgb_of: Callable[[str], tuple[int, int, int]]) -> None:
         """Show the given landmarks in the colours of their classes."""
-        if list(fields_of(landmarks).items()) == list(fields_of(self._shown).items()):
+        if list(landmarks.items()) == list(self._shown.items()):
             return
         before, self._shown = self._shown, landmarks
         shown = list(landmarks.values())
@@ -95,89 +90,24 @@ class Ellipsoids:
 
 
 class Labels:
-    """Ids of the landmarks in the scene. Of overlapping ids, only the nearest is shown.
+    """Ids and labels of the selected landmarks, above them in the scene."""
 
-    Selected landmarks also show their labels, which may be equal and long. The layout fits the
-    window of the browser whose camera moved last.
-    """
+    def __init__(self, scene: viser.SceneApi, up: NDArray[np.float64]):
+        self._scene, self._up = scene, up
+        self._handles: list[Any] = []
 
-    def __init__(self, server: viser.ViserServer, up: NDArray[np.float64]):
-        self._server, self._up = server, up
-        self._handles: dict[str, Any] = {}
-        self._count = 0
-        self._shown: tuple[Landmarks, Sequence[str]] = {}, ()
-        self._camera: Any = None
-        self._lock, self._is_stale = threading.Lock(), False
-
-        @server.on_client_connect
-        def _(client: viser.ClientHandle) -> None:
-            client.camera.on_update(self._moved)
-            self._moved(client.camera)
-
-    def show(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
-        """Show the labels of the given landmarks, with priority for the selection."""
-        self._shown = landmarks, selection
-        self._lay_out()
-
-    def _moved(self, camera: Any) -> None:
-        self._camera = camera
-        self._lay_out()
-
-    def _lay_out(self) -> None:
-        """Lay out the labels. A call during another call makes that call repeat the layout."""
-        self._is_stale = True
-        while self._is_stale and self._lock.acquire(blocking=False):
-            try:
-                self._is_stale = False
-                if self._camera is not None:
-                    with self._server.atomic():
-                        self._set(*self._shown)
-            finally:
-                self._lock.release()
-
-    def _with_room(self, tops: NDArray[np.float64], texts: Sequence[str],
-                   is_selected: NDArray[np.bool_]) -> Iterator[tuple[int, float]]:
-        """Yield the rows of the labels that do not overlap, and their sizes."""
-        camera = self._camera
-        pixels, depths = pixels_of(camera, tops)
-        orbit_m = float(np.linalg.norm(camera.look_at - camera.position))
-        with np.errstate(invalid='ignore'):
-            is_inside = (depths > 0.05) & (pixels > 0.0).all(axis=1) & (
-                pixels < (camera.image_width, camera.image_height)).all(axis=1)
-        order = np.lexsort([depths, ~is_selected])
-        taken: list[tuple[float, float, float, float]] = []
-        for row in order[is_inside[order]].tolist():
-            scale = round(min(max(orbit_m / float(depths[row]), 0.8), 1.1), 1)
-            half = 0.5 * scale * _LETTER_PX * (len(texts[row]) + 2)
-            x, bottom = pixels[row].tolist()
-            left, top, right = x - half, bottom - scale * _LINE_PX, x + half
-            if not any(left < other[2] and right > other[0] and top < other[3]
-                       and bottom > other[1] for other in taken):
-                taken.append((left, top, right, bottom))
-                yield row, scale
-            if len(taken) >= _MAX_LABELS:
-                return
-
-    def _set(self, landmarks: Landmarks, selection: Sequence[str]) -> None:
-        tops = np.array([
-            landmark.center + float(np.linalg.norm(landmark.basis.T @ self._up)) * self._up
-            for landmark in landmarks.values()]).reshape(-1, 3)
-        keys, texts = list(landmarks), [
-            _shortened(f'{key}: {landmark.label}', _MAX_LABEL_LENGTH) if key in selection
-            else _shortened(key, _SHORT_LABEL_LENGTH) for key, landmark in landmarks.items()]
-        rows = dict(self._with_room(tops, texts, np.isin(keys, selection)) if keys else ())
-        for key in self._handles.keys() - landmarks.keys():
-            self._handles.pop(key).remove()
-        for key in self._handles.keys() - {keys[row] for row in rows}:
-            _set_props(self._handles[key], visible=False)
-        for row, scale in rows.items():
-            if keys[row] not in self._handles:
-                # nodes are numbered, because ids may contain characters that names must not
-                self._handles[keys[row]] = self._server.scene.add_label(
-                    f'/labels/{self._count}', texts[row], anchor='bottom-center')
-                self._count += 1
-            _set_props(self._handles[keys[row]], position=tops[row], text=texts[row],
-                       font_screen_scale=scale, visible=True)
+    def show(self, landmarks: Landmarks) -> None:
+        """Show the labels of the given landmarks."""
+        while len(self._handles) < len(landmarks):
+            # nodes are numbered, because ids may contain characters that names must not
+            self._handles.append(self._scene.add_label(
+                f'/labels/{len(self._handles)}', '', anchor='bottom-center', visible=False))
+        for handle in self._handles[len(landmarks):]:
+            _set_props(handle, visible=False)
+        for handle, (key, one) in zip(self._handles, landmarks.items(), strict=False):
+            top = one.center + float(np.linalg.norm(one.basis.T @ self._up)) * self._up
+            _set_props(handle, position=top, text=f'{key}: {one.label}'[:_MAX_LABEL_LENGTH],
+                       visible=True)
 
 
 def _set_props(handle: Any, **props: Any) -> None:
@@ -185,10 +115,6 @@ def _set_props(handle: Any, **props: Any) -> None:
     for name, value in props.items():
         if not np.array_equal(getattr(handle, name), value):
             setattr(handle, name, value)
-
-
-def _shortened(text: str, length: int) -> str:
-    return text if len(text) <= length else f'{text[:length - 1]}…'
 
 
 class Gizmo:

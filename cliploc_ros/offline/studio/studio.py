@@ -25,7 +25,7 @@ from cliploc_ros.offline.mapping.sightings import Sighting
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.landmark import Landmark, Landmarks, fields_of
+from cliploc_ros.offline.studio.landmark import Landmark, Landmarks
 from cliploc_ros.offline.studio.new_landmark import NewLandmark
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.review import ReviewQueue
@@ -327,8 +327,7 @@ class Studio:
     @property
     def is_stale(self) -> bool:
         """Return whether the map was edited since the last check."""
-        return bool(self.check_page) and fields_of(self._checked) != fields_of(
-            self.document.landmarks)
+        return bool(self.check_page) and self._checked != self.document.landmarks
 
     def relocalize_robot(self) -> str:
         """Request a relocalization from the running relocalizer."""

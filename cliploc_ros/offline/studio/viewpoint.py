@@ -16,11 +16,8 @@ from cliploc_ros.offline.mapping.tilt import find_tilt, rotation_to_z
 
 #: The vertical angle of view [rad].
 FOV_RAD = 0.9
-# Angle of view that is almost orthographic from afar; viser has no orthographic camera [rad].
-_FLAT_RAD = 0.08
-# Near plane of the flat view as a share of the distance, and of other views [m]. The depth buffer
-# is not precise enough for both near and far objects.
-_FLAT_NEAR, _NEAR_M = 0.3, 0.01
+# Near plane [m].
+_NEAR_M = 0.01
 # If the vertical by hand-held cameras is within this angle of z, z is used [deg].
 _SAME_UP_DEG = 20.0
 # Share of landmarks and cameras within the extent.
@@ -112,47 +109,22 @@ def fly(client: Any, position: NDArray[np.float64], look_at: NDArray[np.float64]
         up: NDArray[np.float64]) -> None:
     """Move the camera of a browser to a position (3,), looking at a point (3,).
 
-    From then on it orbits that point. In a flat view, the camera is further away, so that it
-    shows the same section.
+    From then on it orbits that point.
     """
     camera = client.camera
-    is_flat = camera.fov < 2.0 * _FLAT_RAD
-    start, pivot = _unflattened(camera.position, camera.look_at, camera.fov), camera.look_at
+    start, pivot = camera.position, camera.look_at
     camera.up_direction = up
     flight = _FLIGHTS[client] = object()
     for share in np.linspace(0.0, 1.0, _FLIGHT_STEPS + 1)[1:]:
         share = share * share * (3.0 - 2.0 * share)
         if _FLIGHTS.get(client) is not flight:
             return
-        at = pivot + share * (look_at - pivot)
-        _put(client, start + share * (position - start), at, is_flat)
+        with client.atomic():
+            camera.position = start + share * (position - start)
+            camera.look_at = pivot + share * (look_at - pivot)
+            camera.fov, camera.near = FOV_RAD, _NEAR_M
+            camera.far = max(1000.0, 3.0 * float(np.linalg.norm(position - look_at)))
         time.sleep(_STEP_S)
-
-
-def set_flat(client: Any, is_flat: bool) -> None:
-    """Let a browser show the map without perspective, or with it, as large as before."""
-    camera = client.camera
-    _put(client, _unflattened(camera.position, camera.look_at, camera.fov), camera.look_at,
-         is_flat)
-
-
-def _put(client: Any, position: NDArray[np.float64], look_at: NDArray[np.float64],
-         is_flat: bool) -> None:
-    camera, fov = client.camera, _FLAT_RAD if is_flat else FOV_RAD
-    away = (position - look_at) * np.tan(FOV_RAD / 2.0) / np.tan(fov / 2.0)
-    with client.atomic():
-        camera.position = look_at + away
-        camera.look_at = look_at
-        camera.fov = fov
-        distance = float(np.linalg.norm(away))
-        camera.near = _FLAT_NEAR * distance if is_flat else _NEAR_M
-        camera.far = max(1000.0, 3.0 * distance)
-
-
-def _unflattened(position: NDArray[np.float64], look_at: NDArray[np.float64], fov: float
-                 ) -> NDArray[np.float64]:
-    """Return the position (3,) that shows the same section with FOV_RAD."""
-    return np.asarray(look_at + (position - look_at) * np.tan(fov / 2.0) / np.tan(FOV_RAD / 2.0))
 
 
 def look_through(client: Any, pose: NDArray[np.float64], intrinsics: Camera) -> None:
@@ -169,17 +141,6 @@ def look_through(client: Any, pose: NDArray[np.float64], intrinsics: Camera) -> 
         half = max(intrinsics.height / intrinsics.fy,
                    intrinsics.width / intrinsics.fx / max(camera.aspect, 0.1)) / 2.0
         camera.fov = 2.0 * float(np.arctan(1.1 * half))
-
-
-def pixels_of(camera: Any, points: Sequence[NDArray[np.float64]] | NDArray[np.float64]
-              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the pixels (n, 2) of points (n, 3) in a browser, and their depths (n,)."""
-    rotation = Rotation.from_quat(np.roll(camera.wxyz, -1)).as_matrix()
-    seen = (np.reshape(points, (-1, 3)) - camera.position) @ rotation
-    focal = camera.image_height / 2.0 / np.tan(camera.fov / 2.0)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        return seen[:, :2] / seen[:, 2:] * focal + (
-            camera.image_width / 2.0, camera.image_height / 2.0), seen[:, 2]
 
 
 def wxyz_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -48,12 +48,21 @@ class Content(NamedTuple):
 
 
 class Board:
-    """The content of all open pages: parts by name, as JSON. Only changed parts are sent."""
+    """The content of all open pages: parts by name, as JSON. Only changed parts are sent.
 
-    def __init__(self) -> None:
+    ``on_change`` is called when a page is opened or closed.
+    """
+
+    def __init__(self, on_change: Callable[[], None]) -> None:
+        self._on_change = on_change
         self._parts: dict[str, str] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
         self._pages: set[asyncio.Event] = set()
+
+    @property
+    def people(self) -> int:
+        """The number of open pages."""
+        return len(self._pages)
 
     def show(self, parts: dict[str, Any]) -> None:
         """Show the given parts; may be called in any thread."""
@@ -73,6 +82,7 @@ class Board:
         self._loop, event, sent = asyncio.get_running_loop(), asyncio.Event(), dict[str, str]()
         self._pages.add(event)
         event.set()
+        self._on_change()
 
         async def send() -> None:
             while True:
@@ -95,6 +105,7 @@ class Board:
         finally:
             self._pages.discard(event)
             sender.cancel()
+            self._on_change()
 
 
 def once(url: str) -> str:

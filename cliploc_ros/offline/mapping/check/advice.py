@@ -40,7 +40,7 @@ _SIGHT_M = 2.0 * RADIUS_M
 def give_advice(report: CheckReport) -> list[Advice]:
     """Return pieces of advice, each of one or two sentences."""
     recorded = report.recording.trials if report.recording else ()
-    misled = [trial for trial in (*recorded, *report.queries, *report.grid.trials)
+    misled = [trial for trial in (*recorded, *report.grid.trials)
               if trial.verdict == 'misled']
     advice = [] if report.scale is None else [Advice(
         f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '

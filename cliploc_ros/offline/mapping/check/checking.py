@@ -30,11 +30,9 @@ from cliploc_ros.offline.mapping.check.relocalization import (
     make_folds,
     measure_detector,
     sample_frames,
-    try_queries,
     try_recording,
 )
 from cliploc_ros.offline.mapping.check.report import (
-    BlockQuality,
     CheckReport,
     GridCheck,
     RecordingCheck,
@@ -48,12 +46,11 @@ from cliploc_ros.offline.mapping.sizes import scale_by_sizes
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
-from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.simulation import DetectorModel, guess_detector
 
 _NOTES = (
-    'similarities of crops and labels are simulated, except for queries: labels of equal text '
-    'look equal, and labels that share words look alike',
+    'similarities of crops and labels are simulated: labels of equal text look equal, and labels '
+    'that share words look alike',
     'the grid assumes that the map is correct and that walls hide only landmarks that were hidden '
     'in the recording')
 _NO_RECORDING = (
@@ -64,18 +61,15 @@ _HEIGHT_MARGIN_M = 0.3
 
 
 def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
-              queries: Sequence[PosedQuery] = (), options: CheckOptions | None = None,
-              thresholds: Thresholds | None = None, progress: Progress | None = None,
-              layer: KeyframeLayer | None = None, image_of: ImageOf | None = None
-              ) -> CheckReport:
+              options: CheckOptions | None = None, thresholds: Thresholds | None = None,
+              progress: Progress | None = None, layer: KeyframeLayer | None = None,
+              image_of: ImageOf | None = None) -> CheckReport:
     """Check a map.
 
     Parameters
     ----------
     detections : PosedDetections, optional
         A recording of the place. Without one, the report is shorter.
-    queries : sequence of PosedQuery
-        Observations with recorded similarities to the map's labels.
     thresholds : Thresholds, optional
         The thresholds that the map has to reach.
     layer : KeyframeLayer, optional
@@ -124,8 +118,6 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         landmarks=tuple(check_landmarks(landmark_map, witness, overlaps)),
         overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map)),
         grid=grid, recording=recording,
-        queries=tuple(_told(try_queries(landmark_map, queries, options), len(queries),
-                            partial(tell, 'relocalizing queries'))),
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
         keyframes=None if layer is None else check_keyframes(layer, grid, recorded),
         scale=scale_by_sizes(landmark_map))
@@ -163,14 +155,13 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
                      witness: Witness, models: Sequence[DetectorModel], options: CheckOptions,
                      tell: Progress, keyframes: RecordedKeyframes | None) -> RecordingCheck:
     tell('cross-validating', 0.0)
-    folds, blocks, held_out = [], [], []
+    folds, held_out = [], []
     for fold in make_folds(views, witness, options):
         # a box whose landmark no other part of the recording shows does not test the map
         is_known = (witness.shown < 0) | np.isin(witness.shown, fold.rows)
         ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames) & is_known]
         folds.append(fold)
         held_out.append(ious)
-        blocks.append(BlockQuality(len(fold.frames), len(fold.rows), BoxQuality.of(ious)))
         tell('cross-validating', len(folds) / options.folds)
     trials = try_recording(landmark_map, detections, witness.shown, folds, options,
                            partial(tell, 'relocalizing recorded frames'), keyframes)
@@ -185,7 +176,7 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         duration_s=float(detections.stamps_s[-1] - detections.stamps_s[0]),
         path_xyz=detections.map_from_camera[:, :3, 3],
         as_given=explained_boxes(views, witness.landmarks),
-        held_out=BoxQuality.of(np.concatenate(held_out)), folds=tuple(blocks),
+        held_out=BoxQuality.of(np.concatenate(held_out)),
         trials=tuple(trials), simulated=tuple(simulated),
         corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
         edge_scale=models[0].edge_scale)

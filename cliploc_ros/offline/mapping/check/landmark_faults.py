@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each landmark of a map: how well a recording supports it, and its faults."""
 
-import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -29,8 +27,6 @@ from cliploc_ros.offline.mapping.sizes import size_of_class
 from cliploc_ros.offline.mapping.views import Views
 from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
-# Greatest number of words of a class name that is looked for in labels.
-_MOST_WORDS = 3
 # A thinner landmark was seen from one side, or is a sheet: boxes hardly constrain its position.
 _MIN_THINNESS = 0.05
 # A landmark is missing if this number of frames should show it and none does.
@@ -132,7 +128,6 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
     supports = [detail.support for detail in landmark_map.details]
     misspelt = (misspelt_classes(classes, shipped_classes()) if witness is None
                 else misspelt_classes(classes, witness.class_names, all_known=True))
-    by_words = {tuple(_words(name)): name for name in sorted(set(classes), reverse=True)}
     weights = np.array(supports if all(supports) else [], dtype=np.float64)
     checks = []
     for row, others in enumerate(partners):
@@ -165,9 +160,6 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         if check.thinness < _MIN_THINNESS:
             faults.append((0.3, f'is a sheet: its axes have the ratio {check.thinness:.3f}; '
                                 'record it from another side, or give it thickness'))
-        if other := _class_of_label(check.label, check.class_id, by_words):
-            faults.append((0.6, f"is labelled '{check.label:.60}', which names a {other}, but "
-                                f'its class is {check.class_id}: correct the wrong one'))
         faults.sort(key=lambda fault: -fault[0])
         checks.append(replace(
             check, faults=tuple(text for _, text in faults),
@@ -175,29 +167,6 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
             weight=float(weights[row]) if len(weights) else 1.0))
     return sorted(checks, key=lambda check: (
         -check.severity, 1.0 if check.seen_ratio is None else check.seen_ratio))
-
-
-def _words(text: str) -> list[str]:
-    return re.findall(r'\w+', text.casefold())
-
-
-def _class_of_label(label: str, class_id: str, by_words: Mapping[tuple[str, ...], str]
-                    ) -> str | None:
-    """Return a class that a label names, in singular or plural, unless it also names its own.
-
-    `by_words` maps the words of a class name to the class.
-    """
-    if any(word in label.casefold() for word in _words(class_id)):
-        return None
-    words = _words(label)
-    for start in range(len(words)):
-        for end in range(start + 1, min(start + _MOST_WORDS, len(words)) + 1):
-            *first, last = words[start:end]
-            for ending in ('', 's', 'es'):
-                if last.endswith(ending) and (
-                        other := by_words.get((*first, last.removesuffix(ending)))):
-                    return other
-    return None
 
 
 def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> dict[str, Any]:

@@ -267,17 +267,6 @@ def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np
             int((shown >= 0).sum()), options), stamp_s=None)
 
 
-def try_queries(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], options: CheckOptions
-                ) -> Iterator[Trial]:
-    """Relocalize queries with recorded similarities in the order of their stamps.
-
-    Yields the trials. One localizer gets all queries.
-    """
-    localizer = Localizer(make_relocalizer(landmark_map, options))
-    for query in sorted(queries, key=lambda query: query.observation.stamp_ns):
-        yield try_view(localizer, query, len(query.observation.detections), options)
-
-
 def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:
     """Return how many trials were accepted, refused and misled."""
     return {name: sum(trial.verdict == name for trial in trials)

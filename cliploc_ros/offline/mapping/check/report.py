@@ -59,15 +59,6 @@ class Measure(NamedTuple):
 
 
 @dataclass(frozen=True)
-class BlockQuality:
-    """The boxes of one fold, judged with landmarks fitted to the other folds."""
-
-    frames: int
-    landmarks: int  #: Landmarks that the other folds suffice to fit
-    boxes: BoxQuality
-
-
-@dataclass(frozen=True)
 class RecordingCheck:
     """The check of a map against a recording."""
 
@@ -78,7 +69,6 @@ class RecordingCheck:
     #: With the map as it is. A map built from this recording was fitted to these boxes.
     as_given: BoxQuality
     held_out: BoxQuality  #: Cross-validated over time
-    folds: tuple[BlockQuality, ...]
     trials: tuple[Trial, ...]  #: Recorded frames in cross-validated maps, in the order of time
     #: The same poses in the map as it is, with simulated boxes. As many should be accepted as with
     #: recorded boxes: otherwise the grid is too optimistic or too pessimistic.
@@ -162,8 +152,6 @@ class CheckReport:
     look_alikes: tuple[LookAlike, ...]
     grid: GridCheck
     recording: RecordingCheck | None = None
-    #: Recorded queries with recorded similarities; empty without any
-    queries: tuple[Trial, ...] = ()
     measures: tuple[Measure, ...] = ()  #: The figures that determine the verdict
     to_do: tuple[Advice, ...] = ()  #: Advice, the most urgent first
     notes: tuple[str, ...] = ()  #: Assumptions behind the figures
@@ -265,7 +253,7 @@ def _tell_localized(what: str, by_objects: NDArray[np.bool_], by_any: NDArray[np
 
 def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
     """Return the figures of a report that have a threshold."""
-    views, recording = [*report.grid.trials, *report.queries], report.recording
+    views, recording = [*report.grid.trials], report.recording
     measures = [
         Measure('landmarks with a serious fault', report.faulty, limits.max_faulty, True),
         Measure('pairs of duplicates', report.duplicates, limits.max_duplicates, True, 'count'),

@@ -9,15 +9,15 @@ const SVG = 'http://www.w3.org/2000/svg';
 const MODES = ['review', 'edit', 'create', 'test'];
 // Greatest number of rows in the list. A search finds the other landmarks.
 const MOST_ROWS = 300;
-// Time between the pictures of the film. The server sends the number of views between two pictures.
-const PICTURE_MS = 200;
+// Time between the pictures of the film, and their greatest number.
+const PICTURE_MS = 200, MOST_PICTURES = 600;
 const STEPS_M = [0.01, 0.05, 0.1, 0.5];
 const person = Array.from(crypto.getRandomValues(new Uint8Array(12)),
                           byte => byte.toString(16).padStart(2, '0')).join('');
 const base = location.pathname.replace(/[^/]*$/, '');
 const state = {file: {}, rows: [], selection: {ids: [], one: null}, review: {}, log: {lines: []}, test: {}, layers: {},
                view: null, new: null};
-let mode = 'review', socket = null, followed = null, step = 0.1, gesture = 0, wantsCheck = true, follows = false, film = null, isFlat = false;
+let mode = 'review', socket = null, followed = null, step = 0.1, gesture = 0, wantsCheck = true, follows = false, film = null;
 // Visible part of the image [px]; null: the whole image. A goal is applied once its view is shown.
 let zoom = null, goal = null, shownView = -1, drag = null, typedNew = {};
 const shares = {review: 0.6, edit: 0.5, create: 0.72, test: 0.5};
@@ -32,7 +32,7 @@ function send(name, values = {}) {
 
 function connect() {
   socket = new WebSocket(`${location.origin.replace(/^http/, 'ws')}${base}socket/${person}`);
-  socket.onopen = () => { $('lost').hidden = true; send('mode', {mode}); };
+  socket.onopen = () => { $('lost').hidden = true; };
   socket.onmessage = event => {
     const parts = JSON.parse(event.data);
     for (const [name, value] of parts) state[name] = value;
@@ -141,7 +141,6 @@ function setMode(name) {
   fill($('modes'), MODES.map((one, place) => el('button', {
     'aria-pressed': String(one === name), onclick: () => setMode(one),
     title: `${one} (${place + 1})`}, capital(one))));
-  send('mode', {mode});
   if (mode === 'create') { send('select', {id: ''}); send('overview'); }
   if (state.file.name) show(new Set(Object.keys(state)));
 }
@@ -520,7 +519,6 @@ function showLayers() {
     buttons(button('Whole map', doing('overview'), {key: 'O'}),
             button('From above', doing('from_above'), {key: 'B'}),
             button('Selection', doing('fly'), {key: 'G'})),
-    box('Orthographic view', isFlat, is_flat => { isFlat = is_flat; send('flatten', {is_flat}); }),
     ...Object.keys(state.layers).map(layerBox),
     ...(state.file.views ? [box('Follow the view', follows, followView),
                             button(film ? 'Stop' : 'Play the recording', playOrStop)] : [])]);
@@ -536,7 +534,7 @@ function followView(isOn) {
 function playOrStop() {
   if (film) { clearInterval(film); film = null; } else {
     film = setInterval(() => {
-      if (state.view.view >= state.file.views - 1) playOrStop(); else stepView(state.file.step);
+      if (state.view.view >= state.file.views - 1) playOrStop(); else stepView(Math.max(1, Math.round(state.file.views / MOST_PICTURES)));
     }, PICTURE_MS);
   }
   showLayers();
