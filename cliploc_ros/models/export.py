@@ -64,6 +64,7 @@ def export_clip(options: ClipOptions, folder: Path, half: bool = False) -> None:
     of CLIP. ModelError: model or tag are unknown, the download failed, or the file does not hold
     the weights of the model. OptionsError: the options name ONNX files.
     """
+    os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')  # read on import
     import open_clip
     import torch
 
@@ -110,7 +111,7 @@ class _Weights(NamedTuple):
     file: Path
     quick_gelu: bool  #: Whether they were trained with OpenAI's approximate GELU
     #: ``image_mean``, ``image_std``, ``image_interpolation`` and ``image_resize_mode`` as
-    #: ``open_clip.create_model`` takes them; empty for its defaults
+    #: ``open_clip.create_model_and_transforms`` takes them; empty for its defaults
     preprocess: dict[str, Any]
 
 
@@ -181,7 +182,7 @@ def _load(weights: _Weights) -> Any:
 
     file = weights.file
     with _quiet_root_logger():
-        model = open_clip.create_model(
+        model, _, _ = open_clip.create_model_and_transforms(
             weights.model, load_weights=False, force_quick_gelu=weights.quick_gelu,
             force_custom_text=True, **weights.preprocess)
     try:
