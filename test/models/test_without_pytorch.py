@@ -17,7 +17,7 @@ from demo import ASSETS
 pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
-WAKE_UPS = 10
+WAKE_UPS = 8
 #: Prints the demo's poses (4, 4), null for a refusal.
 POSES = """
 import json, sys
