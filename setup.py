@@ -27,7 +27,7 @@ RUNTIME = [OPENCV, 'ftfy>=6,<7', 'huggingface_hub>=0.30,<4', 'openvino>=2025.0,<
 EXTRAS = {
     # Detector and CLIP as ONNX networks.
     'runtime': RUNTIME,
-    # The same in PyTorch: to export networks, to train, and for a GPU.
+    # With PyTorch: to export networks, and to train.
     'models': [
         *RUNTIME, 'onnx>=1.17,<2', 'open_clip_torch>=3.0,<4', 'safetensors>=0.4,<1',
         'torch>=2.4,<3', 'torchvision>=0.19,<1', 'ultralytics-opencv-headless>=8.4,<9',

@@ -65,6 +65,7 @@ def export_network(options: argparse.Namespace) -> int:
     make_folder(out.parent)
     # The imports take seconds.
     from cliploc_ros.cli.sources import clip_options, detector_options
+    from cliploc_ros.models.clip_weights import names_onnx
     from cliploc_ros.models.export import export_clip
     from cliploc_ros.models.exports import DETECTOR, run_export
     from cliploc_ros.models.yolo_weights import export_detector, resolve_published
@@ -73,6 +74,8 @@ def export_network(options: argparse.Namespace) -> int:
         found = Path(desk) / 'network'
         if is_clip:
             clip = clip_options(options)
+            if names_onnx(clip):
+                raise OptionsError(f'{clip.pretrained} has ONNX files already')
             run_export(f'CLIP {clip.model}', partial(export_clip, clip, half=options.half), found)
         else:
             detector = detector_options(options)

@@ -15,11 +15,12 @@ from cliploc_ros.core.map.landmark_details import WeightedLabels
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights, resolve_clip_weights
+from cliploc_ros.models.clip_weights import ClipWeights, resolve_clip_weights
 from cliploc_ros.models.images import check_image_rgb, crop_bounds
 from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
 from cliploc_ros.models.onnx_clip import OnnxTextTower, OnnxTower
 from cliploc_ros.models.onnx_network import free_memory
+from cliploc_ros.models.protocols import ClipOptions
 
 Label = str | WeightedLabels
 

@@ -4,42 +4,23 @@
 
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.exports import export_key, exported
+from cliploc_ros.models.exports import (
+    BESIDE,
+    CONFIG,
+    IMAGE_TOWERS,
+    TEXT_TOWERS,
+    WITHOUT_CLIP,
+    export_key,
+    exported,
+)
 from cliploc_ros.models.files import fingerprint_file
 from cliploc_ros.models.hub import find_network, is_hub_name, resolve_folder
 from cliploc_ros.models.onnx_network import read_config
-
-#: Remedy without CLIP, with the options of the nodes and of the programs.
-WITHOUT_CLIP = ", or do without CLIP ('matching: class', --no-clip)"
-#: The option for a file of weights, as named in messages.
-CHECKPOINT = 'clip_checkpoint_path (of programs: --clip-pretrained) to the file'
-#: The files of a published CLIP, first in the layout of transformers, then in that of open_clip.
-IMAGE_TOWERS = ('vision_model.onnx', 'onnx/vision_model.onnx', 'visual/model.onnx')
-TEXT_TOWERS = ('text_model.onnx', 'onnx/text_model.onnx', 'textual/model.onnx')
-CONFIG, PREPROCESSOR, PREPROCESS, TOKENIZER = (
-    'config.json', 'preprocessor_config.json', 'visual/preprocess_cfg.json', 'tokenizer.json')
-BESIDE = (CONFIG, PREPROCESSOR, PREPROCESS, TOKENIZER, f'textual/{TOKENIZER}')
-
-
-@dataclass(frozen=True)
-class ClipOptions:
-    """The CLIP to load."""
-
-    #: Architecture: a name of ``open_clip.list_models()``, or the path of an open_clip model
-    #: config (.json), which gets the name of the file
-    model: str = 'ViT-L-14'
-    #: A folder with ONNX files, or OWNER/NAME[@REVISION] of the hub; both need no model. Otherwise
-    #: a tag of ``open_clip.list_pretrained()``, or the path of a checkpoint, which PyTorch exports
-    #: to ONNX at its first use. A tag also determines activation and colour normalization; a
-    #: checkpoint has those of the architecture.
-    pretrained: str = 'openai'
-    #: Local file with the weights of the tag; '': download them
-    checkpoint_path: str = ''
-    #: Folder for downloads, label embeddings, exported and compiled networks; '': the user's cache
-    cache_dir: str = ''
+from cliploc_ros.models.protocols import ClipOptions
 
 
 @dataclass(frozen=True)
@@ -72,14 +53,10 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
             name, config = file.stem, fingerprint_file(file)
         tag = options.pretrained if options.checkpoint_path or not given.is_file() else ''
 
-        def export(desk: Path) -> None:
-            from cliploc_ros.models.export import export_clip
-
-            export_clip(options, desk)
-
+        from cliploc_ros.models.export import export_clip
         folder = exported(options.cache_dir, name, f'CLIP {name}', (
             'CLIP', name, config, tag, fingerprint_file(given) if given.is_file() else ''),
-            export, WITHOUT_CLIP)
+            partial(export_clip, options), WITHOUT_CLIP)
     image_tower = find_network(folder, named, IMAGE_TOWERS)
     text_tower = find_network(folder, '', TEXT_TOWERS)
     about = read_config(folder / CONFIG, 'it has the length of an embedding')

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
+from cliploc_ros.errors import ModelError, did_you_mean
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_weights import (
+from cliploc_ros.models.exports import (
     CHECKPOINT,
     CONFIG,
     IMAGE_TOWERS,
@@ -28,10 +28,9 @@ from cliploc_ros.models.clip_weights import (
     TEXT_TOWERS,
     TOKENIZER,
     WITHOUT_CLIP,
-    ClipOptions,
-    names_onnx,
+    ExportError,
+    describe_export,
 )
-from cliploc_ros.models.exports import ExportError, describe_export
 from cliploc_ros.models.files import (
     check_weights_file,
     damaged,
@@ -40,6 +39,7 @@ from cliploc_ros.models.files import (
     first_line,
 )
 from cliploc_ros.models.onnx_network import CompiledNetwork, import_openvino, read_config
+from cliploc_ros.models.protocols import ClipOptions
 
 if TYPE_CHECKING:
     import torch
@@ -62,8 +62,9 @@ def export_clip(options: ClipOptions, folder: Path, half: bool = False) -> None:
 
     ExportError: the results of a tower differ from those in PyTorch, or the tokenizer is not that
     of CLIP. ModelError: model or tag are unknown, the download failed, or the file does not hold
-    the weights of the model. OptionsError: the options name ONNX files.
+    the weights of the model.
     """
+    os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')  # read on import
     import open_clip
     import torch
 
@@ -110,7 +111,7 @@ class _Weights(NamedTuple):
     file: Path
     quick_gelu: bool  #: Whether they were trained with OpenAI's approximate GELU
     #: ``image_mean``, ``image_std``, ``image_interpolation`` and ``image_resize_mode`` as
-    #: ``open_clip.create_model`` takes them; empty for its defaults
+    #: ``open_clip.create_model_and_transforms`` takes them; empty for its defaults
     preprocess: dict[str, Any]
 
 
@@ -119,8 +120,6 @@ def _find(options: ClipOptions) -> _Weights:
     import open_clip
 
     name = options.pretrained
-    if names_onnx(options):
-        raise OptionsError(f'{options.checkpoint_path or name} has ONNX files already')
     # OpenAI's spelling is ViT-L/14.
     model = (_add_config(options.model) if options.model.endswith('.json')
              else options.model.replace('/', '-'))
@@ -181,7 +180,7 @@ def _load(weights: _Weights) -> Any:
 
     file = weights.file
     with _quiet_root_logger():
-        model = open_clip.create_model(
+        model, _, _ = open_clip.create_model_and_transforms(
             weights.model, load_weights=False, force_quick_gelu=weights.quick_gelu,
             force_custom_text=True, **weights.preprocess)
     try:

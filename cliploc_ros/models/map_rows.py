@@ -17,7 +17,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError
 from cliploc_ros.models.clip_encoder import LoadedEncoder, embed_labels, load_encoder
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.clip_weights import resolve_clip_weights
+from cliploc_ros.models.protocols import ClipOptions
 
 logger = logging.getLogger(__name__)
 

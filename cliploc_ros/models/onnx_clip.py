@@ -18,13 +18,8 @@ from PIL import Image
 
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import parse_json, read_file
-from cliploc_ros.models.clip_weights import (
-    CONFIG,
-    PREPROCESS,
-    PREPROCESSOR,
-    TOKENIZER,
-    ClipWeights,
-)
+from cliploc_ros.models.clip_weights import ClipWeights
+from cliploc_ros.models.exports import CONFIG, PREPROCESS, PREPROCESSOR, TOKENIZER
 from cliploc_ros.models.files import first_line
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
 

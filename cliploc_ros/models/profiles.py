@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:  # not at run time: nodes need the names of profiles before loading networks
-    from cliploc_ros.models.clip_weights import ClipOptions
-    from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
+    from cliploc_ros.models.protocols import ClipOptions, DetectorOptions, ObjectDetector
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,24 @@ class DetectorOptions:
                 raise OptionsError(f'{name} must be at least 1, not {getattr(self, name)}')
 
 
+@dataclass(frozen=True)
+class ClipOptions:
+    """The CLIP to load."""
+
+    #: Architecture: a name of ``open_clip.list_models()``, or the path of an open_clip model
+    #: config (.json), which gets the name of the file
+    model: str = 'ViT-L-14'
+    #: A folder with ONNX files, or OWNER/NAME[@REVISION] of the hub; both need no model. Otherwise
+    #: a tag of ``open_clip.list_pretrained()``, or the path of a checkpoint, which PyTorch exports
+    #: to ONNX at its first use. A tag also determines activation and colour normalization; a
+    #: checkpoint has those of the architecture.
+    pretrained: str = 'openai'
+    #: Local file with the weights of the tag; '': download them
+    checkpoint_path: str = ''
+    #: Folder for downloads, label embeddings, exported and compiled networks; '': the user's cache
+    cache_dir: str = ''
+
+
 class ImageTextEncoder(Protocol):
     """Embeds image crops and text labels in a common space, with cosine similarity."""
 

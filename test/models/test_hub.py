@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Networks by OWNER/NAME from a local model hub: downloaded once, completely, and used offline."""
+"""Downloads from a local model hub: made once, complete, and used offline.
+
+They run in separate processes: the libraries read addresses and proxies once, on import.
+"""
 
 import hashlib
 import http.server
@@ -13,6 +16,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from disks import small_disk
 
 pytestmark = pytest.mark.full
 
@@ -29,6 +33,28 @@ except ModelError as error:
     print(json.dumps({'error': str(error)}))
 else:
     print(json.dumps({'network': str(find_network(folder, sys.argv[2], networks))}))
+"""
+
+
+#: Weights that open_clip downloads; they hold none of its tensors.
+RESOLVE_CLIP = """
+import json, sys
+from cliploc_ros.errors import ModelError
+from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+try:
+    resolve_clip_weights(ClipOptions(sys.argv[2], 'openai', cache_dir=sys.argv[1]))
+except ModelError as error:
+    print(json.dumps({'error': str(error)}))
+"""
+LOAD_YOLO = """
+import json, sys
+from cliploc_ros.errors import ModelError
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions
+try:
+    load_detector(DetectorOptions(sys.argv[2], cache_dir=sys.argv[1]))
+except ModelError as error:
+    print(json.dumps({'error': str(error)}))
 """
 
 
@@ -55,9 +81,11 @@ class Hub(http.server.BaseHTTPRequestHandler):
                 'id': 'someone/net', 'sha': COMMIT,
                 'siblings': [{'rfilename': name} for name in self.files]}).encode(), {}
         else:
-            name = self.path.partition(f'/resolve/{COMMIT}/')[2]
+            name = self.path.partition('/resolve/')[2].partition('/')[2]
             if name not in self.files:
-                self.send_error(404)
+                self.send_response(404)
+                self.send_header('X-Error-Code', 'EntryNotFound')
+                self.end_headers()
                 return
             body = self.sent.get(name, self.files[name])
             extra = {'ETag': f'"{hashlib.sha256(self.files[name]).hexdigest()}"',
@@ -95,9 +123,10 @@ def hub(monkeypatch, tmp_path):
         server.shutdown()
 
 
-def resolve(cache: Path, name: str = 'someone/net', **environment: str) -> dict[str, str]:
+def resolve(cache: Path, name: str = 'someone/net', *within: str, script: str = RESOLVE,
+            **environment: str) -> dict[str, str]:
     done = subprocess.run(
-        [sys.executable, '-c', RESOLVE, str(cache), name], cwd=PROJECT, text=True,
+        [*within, sys.executable, '-c', script, str(cache), name], cwd=PROJECT, text=True,
         env={**os.environ, 'NO_PROXY': '127.0.0.1', **environment}, capture_output=True,
         timeout=300, check=False)
     assert done.returncode == 0, done.stderr
@@ -147,6 +176,31 @@ def test_a_repository_without_onnx(hub, tmp_path):
     assert 'has none of model.onnx, onnx/model.onnx' in resolve(tmp_path)['error']
 
 
+def test_weights_of_a_tag(hub, tmp_path):
+    """They are downloaded once, even if they are then refused."""
+    hub.files = {'open_clip_model.safetensors': safetensors(4 * 16)}
+    for _ in range(2):
+        text = resolve(tmp_path / 'cache', 'ViT-B-32', script=RESOLVE_CLIP)['error']
+        assert "does not hold the weights of CLIP model 'ViT-B-32'" in text
+        assert str(tmp_path / 'cache/weights') in text
+    gets = [line for line in hub.requests if line.startswith('GET') and '/resolve/' in line]
+    assert len(gets) == 1 and gets[0].endswith('open_clip_model.safetensors')
+
+
+def safetensors(size: int) -> bytes:
+    """Return a file with a tensor of a size in bytes."""
+    header = json.dumps({'visual.proj': {'dtype': 'F32', 'shape': [size // 4],
+                                         'data_offsets': [0, size]}}).encode()
+    return len(header).to_bytes(8, 'little') + header + bytes(size)
+
+
+def test_networks_that_do_not_fit_on_the_disk(hub, tmp_path):
+    disk = tmp_path / 'disk'
+    disk.mkdir()
+    text = resolve(disk, 'someone/net', *small_disk(disk))['error']
+    assert f'{disk}/weights is full' in text and 'on another machine' in text
+
+
 def test_without_a_network_the_message_names_files_and_remedy(tmp_path):
     with socket.socket() as free:
         free.bind(('127.0.0.1', 0))
@@ -157,3 +211,7 @@ def test_without_a_network_the_message_names_files_and_remedy(tmp_path):
         assert 'model.onnx, config.json from https://huggingface.co/someone/net' in text
     text = resolve(tmp_path, 'not/a/name')['error']
     assert 'does not exist' in text
+    text = resolve(tmp_path, 'yolov8n', script=LOAD_YOLO,
+                   HTTPS_PROXY=f'http://127.0.0.1:{port}')['error']
+    assert 'yolov8n.pt' in text and 'on another machine' in text
+    assert not any(file.name.startswith('yolo') for file in (tmp_path / 'weights').iterdir())

@@ -16,8 +16,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
-from cliploc_ros.errors import ModelError, OptionsError
-from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
+from cliploc_ros.errors import ModelError
+from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, names_onnx, resolve_clip_weights
 from cliploc_ros.models.exports import describe_export
 from cliploc_ros.models.onnx_clip import OnnxTextTower
@@ -90,10 +90,9 @@ def cache(tmp_path_factory) -> str:
     return str(tmp_path_factory.mktemp('cache'))
 
 
-def load(folder: Path, cache: str, **changes) -> tuple[ClipEncoder, ClipOptions]:
-    options = ClipOptions(pretrained=str(folder), device='cpu', cache_dir=cache,
-                          **{'precision': 'fp32', **changes})
-    return ClipEncoder(resolve_clip_weights(options), options), options
+def load(folder: Path, cache: str) -> ClipEncoder:
+    options = ClipOptions(pretrained=str(folder), cache_dir=cache)
+    return ClipEncoder(resolve_clip_weights(options), options)
 
 
 def unit(rows):
@@ -102,24 +101,21 @@ def unit(rows):
 
 @pytest.mark.parametrize('layout', ['published', 'exported'])
 def test_both_layouts_give_the_embeddings_of_their_towers(layout, cache, request):
-    encoder, options = load(request.getfixturevalue(layout), cache)
+    encoder = load(request.getfixturevalue(layout), cache)
     colours = np.array([[10, 200, 90], [250, 0, 30]], np.uint8)  # RGB
     image = np.repeat(np.repeat(colours[None], 300, axis=0), 200, axis=1)
     crops = encoder.encode_crops(image, np.array([[20.0, 10, 180, 290], [210, 100, 390, 140]]))
     expected = unit((colours / 255 - MEAN) / STD @ OF_COLOUR)
-    np.testing.assert_allclose(crops, expected, atol=1e-4)
+    np.testing.assert_allclose(crops, expected, atol=1e-2)  # may be encoded in bf16
     rows = [[START, *tokens, END] + [0] * (CONTEXT - 2 - len(tokens))
             for tokens in TOKENS.values()]
     labels = encoder.encode_labels(list(TOKENS))
     np.testing.assert_allclose(labels, unit(OF_TOKEN[rows].mean(axis=1)), atol=1e-4)
-    with pytest.raises(OptionsError, match='runs in OpenVINO'):
-        encode_labels(resolve_clip_weights(options), ['a mug'],
-                      ClipOptions(pretrained=options.pretrained, inference='pytorch'))
 
 
 def test_labels_have_the_tokens_of_clip(published, cache):
-    options = ClipOptions(pretrained=str(published), device='cpu', cache_dir=cache)
-    tower = OnnxTextTower(resolve_clip_weights(options), options)
+    weights = resolve_clip_weights(ClipOptions(pretrained=str(published)))
+    tower = OnnxTextTower(weights, cache)
     found, mask = tower.tokens(list(TOKENS))
     for row, inside, tokens in zip(found, mask, TOKENS.values(), strict=True):
         assert row[inside == 1].tolist() == [START, *tokens, END]
@@ -178,7 +174,7 @@ def test_what_is_no_clip(published, cache, tmp_path, change, named):
     folder = Path(shutil.copytree(published, tmp_path / 'clip'))
     change(folder)
     with pytest.raises(ModelError) as caught:
-        load(folder, cache)[0].encode_labels(['a cup'])
+        load(folder, cache).encode_labels(['a cup'])
     assert named in str(caught.value) and str(folder) in str(caught.value)
 
 

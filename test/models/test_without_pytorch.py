@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""ONNX networks run without PyTorch, and give the same poses."""
+"""Weights for PyTorch localize the demo, also without PyTorch once they are exported."""
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -18,14 +17,15 @@ from demo import ASSETS
 pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
-WAKE_UPS = 10
-#: Prints the demo's poses (4, 4), null for a refusal, and their distances to the truth [m].
+WAKE_UPS = 8
+#: Prints the demo's poses (4, 4), null for a refusal.
 POSES = """
 import json, sys
 import cv2, numpy as np
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import ModelError
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from demo import ASSETS
@@ -35,73 +35,54 @@ from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 
-inference, cache, wake_ups = sys.argv[1], sys.argv[2], int(sys.argv[3])
+model, clip_model, pretrained, cache, wake_ups = sys.argv[1:]
 landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
-detector = load_detector(DetectorOptions(
-    str(ASSETS / ('yolo.pt' if inference == 'pytorch' else 'yolo.onnx')), inference=inference,
-    cache_dir=cache, device='cpu'))
-clip = ([str(ASSETS / 'clip.json'), str(ASSETS / 'clip.safetensors')] if inference == 'pytorch'
-        else ['', str(ASSETS / 'clip')])
-observer = Observer(*load_encoder_for_map(ClipOptions(
-    *clip, inference=inference, cache_dir=cache, device='cpu', precision='fp32'),
-    landmark_map, [], 'text'))
+try:
+    observer = Observer(*load_encoder_for_map(
+        ClipOptions(clip_model, pretrained, cache_dir=cache), landmark_map, [], 'text'))
+    detector = load_detector(DetectorOptions(model, cache_dir=cache))
+except ModelError as error:
+    sys.exit(f'error: {error}')
 relocalizer = Relocalizer(landmark_map, RelocalizerOptions(time_budget_s=60.0))
 camera, _ = find_camera(None, ASSETS / 'sequence')
 found = []
-for file in read_tum(ASSETS / 'sequence').image_paths[::5][:wake_ups]:
+for file in read_tum(ASSETS / 'sequence').image_paths[::5][:int(wake_ups)]:
     image = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
     boxes = detector.detect(image).usable(camera.width, camera.height, 50)
     pose = relocalizer.relocalize([observer.observe(image, camera, boxes, 0)])
     found.append(np.asarray(pose.map_from_camera).tolist() if pose.accepted else None)
-print(json.dumps({'poses': found, 'engines': [detector.inference, observer._encoder.inference],
+print(json.dumps({'poses': found,
                   'loaded': sorted({'torch', 'ultralytics', 'open_clip'} & set(sys.modules))}))
 """
+ONNX = (ASSETS / 'yolo.onnx', '', ASSETS / 'clip')
+WEIGHTS = (ASSETS / 'yolo.pt', ASSETS / 'clip.json', ASSETS / 'clip.safetensors')
 
 
-@pytest.fixture(scope='module')
-def hidden(tmp_path_factory) -> dict[str, str]:
-    return hide_pytorch(tmp_path_factory.mktemp('hidden'))
+def localize(networks: tuple, cache: Path, environment: dict[str, str]
+             ) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, '-c', POSES, *map(str, networks), str(cache), str(WAKE_UPS)],
+        cwd=PROJECT, env=environment, capture_output=True, text=True, timeout=300, check=False)
 
 
-@pytest.fixture
-def walk(tmp_path) -> Path:
-    """Work on a copy, since evaluate stores its recording beside the folder."""
-    return Path(shutil.copytree(ASSETS / 'rig/front', tmp_path / 'walk'))
-
-
-def run(code: list[object], environment: dict[str, str]) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, *map(str, code)], cwd=PROJECT, env=environment,
-                          capture_output=True, text=True, timeout=300, check=False)
-
-
-def test_poses_equal_those_with_pytorch(hidden, tmp_path):
-    found = {}
-    for inference, environment in (('openvino', hidden), ('pytorch', dict(os.environ))):
-        done = run(['-c', POSES, inference, tmp_path / inference, WAKE_UPS], environment)
-        assert done.returncode == 0, done.stderr
-        found[inference] = json.loads(done.stdout)
-        assert found[inference]['engines'] == [inference] * 2
-    assert found['openvino']['loaded'] == []
-    first, second = (found[name]['poses'] for name in ('openvino', 'pytorch'))
-    assert [pose is None for pose in first] == [pose is None for pose in second]
-    off = [np.linalg.norm(np.subtract(one, other)[:3, 3]) for one, other in
-           zip(first, second, strict=True) if one is not None]
-    print(f'\n{len(off)} of {WAKE_UPS} poses accepted, at most {1e3 * max(off):.2f} mm apart')
-    assert len(off) >= WAKE_UPS // 2 and max(off) < 0.01
-
-
-def test_networks_that_are_no_onnx_are_named_with_the_remedies(hidden, walk, tmp_path):
-    (tmp_path / 'yolo.pt').symlink_to(ASSETS / 'yolo.pt')
-    for file in ('clip.json', 'clip.safetensors'):
-        (tmp_path / file).symlink_to(ASSETS / file)
-    sources = ['-m', 'cliploc_ros.cli.evaluate', '--tum', walk, '--map',
-               ASSETS / 'map.yaml', '--methods', 'auto', '--out', tmp_path / 'out']
-    environment = hidden | {'XDG_CACHE_HOME': str(tmp_path / 'cache')}
-    for networks, named in (
-            (['--model', tmp_path / 'yolo.pt', '--no-clip'], 'yolo.pt'),
-            (['--model', ASSETS / 'yolo.onnx', '--clip-model', tmp_path / 'clip.json',
-              '--clip-pretrained', tmp_path / 'clip.safetensors'], '--no-clip')):
-        done = run([*sources, *networks], environment)
+def test_weights_are_exported_once_and_then_need_no_pytorch(tmp_path):
+    (tmp_path / 'hidden').mkdir()
+    hidden, cache = hide_pytorch(tmp_path / 'hidden'), tmp_path / 'cache'
+    for networks, named in ((WEIGHTS, '--no-clip'), ((WEIGHTS[0], *ONNX[1:]), 'yolo.pt')):
+        done = localize(networks, tmp_path / 'empty', hidden)
         assert done.returncode == 1 and 'Traceback' not in done.stderr
         assert 'is not installed' in done.stderr and 'export_network' in done.stderr
-        assert named in done.stderr
+        assert 'script/setup models' in done.stderr and named in done.stderr
+    found = []
+    for networks, environment in ((ONNX, hidden), (WEIGHTS, dict(os.environ)), (WEIGHTS, hidden)):
+        done = localize(networks, cache, environment)
+        assert done.returncode == 0, done.stderr
+        answer = json.loads(done.stdout)
+        assert bool(answer['loaded']) == (environment is not hidden)
+        found.append(answer['poses'])
+    assert found[1] == found[2]
+    assert [pose is None for pose in found[0]] == [pose is None for pose in found[1]]
+    off = [np.linalg.norm(np.subtract(one, other)[:3, 3])
+           for one, other in zip(*found[:2], strict=True) if one is not None]
+    print(f'\n{len(off)} of {WAKE_UPS} poses accepted, at most {1e3 * max(off):.2f} mm apart')
+    assert len(off) >= WAKE_UPS // 2 and max(off) < 0.01

@@ -34,7 +34,6 @@ from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.command import Interruption, split_ros_args
 from cliploc_ros.errors import CliplocError, OptionsError, StoppedError
-from cliploc_ros.models.onnx_network import free_memory
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.node.parameters import NodeParameters, Parameters
 from cliploc_ros.ros.node.threads import BoundedCallbackGroup, NodeExecutor, Worker, log_failure
@@ -334,6 +333,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         self.worker.run(self._unload)
 
     def _unload(self) -> None:
+        from cliploc_ros.models.onnx_network import free_memory
         self.unload()
         free_memory()
 
