@@ -144,14 +144,14 @@ class Doctor(RelocalizerNode):
             report.add('map', State.FAIL, self._map_error)
         else:
             report_map(localizer, parameters, report)
-        self._check_inputs(parameters, patience_s, report)
+        has_frame = self._check_inputs(parameters, patience_s, report)
         if parameters.require_localizer:
             report.judge('localizer', self._handoff.missing() if parameters.base_frame else
                          'base_frame is empty: initialpose would carry the pose of the camera: '
                          "set it to AMCL's base_frame_id", 'it subscribes to initialpose, and '
                          f'publishes {parameters.localizer_pose or "nothing that is checked"}')
-        if localizer is None:
-            return report.add('pose', State.NOT_CHECKED, 'it needs a map')
+        if localizer is None or not has_frame:
+            return report.add('pose', State.NOT_CHECKED, 'it needs a map and a frame')
         answer = self._requests.answer()
         faults = [fault.text for fault in localizer.instants.faults]
         report.judge('input', '; '.join([*faults, *localizer.instants.notes,
@@ -163,8 +163,8 @@ class Doctor(RelocalizerNode):
                           answer.message)
 
     def _check_inputs(self, parameters: RelocalizerParameters, patience_s: float, report: Report
-                      ) -> None:
-        """Wait for a frame; check what does not depend on its content: silence, clocks, motion."""
+                      ) -> bool:
+        """Wait for a frame; check silence, clocks, mount and motion; return whether it came."""
         after, frame, seen = time.monotonic(), None, set[str]()
         with suppress(NoFrameError):  # reported by the sources; discovery may take seconds
             while frame is None or len(seen) < len(self._frames.sources) or (
@@ -188,15 +188,16 @@ class Doctor(RelocalizerNode):
                 up_deg = math.degrees(math.asin(np.clip(base_from_camera[2, 2], -1.0, 1.0)))
                 report.add('tf', State.PASS, f'the camera is {base_from_camera[2, 3]:.2f} m above '
                            f"'{parameters.base_frame}' and looks {up_deg:+.0f} degrees up")
-        odometry = self._robot.odometry
-        if not odometry.is_published:
-            return report.add('odometry', State.NOT_CHECKED, f'nobody publishes {odometry.topic}: '
-                              'the robot is assumed to be at rest, and frames are not fused')
-        with report.failing('odometry'):
-            self._handoff.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s,
-                                     time.monotonic() + patience_s)
-            report.add('odometry', State.PASS, 'the robot is at rest')
-        return None
+        if not self._robot.odometry.is_published:
+            report.add('odometry', State.NOT_CHECKED, 'nobody publishes '
+                       f'{self._robot.odometry.topic}: the robot is assumed to be at rest, and '
+                       'frames are not fused')
+        else:
+            with report.failing('odometry'):
+                self._handoff.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s,
+                                         time.monotonic() + patience_s)
+                report.add('odometry', State.PASS, 'the robot is at rest')
+        return frame is not None
 
     def _clock_fault(self, lag_s: float) -> str:
         """Return how the clocks of camera and node disagree; empty if they agree."""

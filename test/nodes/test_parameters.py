@@ -32,7 +32,7 @@ def write_dump(values, name, path):
 
 def test_a_dump_starts_the_same_relocalizer(start, tester, room_map, tmp_path):
     first = start('nodes.relocalizer', '--ros-args', '--params-file', room_map, parameters={
-        **class_matching("''"), 'timeout_s': 3, 'random_seed': -1, 'base_frame': 'base_link',
+        **class_matching("''"), 'timeout_s': 30, 'random_seed': -1, 'base_frame': 'base_link',
         'base_from_camera': '[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]'})
     first.wait_for_output('12 landmarks')
     tester.connect()

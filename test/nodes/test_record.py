@@ -41,13 +41,13 @@ def test_a_recorded_failure_replays_to_the_same_verdict(own_relocalizer, tester,
 
 def test_what_cannot_be_recorded_says_why(own_relocalizer, tester, tmp_path):
     folder = tmp_path / 'cases'
-    own_relocalizer(record_folder=folder, record_limit_mb=1, timeout_s=1.0,
-                    require_localizer=False)
+    own_relocalizer(record_folder=folder, record_limit_mb=1, require_localizer=False)
     assert not tester.trigger('record').success
     assert tester.relocalize(make_frame()).success
     assert tester.trigger('record').success  # 0.9 MiB
     full = tester.trigger('record')
     assert not full.success and 'record_limit_mb' in full.message
     assert len(list(folder.iterdir())) == 1
+    assert tester.set_parameter('timeout_s', 1.0).successful
     assert 'no new frame' in tester.answer(tester.ask()).message
     assert not tester.trigger('record').success

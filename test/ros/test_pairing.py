@@ -30,7 +30,7 @@ def test_what_came_is_known_for_the_reason_that_nothing_paired():
     pairing.clear()
     assert pairing.received == dict.fromkeys(TOPICS, 0)
     assert pairing.last_stamp_ns == {}
-    assert pairing.waiting_bytes() == 0
+    assert sum(pairing._bytes.values()) == 0
     assert add_all(pairing, ('camera_info', 9), ('image', 9)) is None
 
 
@@ -66,7 +66,7 @@ def test_a_set_is_complete_if_and_only_if_nothing_of_it_was_evicted(additions):
     pairing, expected = ExactPairing(LIMITS, MAX_COUNT), Expected()
     for item, (topic, stamp, size) in enumerate(additions):
         assert pairing.add(topic, stamp, item, size) == expected.add(topic, stamp, item, size)
-        assert pairing.waiting_bytes() == sum(map(expected.size, TOPICS))
+        assert sum(pairing._bytes.values()) == sum(map(expected.size, TOPICS))
 
 
 def paired_by_a_slow_detector(behind, room, images, queue=False, begin=0):
@@ -78,7 +78,7 @@ def paired_by_a_slow_detector(behind, room, images, queue=False, begin=0):
     paired, taken, done_at = [], 0, begin
     for number in range(1, images + 1):
         pairing.add('image', number, number, 100)
-        assert pairing.waiting_bytes() <= 100 * room
+        assert sum(pairing._bytes.values()) <= 100 * room
         stamp = number - behind if queue else taken
         if queue or number >= done_at:
             if stamp and pairing.add('detections', stamp, 'boxes', 0):

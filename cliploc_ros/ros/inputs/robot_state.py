@@ -108,8 +108,7 @@ class VerticalSource(qos.Listener):
         self._samples: deque[Sample] = deque(maxlen=_MAX_SAMPLES)
         self._stamps = StampOrder()
         self._imu_frame = ''
-        self._newest_is_empty = False
-        #: Fault of the newest message's stamp, and the remedy; empty if the stamp is valid.
+        #: Fault of the newest message, and the remedy; empty if it is valid.
         self.problem = ''
 
     def open(self, source: str) -> None:
@@ -129,9 +128,10 @@ class VerticalSource(qos.Listener):
         """Process a message of the IMU."""
         sample = sample_from_msg(msg)
         with self._lock:
-            self._newest_is_empty = sample is None
             why, topic = stamp_problem(msg.header.stamp), self._node.resolve_topic_name('imu')
-            self.problem = why and f'the stamp of {topic} {why}: its driver must stamp each sample'
+            self.problem = f'the stamp of {topic} {why}: its driver must stamp each sample' \
+                if why else '' if sample is not None else \
+                f'{topic} has neither an orientation nor an acceleration: publish at least one'
             if sample is None or why:
                 return
             if self._stamps.goes_back('imu', sample.stamp_ns):
@@ -169,17 +169,11 @@ class VerticalSource(qos.Listener):
         """Return the mean vertical around an instant, and its coordinate frame."""
         with self._lock:
             frame, samples = self._imu_frame, list(self._samples)
-            newest_is_empty = self._newest_is_empty
         near = [sample for sample in samples if abs(sample.stamp_ns - at_ns) <= WINDOW_NS]
         topic = self._node.resolve_topic_name('imu')
-        if not near and self.problem:
-            raise NoVerticalError(self.problem)
-        if not near and newest_is_empty:
-            raise NoVerticalError(f'{topic} has neither an orientation nor an acceleration: '
-                                  'publish at least one of them')
         if not near:
-            raise NoVerticalError(f'no message on {topic} within {WINDOW_NS // 1_000_000} ms of '
-                                  'the image')
+            raise NoVerticalError(self.problem or f'no message on {topic} within '
+                                  f'{WINDOW_NS // 1_000_000} ms of the image')
         if not frame:
             raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: set it')
         return mean_up(near, samples, topic), frame
@@ -294,7 +288,7 @@ class RobotStateSource:
         self.odometry.forget()
 
     def examine(self, health: Health) -> None:
-        """Report invalid stamps of odometry and of the IMU."""
+        """Report invalid messages of odometry and of the IMU."""
         for problem in (self.odometry.problem, self.vertical.problem):
             if problem:
                 health.warn(problem)

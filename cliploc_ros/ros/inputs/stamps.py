@@ -204,10 +204,6 @@ class ExactPairing:
         """Return the oldest waiting item of a topic; None without any."""
         return next((item for item, _ in self._waiting[topic].values()), None)
 
-    def waiting_bytes(self) -> int:
-        """Return the memory of all waiting messages [bytes]."""
-        return sum(self._bytes.values())
-
     def clear(self) -> None:
         """Forget all waiting messages and all counts."""
         for waiting in self._waiting.values():
