@@ -14,7 +14,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
     project_ellipsoids,
     shape_matrices,
 )
-from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
+from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, make_transform
 from cliploc_ros.core.map.culling import (
     make_groups,
     sort_landmarks,
@@ -74,6 +74,9 @@ def test_nothing_that_counts_is_left_out(seed):
     assert progress.tried == np.count_nonzero(samples[:, 0] >= 0)
     ranked = leaders.ranked()
     assert len(ranked) > 50
+    poses = [invert_transform(make_transform(leaders.rotations[row], leaders.translations[row]))
+             for row in ranked]
+    assert SAME_PLACE.distinct(np.array(poses)) == [*range(len(ranked))]
     for row in ranked:
         assert leaders.scores[row] == pytest.approx(scores[leaders.iterations[row] - 1],
                                                     abs=1e-9)

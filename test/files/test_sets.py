@@ -52,9 +52,10 @@ def path(tmp_path):
     return tmp_path / 'a.yaml'
 
 
-def write_again_and_again(path, first, begun):
-    begun.set()
+def write_again_and_again(path, first, begun, after):
     for number in range(first, first + 1000):
+        if number == first + after:
+            begun.set()
         write_set(path, number)
 
 
@@ -64,10 +65,10 @@ def test_a_kill_leaves_one_whole_set(path):
     for kill in range(60):
         begun = fork.Event()
         writer = fork.Process(target=write_again_and_again,
-                              args=(path, 1000 * kill + 1, begun), daemon=True)
+                              args=(path, 1000 * kill + 1, begun, draw.randrange(3)), daemon=True)
         writer.start()
         assert begun.wait(60.0)
-        time.sleep(draw.uniform(0.0, 0.06))
+        time.sleep(draw.uniform(0.0, 0.03))
         os.kill(writer.pid, signal.SIGKILL)
         writer.join()
         number, agree = read(path)
