@@ -149,7 +149,8 @@ def test_a_file_that_changed_on_disk_is_not_overwritten(document, path):
     with pytest.raises(MapError, match='another program'):
         document.save()
     assert path.read_text() == theirs
-    document.overwrite()
+    assert document.has_conflict
+    assert 'office.yaml' in document.overwrite() and not document.has_conflict
     assert LandmarkMap.from_file(path).labels[0] == 'mine'
 
 

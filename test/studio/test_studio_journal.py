@@ -106,6 +106,7 @@ def test_a_broken_journal_loses_its_end_only(path, tail):
         file.write(tail)
     document = Document(path)
     assert document.landmarks['cup_1'].label == 'mine'
+    assert set(document.landmarks) == {'cup_1', 'book_1', 'plant_1'}
     document.edit(edits.set_fields, ['cup_1'], label='mine, too')
     document.close()
     assert Document(path).landmarks['cup_1'].label == 'mine, too'

@@ -236,7 +236,6 @@ class Document:
             if not self.landmarks:
                 raise EditError(f'{self.path}: a map without landmarks is not saved; create one, '
                                 'or delete the file')
-            self.to_map()
             file = self._file.with_landmarks(self.landmarks)
             self._journal.append({'writing': file.digest})
             # the map is written last: its new content marks a complete save

@@ -20,7 +20,7 @@ from cliploc_ros.offline.mapping.check.landmark_faults import (
     find_map_overlaps,
     hear_witness,
 )
-from cliploc_ros.offline.mapping.check.places import Grid, find_look_alikes, make_grid
+from cliploc_ros.offline.mapping.check.places import find_look_alikes, make_grid
 from cliploc_ros.offline.mapping.check.relocalization import (
     ImageOf,
     RecordedKeyframes,
@@ -111,9 +111,14 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     overlaps = find_map_overlaps(landmark_map, witness, views)
     places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
                        options)
-    grid = judge_grid(places, model, _told(
-        each_pose(model, landmark_map, places.poses, options), len(places.poses),
-        partial(tell, 'relocalizing on the grid')), options.headings)
+    trials = _told(each_pose(model, landmark_map, places.poses, options), len(places.poses),
+                   partial(tell, 'relocalizing on the grid'))
+    verdicts = np.array([trial.verdict for trial in trials], dtype=np.str_)
+    verdicts = verdicts.reshape(-1, options.headings)
+    grid = GridCheck(
+        **vars(places), accepted=(verdicts == 'accepted').sum(axis=1),
+        misled=(verdicts == 'misled').sum(axis=1), trials=tuple(trials), visible=np.array(
+            [model.expected_detections(pose) for pose in places.poses]).reshape(verdicts.shape))
     report = CheckReport(
         landmarks=tuple(check_landmarks(landmark_map, witness, overlaps)),
         overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map)),
@@ -124,22 +129,6 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     tell('done', 1.0)
     return replace(report, to_do=tuple(give_advice(report)),
                    measures=tuple(find_measures(report, thresholds or Thresholds())))
-
-
-def judge_grid(grid: Grid, model: DetectorModel, trials: Sequence[Trial], headings: int
-               ) -> GridCheck:
-    """Summarize trials on a grid, or on its first positions.
-
-    The trials were made with the model, position by position, in the order of headings.
-    """
-    count = len(trials) // headings
-    trials = trials[:count * headings]
-    verdicts = np.array([trial.verdict for trial in trials]).reshape(count, headings)
-    visible = np.array([model.expected_detections(pose) for pose in grid.poses[:len(trials)]])
-    return GridCheck(
-        grid.positions[:count], grid.is_near[:count], grid.poses[:len(trials)], grid.spacing_m,
-        (verdicts == 'accepted').sum(axis=1), (verdicts == 'misled').sum(axis=1),
-        visible.reshape(count, headings), tuple(trials))
 
 
 def _told(trials: Iterator[Trial], count: int, tell: Tell) -> list[Trial]:
