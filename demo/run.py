@@ -26,12 +26,7 @@ from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, conve
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from demo import page
 from demo.pictures import draw_top_view, draw_wake_up
-from demo.processes import (
-    DemoError,
-    node_command,
-    own_ros_domain,
-    running,
-)
+from demo.processes import DemoError, node_command, own_ros_domain, running
 from demo.review import Judged, Reviewer, judge
 from demo.robot import Robot
 

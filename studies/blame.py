@@ -27,12 +27,7 @@ from tqdm import tqdm
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.acceptance.confidence import Support, tilt_handicaps, utilities
-from cliploc_ros.core.acceptance.contenders import (
-    contenders_of,
-    join_frames,
-    refined,
-    unrefined,
-)
+from cliploc_ros.core.acceptance.contenders import contenders_of, join_frames, refined, unrefined
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions

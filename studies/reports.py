@@ -22,12 +22,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.files.parallel import MakeWork, WorkersError, run_tasks
 from cliploc_ros.files.storage import make_folder
-from cliploc_ros.offline.evaluation.figures import (
-    JUDGED_COLORS,
-    add_legend,
-    new_axes,
-    save_figure,
-)
+from cliploc_ros.offline.evaluation.figures import JUDGED_COLORS, add_legend, new_axes, save_figure
 from cliploc_ros.offline.evaluation.summary import wilson_interval
 
 #: Errors below which a pose is a success [m].

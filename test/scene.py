@@ -15,12 +15,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT
-from cliploc_ros.core.keyframes.layer import (
-    KeyframeLayer,
-    layer_path,
-    nearest_words,
-    save_layer,
-)
+from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, nearest_words, save_layer
 from cliploc_ros.core.map import map_file
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections

@@ -113,8 +113,9 @@ def exported(cache_dir: str, kind: str, name: str, identity: Sequence[str],
                     folder.rename(Path(beside) / 'old')
                 whole.rename(folder)
         except OSError as error:
-            raise ModelError(f'the export of {name} cannot be written to {folder}: '
-                             f'{first_line(error)}; {MAKE_ROOM} (cache_dir)') from error
+            reason = error.strerror or 'is the disk full?'  # copytree joins many errors
+            raise ModelError(f'the export of {name} cannot be written to {folder}: {reason}; '
+                             f'{MAKE_ROOM} (cache_dir)') from error
     free_memory()
     logger.info('exported %s in %.0f s', name, time.monotonic() - started)
     return folder

@@ -87,6 +87,9 @@ class OnnxNetwork:
     OpenVINO runs a damaged network without an error (measured: boxes off by 20 px), so its SHA-256
     is stored and checked.
 
+    It has as many threads as OMP_NUM_THREADS says when it is loaded, by default one for each core
+    that the process may use.
+
     ModelError: the file is missing, damaged, or holds operations that OpenVINO does not support,
     or OpenVINO is not installed.
 
@@ -166,11 +169,6 @@ def import_openvino() -> Any:
     return openvino
 
 
-def set_threads(count: int) -> None:
-    """Set the number of threads of networks that this process loads later."""
-    os.environ['OMP_NUM_THREADS'] = str(count)
-
-
 def free_memory() -> None:
     """Return the memory of freed networks to the system."""
     gc.collect()
@@ -184,7 +182,6 @@ def _settings(precision: str | None) -> dict[str, Any]:
     # No pinning: a pinned thread waits for other processes on its core.
     settings: dict[str, Any] = {
         'PERFORMANCE_HINT': 'LATENCY', 'NUM_STREAMS': 1, 'ENABLE_CPU_PINNING': False}
-    # By default, OpenVINO has a thread for each core that this process may use.
     if (threads := os.environ.get('OMP_NUM_THREADS', '')).isdecimal() and int(threads):
         settings['INFERENCE_NUM_THREADS'] = int(threads)
     return settings if precision is None else settings | {'INFERENCE_PRECISION_HINT': precision}

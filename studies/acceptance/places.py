@@ -16,11 +16,7 @@ from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.observations import Queries, load_observations, load_queries
-from cliploc_ros.offline.evaluation.trials import (
-    make_queries,
-    with_neighbours,
-    with_vertical,
-)
+from cliploc_ros.offline.evaluation.trials import make_queries, with_neighbours, with_vertical
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.posed_query import PosedQuery

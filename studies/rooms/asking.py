@@ -22,14 +22,7 @@ from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.blame import blame
 from studies.reports import Answer, judged
-from studies.rooms.rooms import (
-    ROBOT,
-    Room,
-    RoomOptions,
-    known_of,
-    read_room,
-    without_boxes,
-)
+from studies.rooms.rooms import ROBOT, Room, RoomOptions, known_of, read_room, without_boxes
 
 if TYPE_CHECKING:
     from studies.rooms.baseline import SiftMap

@@ -29,11 +29,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.culling import make_groups
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.similarities import (
-    CropSimilarities,
-    LabelEmbeddings,
-    nearest_landmarks,
-)
+from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings, nearest_landmarks
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

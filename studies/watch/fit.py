@@ -13,13 +13,7 @@ from cliploc_ros.core.geometry.transforms import Tolerance
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.watch.look import LookEvidence, align, log_odds, look_at, measure
 from studies.reports import fit_logistic, table
-from studies.watch.judge import (
-    displaced,
-    drifting,
-    kidnapped,
-    simulated_drive,
-    turned_camera,
-)
+from studies.watch.judge import displaced, drifting, kidnapped, simulated_drive, turned_camera
 
 _IMAGES = 60
 # Shares of objects that changed since the place was mapped; worlds take these in turn.

@@ -23,11 +23,7 @@ from cliploc_ros.core.map.culling import FEW
 from cliploc_ros.core.map.landmark_details import LEAST_CLASS_SHARE, LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, with_images
 from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
-from cliploc_ros.core.map.similarities import (
-    CropSimilarities,
-    LabelEmbeddings,
-    nearest_landmarks,
-)
+from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings, nearest_landmarks
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query

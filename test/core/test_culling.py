@@ -15,11 +15,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
     shape_matrices,
 )
 from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, make_transform
-from cliploc_ros.core.map.culling import (
-    make_groups,
-    sort_landmarks,
-    visible_members,
-)
+from cliploc_ros.core.map.culling import make_groups, sort_landmarks, visible_members
 from cliploc_ros.core.search.scene import Scene, make_scene
 from cliploc_ros.core.search.strategies import Leaders, draw_ransac, search_samples
 

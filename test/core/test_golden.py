@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from reference import candidate_mask, same_class, sample_pose, solve_p3p, verify
 
-from cliploc_ros.core.search.frame_search import (
-    balanced_order,
-    nearest_candidates,
-    prosac_order,
-)
+from cliploc_ros.core.search.frame_search import balanced_order, nearest_candidates, prosac_order
 from cliploc_ros.core.search.scene import make_scene
 from cliploc_ros.core.search.strategies import Leaders, search_exhaustively
 

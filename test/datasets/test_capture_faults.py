@@ -11,12 +11,7 @@ import tracemalloc
 import cv2
 import numpy as np
 import pytest
-from capture_folders import (
-    WRITERS,
-    shots_of,
-    write_colmap,
-    write_nerf,
-)
+from capture_folders import WRITERS, shots_of, write_colmap, write_nerf
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

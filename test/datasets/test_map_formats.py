@@ -23,13 +23,7 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.given_map import GivenMap, place, read_table
-from studies.foreign_maps import (
-    COCO,
-    main,
-    read_goreloc,
-    read_msgloc,
-    read_oaslam,
-)
+from studies.foreign_maps import COCO, main, read_goreloc, read_msgloc, read_oaslam
 
 HERE = ('map', 1.0, np.eye(4))
 CUP = COCO.index('cup')

@@ -16,11 +16,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import bag_messages
-from cliploc_ros.offline.datasets.bag_frames import (
-    BagTopics,
-    bag_frames,
-    find_topics,
-)
+from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames, find_topics
 from cliploc_ros.offline.datasets.bag_poses import PoseSource, bag_odometry
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from demo.map_review import (
-    Sightings,
-    review_map,
-)
+from demo.map_review import Sightings, review_map
 from demo.truth import TrueObject
 
 HOSTILE = '<script>alert("&")</script>'

@@ -23,13 +23,7 @@ from demo.world.appearance import CLASSES
 from demo.world.recording import find_boxes, record, write_true_map
 from demo.world.renderer import Light, Renderer
 from demo.world.room import make_room
-from demo.world.trajectories import (
-    CAMERA,
-    draw_views,
-    query_walk,
-    rig_mounts,
-    rig_walk,
-)
+from demo.world.trajectories import CAMERA, draw_views, query_walk, rig_mounts, rig_walk
 
 pytestmark = pytest.mark.full
 

@@ -21,12 +21,7 @@ from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.files.parallel import WorkersError
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.datasets.poses import TimedPoses
-from cliploc_ros.offline.evaluation.figures import (
-    draw_map,
-    png_of,
-    precision_recall,
-    spread_names,
-)
+from cliploc_ros.offline.evaluation.figures import draw_map, png_of, precision_recall, spread_names
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS, parse_methods
 from cliploc_ros.offline.evaluation.run import count_trials, run_methods
 from cliploc_ros.offline.evaluation.summary import (

@@ -26,11 +26,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import set_digest, write_map
 from cliploc_ros.errors import DatasetError, MapError, OptionsError
 from cliploc_ros.files.storage import replace_file
-from cliploc_ros.offline.datasets.map_recording import (
-    MapRecording,
-    load_recording,
-    recording_path,
-)
+from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording, recording_path
 from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
 from cliploc_ros.offline.studio.document import Document
 

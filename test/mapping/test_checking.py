@@ -25,10 +25,7 @@ from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictur
 from cliploc_ros.offline.evaluation.pages import CHECK, CHECK_DATA, write_check
 from cliploc_ros.offline.mapping.check.advice import give_advice
 from cliploc_ros.offline.mapping.check.checking import check_map
-from cliploc_ros.offline.mapping.check.landmark_faults import (
-    check_landmarks,
-    hear_witness,
-)
+from cliploc_ros.offline.mapping.check.landmark_faults import check_landmarks, hear_witness
 from cliploc_ros.offline.mapping.check.places import LookAlike, find_look_alikes, make_grid
 from cliploc_ros.offline.mapping.check.relocalization import (
     make_folds,

@@ -7,13 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from disturbed_poses import (
-    aligned_offsets_m,
-    disturb,
-    draw_errors,
-    offsets_m,
-    with_odometry,
-)
+from disturbed_poses import aligned_offsets_m, disturb, draw_errors, offsets_m, with_odometry
 from scipy.spatial.transform import Rotation
 from walk import look_at, make_table, nearest_errors, see, walk_around
 

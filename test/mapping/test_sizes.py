@@ -13,11 +13,7 @@ from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.report import BY_OBJECTS, Measure
 from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
 from cliploc_ros.offline.mapping.options import CheckOptions
-from cliploc_ros.offline.mapping.sizes import (
-    log_sizes,
-    scale_by_sizes,
-    size_of_class,
-)
+from cliploc_ros.offline.mapping.sizes import log_sizes, scale_by_sizes, size_of_class
 from cliploc_ros.offline.mapping.views import make_views
 
 QUICK = CheckOptions(max_positions=4, headings=4)

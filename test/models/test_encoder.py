@@ -25,12 +25,12 @@ from cliploc_ros.core.map.landmark_embeddings import (
     save_landmark_embeddings,
 )
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.errors import CliplocError, ImageError
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
 from cliploc_ros.models.files import fingerprint_file
-from cliploc_ros.models.images import check_image_rgb, crop_bounds, visible_boxes
+from cliploc_ros.models.images import crop_bounds, visible_boxes
 from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
 from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
 from cliploc_ros.models.observer import Observer
@@ -221,14 +221,6 @@ def test_every_visible_box_has_pixels(boxes, width, height):
     left, top, right, bottom = crop_bounds(kept, width, height).T
     assert ((left >= 0) & (left < right) & (right <= width)).all()
     assert ((top >= 0) & (top < bottom) & (bottom <= height)).all()
-
-
-@pytest.mark.parametrize(('image', 'message'), [
-    (np.zeros((0, 0, 3), np.uint8), 'no pixels'), (np.zeros((4, 4), np.uint8), r'\(4, 4\)'),
-    (np.zeros((4, 4, 3), np.float32), 'float32')])
-def test_no_image(image, message):
-    with pytest.raises(ImageError, match=message):
-        check_image_rgb(image)
 
 
 def test_fingerprint(tmp_path):

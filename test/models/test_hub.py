@@ -25,34 +25,19 @@ COMMIT = '1' * 40
 RESOLVE = """
 import json, sys
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.hub import find_network, resolve_folder
-networks = ['model.onnx', 'onnx/model.onnx']
-try:
-    folder = resolve_folder(sys.argv[2], [networks], ['config.json'], sys.argv[1])
-except ModelError as error:
-    print(json.dumps({'error': str(error)}))
-else:
-    print(json.dumps({'network': str(find_network(folder, sys.argv[2], networks))}))
-"""
-
-
-#: Weights that open_clip downloads; they hold none of its tensors.
-RESOLVE_CLIP = """
-import json, sys
-from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-try:
-    resolve_clip_weights(ClipOptions(sys.argv[2], 'openai', cache_dir=sys.argv[1]))
-except ModelError as error:
-    print(json.dumps({'error': str(error)}))
-"""
-LOAD_YOLO = """
-import json, sys
-from cliploc_ros.errors import ModelError
+from cliploc_ros.models.hub import find_network, resolve_folder
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
+cache, name = sys.argv[1:]
+networks = ['model.onnx', 'onnx/model.onnx']
 try:
-    load_detector(DetectorOptions(sys.argv[2], cache_dir=sys.argv[1]))
+    if name.startswith('yolo'):
+        load_detector(DetectorOptions(name, cache_dir=cache))
+    elif name.startswith('ViT'):
+        resolve_clip_weights(ClipOptions(name, 'openai', cache_dir=cache))
+    folder = resolve_folder(name, [networks], ['config.json'], cache)
+    print(json.dumps({'network': str(find_network(folder, name, networks))}))
 except ModelError as error:
     print(json.dumps({'error': str(error)}))
 """
@@ -123,10 +108,10 @@ def hub(monkeypatch, tmp_path):
         server.shutdown()
 
 
-def resolve(cache: Path, name: str = 'someone/net', *within: str, script: str = RESOLVE,
-            **environment: str) -> dict[str, str]:
+def resolve(cache: Path, name: str = 'someone/net', *within: str, **environment: str
+            ) -> dict[str, str]:
     done = subprocess.run(
-        [*within, sys.executable, '-c', script, str(cache), name], cwd=PROJECT, text=True,
+        [*within, sys.executable, '-c', RESOLVE, str(cache), name], cwd=PROJECT, text=True,
         env={**os.environ, 'NO_PROXY': '127.0.0.1', **environment}, capture_output=True,
         timeout=300, check=False)
     assert done.returncode == 0, done.stderr
@@ -180,7 +165,7 @@ def test_weights_of_a_tag(hub, tmp_path):
     """They are downloaded once, even if they are then refused."""
     hub.files = {'open_clip_model.safetensors': safetensors(4 * 16)}
     for _ in range(2):
-        text = resolve(tmp_path / 'cache', 'ViT-B-32', script=RESOLVE_CLIP)['error']
+        text = resolve(tmp_path / 'cache', 'ViT-B-32')['error']
         assert "does not hold the weights of CLIP model 'ViT-B-32'" in text
         assert str(tmp_path / 'cache/weights') in text
     gets = [line for line in hub.requests if line.startswith('GET') and '/resolve/' in line]
@@ -211,7 +196,6 @@ def test_without_a_network_the_message_names_files_and_remedy(tmp_path):
         assert 'model.onnx, config.json from https://huggingface.co/someone/net' in text
     text = resolve(tmp_path, 'not/a/name')['error']
     assert 'does not exist' in text
-    text = resolve(tmp_path, 'yolov8n', script=LOAD_YOLO,
-                   HTTPS_PROXY=f'http://127.0.0.1:{port}')['error']
+    text = resolve(tmp_path, 'yolov8n', HTTPS_PROXY=f'http://127.0.0.1:{port}')['error']
     assert 'yolov8n.pt' in text and 'on another machine' in text
     assert not any(file.name.startswith('yolo') for file in (tmp_path / 'weights').iterdir())

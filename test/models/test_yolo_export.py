@@ -81,16 +81,10 @@ def test_boxes_in_real_images_equal_those_of_pytorch(settings, weights, office_r
     for image in images:
         found, (rows, classes) = exported.detect(image), by_ultralytics(model, image)
         assert len(rows) > 4 and list(found.class_ids) == classes
-        assert np.allclose(found.scores, rows[:, 4], atol=1e-2)
+        assert np.allclose(found.scores, rows[:, 4], atol=1e-2) and found.scores.dtype == float
         largest = max(largest, float(np.abs(found.bboxes_xyxy - rows[:, :4]).max()))
     print(f'\nlargest difference of a box: {largest:.5f} px')
     assert largest < 0.5
-
-
-def test_options_reach_the_network(weights, office_rgb, cache):
-    few = detector(weights, cache, conf=0.5, max_det=3, imgsz=300).detect(office_rgb[0])
-    assert 0 < len(few) <= 3 and (few.scores >= 0.5).all()
-    assert few.bboxes_xyxy.dtype == few.scores.dtype == np.float64
 
 
 NAMES, SIDE = ('chair', 'cup', 'dining table'), 128

@@ -14,10 +14,7 @@ from std_msgs.msg import Header
 from tester import RELIABLE, make_frame, transform_of
 from watched import BASE_FROM_CAMERA, MOUNT, stamp
 
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    make_transform,
-)
+from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.ros.conversions import pose_to_msg
 

@@ -7,12 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from studies.sensors import (
-    angle_table,
-    read_robot,
-    restarts_table,
-    vertical_rows,
-)
+from studies.sensors import angle_table, read_robot, restarts_table, vertical_rows
 
 pytestmark = pytest.mark.full
 

@@ -22,12 +22,7 @@ from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
 from cliploc_ros.ros.conversions import pose_from_msg
 from studies.watch.__main__ import run
 from studies.watch.judge import KIDNAPPED, alarm_table, judge, right_table, simulated_drive
-from studies.watch.recordings import (
-    WatchedLook,
-    alarms_of,
-    summarize_watch,
-    write_watch,
-)
+from studies.watch.recordings import WatchedLook, alarms_of, summarize_watch, write_watch
 
 pytestmark = pytest.mark.full
 

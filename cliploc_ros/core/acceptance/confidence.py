@@ -45,11 +45,7 @@ from cliploc_ros.core.geometry.transforms import SAME_ANSWER, invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
-from cliploc_ros.core.map.similarities import (
-    Similarities,
-    pair_similarities,
-    sampled_spread,
-)
+from cliploc_ros.core.map.similarities import Similarities, pair_similarities, sampled_spread
 from cliploc_ros.core.observation import Detections, Region
 from cliploc_ros.core.search.scene import Scene
 

@@ -19,11 +19,7 @@ from scipy.stats import chi2
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import moved_pose
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    move_covariance,
-    pose_difference,
-)
+from cliploc_ros.core.geometry.transforms import invert_transform, move_covariance, pose_difference
 
 # Odometry as a random walk: standard deviation on each axis after a metre and after a radian, as
 # in cliploc_ros.core.fit.covariance. A filter that assumes more drift stays consistent.

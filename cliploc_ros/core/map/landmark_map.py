@@ -17,11 +17,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cliploc_ros.core.geometry.ellipsoid import (
-    STANDS_IN,
-    normalized_lengths,
-    shape_matrices,
-)
+from cliploc_ros.core.geometry.ellipsoid import STANDS_IN, normalized_lengths, shape_matrices
 from cliploc_ros.core.map.culling import SortedLandmarks, sort_landmarks
 from cliploc_ros.core.map.landmark_details import (
     OPTIONAL_FIELDS,

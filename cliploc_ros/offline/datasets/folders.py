@@ -23,13 +23,7 @@ from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.agreement import (
-    AXES,
-    Reading,
-    View,
-    check_agreement,
-    w_first,
-)
+from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_agreement, w_first
 from cliploc_ros.offline.datasets.captures import colmap, devices
 from cliploc_ros.offline.datasets.captures.capture import Capture, FolderOptions
 from cliploc_ros.offline.datasets.frames import (

@@ -32,11 +32,7 @@ from cliploc_ros.offline.mapping.check.relocalization import ImageOf, refused_sp
 from cliploc_ros.offline.mapping.check.report import Advice, CheckReport
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.sightings import (
-    crop_around,
-    find_sightings,
-    outlines_in_view,
-)
+from cliploc_ros.offline.mapping.sightings import crop_around, find_sightings, outlines_in_view
 from cliploc_ros.offline.mapping.views import make_views
 
 _DPI = 120

@@ -23,11 +23,7 @@ from cliploc_ros.models.clip_weights import (
     resolve_clip_weights,
 )
 from cliploc_ros.offline.datasets.frames import Frames
-from cliploc_ros.offline.datasets.map_recording import (
-    MapRecording,
-    recording_path,
-    save_recording,
-)
+from cliploc_ros.offline.datasets.map_recording import MapRecording, recording_path, save_recording
 from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map
 from cliploc_ros.offline.mapping.labelling import (
     embed_landmarks,

@@ -3,6 +3,7 @@
 """Run detector and CLIP on one frame, for an observation file."""
 
 import io
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +18,6 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.clip_encoder import ClipEncoder
 from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.onnx_network import set_threads
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ImageTextEncoder
 from cliploc_ros.offline.datasets.frames import RawFrame
@@ -88,7 +88,7 @@ class LoadNetworks:
         ModelError or OptionsError: the networks cannot be loaded.
         """
         if self.threads:
-            set_threads(self.threads)
+            os.environ['OMP_NUM_THREADS'] = str(self.threads)  # see OnnxNetwork
         encoder = (None if self.clip is None
                    else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
         return RunNetworks(load_detector(self.detector).detect, encoder)

@@ -17,12 +17,7 @@ from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.storage import parse_json
 from cliploc_ros.offline.studio.edits import Change, EditError, change_from_json
-from cliploc_ros.offline.studio.landmark import (
-    KNOWN_FIELDS,
-    Landmark,
-    Landmarks,
-    map_of,
-)
+from cliploc_ros.offline.studio.landmark import KNOWN_FIELDS, Landmark, Landmarks, map_of
 from cliploc_ros.offline.studio.map_file import (
     LookFile,
     MapFile,
