@@ -114,13 +114,8 @@ def _weights(name: str, folder: Path) -> tuple[str, str, str]:
 
 
 def _load(yolo: str, clip: str, folder: str) -> tuple[ObjectDetector, ClipEncoder]:
-<<<<<<< HEAD
     model, pretrained, checkpoint = json.loads(clip)
     options = ClipOptions(model, pretrained, checkpoint, cache_dir=folder)
-=======
-    model, pretrained, file = json.loads(clip)
-    options = ClipOptions(model, pretrained, file, cache_dir=folder)
->>>>>>> models
     return (load_detector(DetectorOptions(yolo, cache_dir=folder)),
             ClipEncoder(resolve_clip_weights(options), options))
 
