@@ -90,6 +90,8 @@ class Robot:
 @pytest.fixture
 def robot(tester):
     robot = Robot(tester)
+    # otherwise the first frames of a request have no odometry on a busy machine
+    tester.wait(robot._odom.get_subscription_count, 'the subscription of odometry')
     yield robot
     robot.close()
 
