@@ -684,3 +684,5 @@ def test_a_search_of_keyframes_that_time_cuts_off_is_named_and_repeated():
         assert 'keyframes: time was up; raise timeout_s' in late.reason
         assert not again.accepted
     assert answers[0] == 'time_up'
+    assert Localizer(RELOCALIZER, Late(None)).answer(Query(
+        (frame(0.0),), (image,), None)).reason == '', 'accepted without keyframes'
