@@ -13,7 +13,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import product, takewhile
 
 import numpy as np
 from tqdm import tqdm
@@ -24,11 +24,13 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.trials import with_vertical
+from cliploc_ros.offline.mapping.refit import refit_map
 from cliploc_ros.offline.posed_query import PosedQuery
 from studies import wrong_sensors
 from studies.acceptance.places import (
     VERTICAL_DEG,
     AnyPlace,
+    Halved,
     Simulated,
     add_arguments,
     chosen_places,
@@ -81,6 +83,8 @@ def _by_class(landmark_map: LandmarkMap) -> LandmarkMap:
     return _rough(replace(landmark_map, semi_axes=semi_axes), 0.0, 0.03)
 
 
+#: Another map, fitted to the boxes that a place's own map is made of.
+REFITTED = '20 %, 5 cm off, refitted'
 #: Other maps of the same objects, by name.
 MAPS: dict[str, Callable[[LandmarkMap], LandmarkMap]] = {
     'given': lambda given: given,
@@ -99,6 +103,7 @@ class Look(Answer):
     localizer: str  #: 'one', or 'new' for each image
     drive: int
     is_called_wrong: bool  #: Whether the localizer has reported the camera as wrong
+    is_look: bool  #: Whether the image gives a look, see camera_check
 
 
 def _drive(place: AnyPlace, options: argparse.Namespace
@@ -116,24 +121,33 @@ def _drive(place: AnyPlace, options: argparse.Namespace
         for query in in_order[::options.every]]
 
 
-def _looks(number: int, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
-           options: argparse.Namespace) -> Iterator[Look]:
+def _looks(number: int, place: AnyPlace, options: argparse.Namespace) -> Iterator[Look]:
     """Yield the answers on a drive, for each of the chosen maps and cameras."""
-    for map_name, name in product(options.maps, options.wrong):
-        relocalizer = Relocalizer(MAPS[map_name](landmark_map),
-                                  RelocalizerOptions(k=min(3, len(landmark_map))))
-        change, level = CAMERAS[name]
-        for localizer in options.localizers:
-            for fields, is_called_wrong in look_on(relocalizer, change(queries, level),
-                                                   localizer == 'one'):
+    own, queries = _drive(place, options)
+    if options.vertical:
+        queries = with_vertical(queries, VERTICAL_DEG)
+    for map_name in options.maps:
+        if map_name != REFITTED:
+            landmark_map = MAPS[map_name](own)
+        elif isinstance(place, Halved):
+            landmark_map = refit_map(place.halves()[0], _rough(own, 0.2, 0.05)).landmark_map
+        else:
+            raise OptionsError(f"'{REFITTED}' needs --observations")
+        relocalizer = Relocalizer(landmark_map, RelocalizerOptions(
+            k=min(3, len(own)), matching='class' if options.observations else 'hybrid'))
+        for name, localizer in product(options.wrong, options.localizers):
+            change, level = CAMERAS[name]
+            for fields, is_called_wrong, is_look in look_on(
+                    relocalizer, change(queries, level), localizer == 'one'):
                 yield Look(map=map_name, camera=name, localizer=localizer, drive=number,
-                           is_called_wrong=is_called_wrong, **fields)
+                           is_called_wrong=is_called_wrong, is_look=is_look, **fields)
 
 
 def _alarms(looks: Sequence[Look]) -> list[int]:
     """Return for each drive the number of looks until the camera is called wrong; 0: never."""
-    return [next((count for count, look in enumerate(drive_looks, start=1)
-                  if look.is_called_wrong), 0)
+    return [any(look.is_called_wrong for look in drive_looks) and 1 + sum(
+                look.is_look for look in takewhile(
+                    lambda look: not look.is_called_wrong, drive_looks))
             for drive_looks in grouped(looks, ['localizer', 'drive']).values()
             if drive_looks[0].localizer == 'one']
 
@@ -164,17 +178,20 @@ def run(arguments: Sequence[str]) -> int:
                         metavar=('W', 'H'), help='size of the images of the query files [px]')
     parser.add_argument('--every', type=positive_int, default=1, metavar='N',
                         help='take each N-th image of a query file')
+    parser.add_argument('--drives', type=positive_int, metavar='N',
+                        help='only the first N drives or halves of recordings')
     parser.add_argument('--images', type=positive_int, default=60, metavar='N',
                         help='images of a drive (%(default)s)')
     parser.add_argument('--wrong', nargs='+', choices=CAMERAS, default=[*CAMERAS],
                         metavar='WHAT', help=f'{", ".join(CAMERAS)} (all)')
-    parser.add_argument('--maps', nargs='+', choices=MAPS, default=['given'], metavar='MAP',
-                        help=f'{", ".join(MAPS)} (given)')
+    parser.add_argument('--maps', nargs='+', choices=[*MAPS, REFITTED],
+                        default=['given'], metavar='MAP',
+                        help=f'{", ".join([*MAPS, REFITTED])} (given)')
     parser.add_argument('--localizers', nargs='+', choices=['new', 'one'], default=['new', 'one'],
                         metavar='WHICH', help='new for each image, one for all images (both)')
     parser.add_argument('--vertical', action='store_true', help='give a vertical, to 1 degree')
     options = parser.parse_args(arguments)
-    places = chosen_places(options)
+    places = chosen_places(options)[:options.drives]
     if options.cameras > 1 or options.workers > 1:
         raise OptionsError('--cameras and --workers must be 1: one process handles the images of '
                            'one camera in order')
@@ -183,12 +200,11 @@ def run(arguments: Sequence[str]) -> int:
                            'no depth')
     looks: list[Look] = []
     for number, place in enumerate(tqdm(places, 'drives', disable=None)):
-        landmark_map, queries = _drive(place, options)
-        if options.vertical:
-            queries = with_vertical(queries, VERTICAL_DEG)
-        looks += _looks(number, landmark_map, queries, options)
-    print(answer_table(looks, ['map', 'camera', 'localizer'], called_wrong=_called_wrong,
-                       after_images_median_most=_after, accepted_wrong_before=_before))
+        looks += _looks(number, place, options)
+    print(answer_table(looks, ['map', 'camera', 'localizer'],
+                       looks=lambda some: sum(look.is_look for look in some),
+                       called_wrong=_called_wrong, after_looks_median_most=_after,
+                       accepted_wrong_before=_before))
     return 0
 
 

@@ -142,15 +142,17 @@ class Halved(NamedTuple):
         """Return the name of its rows in a table."""
         return self.observations.stem
 
-    def load(self) -> Place:
-        """Return the place. The boxes of its queries have no similarities."""
+    def halves(self) -> list[PosedDetections]:
+        """Return the mapped half and the half that is asked about."""
         recorded = load_observations(self.observations)
         order = np.random.default_rng(self.seed).permutation(len(recorded))
-        halves = [np.sort(half) for half in np.array_split(order, 2)]
-        if self.is_swapped:
-            halves.reverse()
-        landmark_map = build_map(recorded.select_frames(halves[0])).landmark_map
-        asked = recorded.select_frames(halves[1])
+        halves = [recorded.select_frames(np.sort(half)) for half in np.array_split(order, 2)]
+        return halves[::-1] if self.is_swapped else halves
+
+    def load(self) -> Place:
+        """Return the place. The boxes of its queries have no similarities."""
+        mapped, asked = self.halves()
+        landmark_map = build_map(mapped).landmark_map
         queries = [PosedQuery(number, observation_of(asked, number, round(stamp_s * NS_PER_S)),
                               pose) for number, (stamp_s, pose) in enumerate(zip(
                        asked.stamps_s, asked.map_from_camera, strict=True))]

@@ -85,7 +85,7 @@ def search(task: Task) -> list[Outcome]:
                       trouble=task.trouble, level=task.level)
     if task.in_order:
         return [outcome(looks='first five' if number < EARLY_LOOKS else 'later', **fields)
-                for number, (fields, _) in enumerate(look_on(
+                for number, (fields, *_) in enumerate(look_on(
                     Relocalizer(landmark_map, options), changed))]
     return [outcome(accepted=result.accepted, confidence=result.confidence,
                     error_m=inf if result.error_m is None else result.error_m,
@@ -96,8 +96,8 @@ def search(task: Task) -> list[Outcome]:
 
 
 def look_on(relocalizer: Relocalizer, queries: Iterable[PosedQuery], is_one: bool = True
-            ) -> Iterator[tuple[dict[str, Any], bool]]:
-    """Yield the fields of each answer, and whether the localizer reports the camera as wrong.
+            ) -> Iterator[tuple[dict[str, Any], bool, bool]]:
+    """Yield the fields of each answer, and whether the camera is called wrong, and looked at.
 
     One localizer gets all queries in order, without odometry, or each query a new localizer.
     """
@@ -106,7 +106,8 @@ def look_on(relocalizer: Relocalizer, queries: Iterable[PosedQuery], is_one: boo
         if not is_one:
             localizer = Localizer(relocalizer)
         found = localizer.answer(Query((query.observation,), run=None))
-        yield judged(found, query.map_from_camera), bool(localizer.cameras.faults)
+        yield (judged(found, query.map_from_camera), bool(localizer.cameras.faults),
+               bool(found.cameras))
 
 
 @lru_cache(maxsize=256)

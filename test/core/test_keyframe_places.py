@@ -98,6 +98,9 @@ def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, mi
         assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
         assert (place.inliers, place.keyframes) == (30, (18,))
         assert place.apart == pytest.approx(0.1 / 2.0, abs=1e-3)
+        turned = place.map_from_camera.copy()
+        turned[:3, :3] = Rotation.from_euler('y', 45, degrees=True).as_matrix()
+        assert 18 not in localization.keyframes_near(corridor.map_from_camera, turned)
         assert abs(place.focal_ratio - 1.0) <= 3.0 * place.focal_deviation < 0.1
 
 

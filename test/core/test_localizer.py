@@ -533,6 +533,12 @@ def test_frames_before_a_carry_are_dropped(room, walk):
     found = Relocalizer(room, OPTIONS).relocalize(frames)
     assert found.accepted and found.frames == len(found.frame_matches) <= 2
     assert pose_error(found.map_from_camera, there @ np.linalg.inv(walk[2]) @ walk[3])[0] < 0.05
+    session = Localizer(RELOCALIZER)
+    for frame in frames[:3]:
+        found = session.answer(Query((frame,), limit=5, length_s=5.0))
+        given = session.covariance_for_filter(found)
+    assert found.frames == 1
+    np.testing.assert_array_equal(given, found.covariance, 'a filter starts again')
 
 
 def test_the_same_view_again_is_judged_by_its_mean_evidence():
@@ -588,7 +594,12 @@ def test_a_changed_option_keeps_the_evidence(session):
     assert (same.cameras, same.depth_scale) == (session.cameras, session.depth_scale)
     found = drive(same, 5.0, 12.0)
     assert 'last 5 frames' in found.reason
-    assert drive(same, 4.0, 12.0).accepted, 'time went back'
+    found = drive(same, 4.0, 12.0)
+    assert found.accepted, 'time went back'
+    same.covariance_for_filter(found)
+    again = same.successor(RELOCALIZER)
+    found = drive(again, 5.0, 12.0)
+    assert (np.diag(again.covariance_for_filter(found)) > np.diag(found.covariance)).all()
 
 
 def test_a_search_of_keyframes_that_time_cuts_off_is_named_and_repeated():
@@ -610,3 +621,5 @@ def test_a_search_of_keyframes_that_time_cuts_off_is_named_and_repeated():
         assert 'keyframes: time was up; raise timeout_s' in late.reason
         assert not again.accepted
     assert answers[0] == 'time_up'
+    assert Localizer(RELOCALIZER, Late(None)).answer(Query(
+        (frame(0.0),), (image,), None)).reason == '', 'accepted without keyframes'

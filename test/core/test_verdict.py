@@ -99,6 +99,7 @@ def test_a_refusal_names_the_evidence_that_decided(what):
 def test_keyframes_that_are_sure_replace_what_objects_lack():
     lacking = replace(SURE, inliers=0, coverage=0.1, tried=3, meetings=0.0)
     assert refusal(replace(lacking, by_points=0.99), OPTIONS) is None
+    assert refusal(replace(lacking, by_points=0.99, camera_fault='boxes'), OPTIONS) is None
     assert refusal(replace(lacking, by_points=0.89), OPTIONS).kind == RefusalKind.SEARCH_CUT_SHORT
 
 

@@ -127,8 +127,9 @@ def test_what_a_robot_asks_about_a_frame(questions):
     instant, = replace(questions[5], neighbours=rig).in_order()
     assert (instant.frames, instant.run) == ((*rig, questions[5].observation), None)
     fused = with_neighbours(questions, [0] * len(questions))[5]
-    *earlier, last = fused.in_order()
+    *earlier, last = replace(fused, image=lambda: np.zeros((1, 1, 3), np.uint8)).in_order()
     assert last.frames == (fused.observation,)
+    assert len(last.images) == 1 and not any(query.images for query in earlier)
     seconds = [query.newest.stamp_ns // 10**9 for query in (*earlier, last)]
     late = max(frame.stamp_ns for frame in fused.neighbours) // 10**9
     assert seconds == sorted(set(seconds)) and seconds[-1] == 105 and len(seconds) > 2

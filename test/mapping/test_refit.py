@@ -143,10 +143,10 @@ BACK = BOTTLE, (0.0, 0.0, 1.0), (0.2, 0.2, 0.2)
 TABLE = BOOK, (0.0, 0.0, 0.6), (0.5, 0.4, 0.3)
 LEFT = BOOK, (-0.1, 0.0, 0.8), (0.1, 0.1, 0.3)
 RIGHT = BOOK, (0.1, 0.0, 0.8), (0.2, 0.1, 0.1)
-# .27 m apart on the line of sight of frames 0 to 5 and 30 to 41: their boxes overlap there
+# .27 m apart on the line of sight of frames 0 to 3 and 31 to 38: their boxes overlap there
 NEAR = BOOK, (0.135, 0.0, 0.8), (0.2, 0.2, 0.3)
 FAR = BOOK, (-0.135, 0.0, 0.8), (0.2, 0.2, 0.3)
-IN_LINE = (FRAMES < 6) | ((FRAMES > 29) & (FRAMES < 42))
+IN_LINE = (FRAMES < 4) | ((FRAMES > 30) & (FRAMES < 39))
 CUP_ON_TABLE = CUP, (0.1, 0.0, 0.85), (0.06, 0.06, 0.08)
 
 
