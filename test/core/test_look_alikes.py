@@ -66,6 +66,18 @@ def test_two_equal_rooms_are_twins_that_no_search_met(turn_deg, missing):
         assert angle_deg < 3.0
 
 
+@pytest.mark.parametrize(('distance_m', 'are_rooms'), [(9.0, True), (5.0, True), (0.0, False)])
+def test_a_room_nearby_is_another_room_but_a_symmetric_room_is_not_two(distance_m, are_rooms):
+    room, classes = one_room()
+    twin = moved(room, move_of(180.0, (0, 0, 0)) if distance_m == 0.0
+                 else move_of(0.0, (distance_m, 0, 0)))
+    between = make_transform(np.eye(3), np.array([min(distance_m, 5.0) / 2.0, 0.0, 1.0]))
+    alike = find_twins(make_map(np.concatenate([room, twin]), classes * 2), between,
+                       np.arange(12), NOWHERE)[1]
+    assert len(alike.moves) >= 1
+    assert alike.are_rooms[0] == are_rooms
+
+
 def test_a_room_of_its_own_has_no_twin():
     room, classes = one_room()
     assert len(find_twins(make_map(room, classes), np.eye(4), np.arange(12), NOWHERE)[0]) == 0
