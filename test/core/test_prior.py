@@ -175,6 +175,15 @@ def test_two_objects_and_the_vertical_fix_a_pose(room):
     assert 'fewer than 3' in blind.reason
 
 
+def test_a_vertical_makes_a_pose_surer(room):
+    relocalizer = Relocalizer(room, RelocalizerOptions(matching='class'))
+    upright = relocalizer.relocalize([with_vertical(room)])
+    free = relocalizer.relocalize([with_vertical(room, None)])
+    for found in (upright, free):
+        assert pose_error(found.map_from_camera, MAP_FROM_CAMERA)[0] < 1e-2
+    assert np.trace(upright.covariance[LEVEL]) < np.trace(free.covariance[LEVEL])
+
+
 def test_a_height_that_is_wrong_leaves_no_pose_outside(room):
     truth = MAP_FROM_CAMERA[2, 3]
     inside = RelocalizerOptions(matching='class', height_range_m=(truth - 0.1, truth + 0.1))

@@ -68,7 +68,7 @@ def test_points_of_keyframes_have_the_colours_of_the_recording_or_of_their_heigh
     extent = viewpoint.extent_of([landmark.center for landmark in landmarks.values()], poses)
     rays = camera.normalize_points(np.array([(200.0, 400.0), (400.0, 400.0)]))
     layer = replace(
-        make_layer(map_of(landmarks), 1, points=2), map_from_camera=poses[3:4], camera=camera,
+        make_layer(map_of(landmarks), 1, points=2), map_from_camera=poses[3:4], cameras=(camera,),
         pixels=np.array([(200, 400), (400, 400)], dtype=np.uint16) * 16,
         points=np.column_stack([rays, np.ones(2)]).astype(np.float32))
     _, colors, _ = find_cloud(recording, layer, extent)
