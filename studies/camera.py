@@ -24,7 +24,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.trials import with_vertical
-from cliploc_ros.offline.mapping.refit import refit_map
+from cliploc_ros.offline.mapping.building import refit_map
 from cliploc_ros.offline.posed_query import PosedQuery
 from studies import wrong_sensors
 from studies.acceptance.places import (

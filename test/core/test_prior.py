@@ -129,7 +129,6 @@ def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
 
 
 UP_IN_CAMERA = MAP_FROM_CAMERA[2, :3]
-LEVEL = np.s_[3:5, 3:5]  # covariance of turns about level axes
 
 
 def with_vertical(room, up=UP_IN_CAMERA):
