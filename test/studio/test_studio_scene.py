@@ -67,21 +67,9 @@ def test_points_of_keyframes_without_images_have_the_colours_of_their_height(stu
     landmarks = studio.document.landmarks
     extent = viewpoint.extent_of([landmark.center for landmark in landmarks.values()], None)
     layer = replace(
-<<<<<<< HEAD
         make_layer(map_of(landmarks), 1, points=2), map_from_camera=np.eye(4)[None],
         points=np.array([[0.0, 0.0, extent.floor_m], [0.0, 0.0, extent.top_m]], np.float32))
     points, colors, _ = find_cloud(studio.recording, layer, extent)
-=======
-        make_layer(map_of(landmarks), 1, points=2), map_from_camera=poses[3:4], cameras=(camera,),
-        pixels=np.array([(200, 400), (400, 400)], dtype=np.uint16) * 16,
-        points=np.column_stack([rays, np.ones(2)]).astype(np.float32))
-    _, colors, _ = find_cloud(recording, layer, extent)
-    assert sorted(colors.tolist()) == sorted(
-        (0.75 * recording.image(3)[400, [200, 400]] + 63.75).astype(np.uint8).tolist())
-    high = replace(layer, map_from_camera=np.eye(4)[None], points=np.array(
-        [[0.0, 0.0, extent.floor_m], [0.0, 0.0, extent.top_m]], dtype=np.float32))
-    points, colors, _ = find_cloud(recording, high, extent)
->>>>>>> core
     low, top = colors[points[:, 2].argsort()].astype(int)
     assert low[0] > low[2] + 50 and top[2] > top[0] + 50, 'brown below, blue above'
 
