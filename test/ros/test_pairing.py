@@ -94,3 +94,10 @@ def test_images_pair_however_slow_the_detector_is(behind, room):
         paired = paired_by_a_slow_detector(behind, room, 10 * behind, begin=begin)
         assert len(paired) >= 8, paired
     assert len(paired_by_a_slow_detector(behind, room, 10 * behind, queue=True)) >= 6
+
+
+def test_how_late_detections_of_forgotten_images_are():
+    pairing = ExactPairing({'image': 300, 'detections': 10**9}, 2000, 'image', 'detections')
+    for number in range(1, 10):
+        pairing.add('image', number, number, 100)
+    assert pairing.add('detections', 3, 'boxes', 0) is None and pairing.outrun == 7

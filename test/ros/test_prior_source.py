@@ -3,6 +3,8 @@
 """Priors of an image: from the topic, and from the file of the last pose."""
 
 import json
+import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -88,7 +90,11 @@ def test_the_last_accepted_pose_holds_at_the_next_start_until_another_is_accepte
     source.keep(pose(at=turned(0.7, 1.001, -2.0)), parameters, 'two')
     source._node.worker.run(lambda: None)
     assert file.read_bytes() == content, 'the robot has not moved'
-    source.keep(pose(at=turned(0.7, 3.0, -2.0)), parameters, 'one')
+    source.keep(pose(at=turned(0.7, 2.0, -2.0)), parameters, 'one')
+    source._node.settings = SimpleNamespace(snapshot=lambda: parameters)
+    for written_at, x_m in ((0.0, 3.0), (time.monotonic(), 9.0)):  # at most once a second
+        source._written_at = written_at
+        source.follow(pose(at=turned(0.7, x_m, -2.0)))  # a pose of the localizer
     source._node.worker.run(lambda: None)
 
     node = make_node('next_start')
