@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Networks in ONNX files, run by OpenVINO on a CPU; compiled once and cached on disk.
 
-OpenVINO, not ONNX Runtime 1.32: on a CPU with instructions for bf16, it encodes crops in half the
-time (ViT-B-32); in fp32, the latencies of CLIP, YOLO and D-FINE differ by less than 5 %.
+OpenVINO, not ONNX Runtime 1.32: with instructions for bf16, OpenVINO encodes crops in half the
+time (ViT-B-32). In fp32 the latencies are similar, and ONNX Runtime starts sooner and takes less
+memory (studies/README.md).
 """
 
 import contextlib
