@@ -6,10 +6,12 @@
 import numpy as np
 import pytest
 from scene import MAP_FROM_CAMERA, depth_image, make_room, see_room
-from sensor_msgs.msg import Image
-from tester import RELIABLE, ask_until, class_matching, make_frame
+from sensor_msgs.msg import CompressedImage, Image
+from tester import RELIABLE, ask_until, make_frame
 
 ROOM = make_room()
+# Enough on a busy machine as well.
+SEARCH = {'algorithm': 'auto', 'time_budget_ms': 5000.0}
 DEPTHS_M = depth_image(ROOM, MAP_FROM_CAMERA, see_room(ROOM).bboxes_xyxy)
 
 
@@ -25,62 +27,56 @@ def message(frame, depths_m=DEPTHS_M, encoding='16UC1', frame_id=None, late_s=0.
     return msg
 
 
-@pytest.fixture(scope='module')
-def cases(tmp_path_factory):
-    return tmp_path_factory.mktemp('cases')
-
-
-@pytest.fixture(scope='module')
-def camera(start_shared, tester, room_map, cases):
-    """Return a relocalizer with depth; publish depth next to a frame until it answers."""
-    process = start_shared('nodes.relocalizer', parameters=class_matching(
-        room_map, depth_transport='raw', record_folder=cases, algorithm='auto',
-        time_budget_ms=5000.0))  # enough on a busy machine as well
-    process.wait_for_output('ready after')
-    tester.connect()
-    publisher = tester.create_publisher(Image, 'depth', RELIABLE)
+@pytest.fixture
+def depth_camera(tester):
+    """Publishes depth next to a frame, as a camera would, until the answer arrives."""
+    raw = tester.create_publisher(Image, 'depth', RELIABLE)
+    small = tester.create_publisher(CompressedImage, 'depth/compressedDepth', RELIABLE)
 
     def ask(depth):
         frame, future = make_frame(), tester.ask()
 
         def publish_all():
             if depth is not None:
-                publisher.publish(depth)
+                (raw if isinstance(depth, Image) else small).publish(depth)
             return future.done()
         tester.feed_until(publish_all, frame)
         return future.result()
-    yield process, ask
-    tester.destroy_publisher(publisher)
-    assert 'Traceback' not in process.output()
+    yield ask
+    tester.destroy_publisher(raw)
+    tester.destroy_publisher(small)
 
 
-def test_depth_counts_and_a_recorded_request_keeps_it(camera, tester, cases, room_map, replay):
-    _, ask = camera
-    answer = ask_until(ask, 'depth of 12', message(make_frame()))
+def test_depth_counts_and_a_recorded_request_keeps_it(own_relocalizer, tester, depth_camera,
+                                                      room_map, tmp_path, replay):
+    own_relocalizer(depth_transport='raw', record_folder=tmp_path, **SEARCH)
+    answer = ask_until(depth_camera, 'depth of 12', message(make_frame()))
     stored = tester.trigger('record')
     assert stored.success, stored.message
-    (case,) = cases.glob('case_*')
+    (case,) = tmp_path.glob('case_*')
     replay(case, room_map, answer)
-
-
-def test_a_request_never_waits_for_depth(camera):
-    """The depth camera is silent, late, or has no depth."""
-    _, ask = camera
-    for depth in (None, message(make_frame(), late_s=0.5), message(make_frame(), 0.0 * DEPTHS_M)):
-        answer = ask(depth)
-        assert answer.success, answer.message
-        assert 'depth' not in answer.message
 
 
 @pytest.mark.parametrize(('given', 'said'), [
     ({'encoding': '32FC1', 'frame_id': 'other'}, "'other'"),
     ({'depths_m': 1.7 * DEPTHS_M}, 'no longer used')])
-def test_depth_that_cannot_be_right_is_left_out_and_named(camera, given, said):
-    process, ask = camera
+def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth_camera, given,
+                                                          said):
+    process = own_relocalizer(depth_transport='raw', **SEARCH)
     for _ in range(30):
-        answer = ask(message(make_frame(), **given))
+        answer = depth_camera(message(make_frame(), **given))
         assert answer.success, answer.message
         assert ', depth of' not in answer.message
         if said in process.output():
             break
     assert process.output().count(said) == 1
+
+
+def test_a_request_never_waits_for_depth(own_relocalizer, depth_camera):
+    """The depth camera is silent, late, or has no depth."""
+    process = own_relocalizer(depth_transport='raw', **SEARCH)
+    for depth in (None, message(make_frame(), late_s=0.5), message(make_frame(), 0.0 * DEPTHS_M)):
+        answer = depth_camera(depth)
+        assert answer.success, answer.message
+        assert 'depth' not in answer.message
+    assert 'Traceback' not in process.output()
