@@ -18,6 +18,7 @@ from cliploc_ros.core.map.visibility import Expected, Missing, expect
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.watch.camera import ImageFaults
 from cliploc_ros.core.watch.look import (
     LookEvidence,
     align,
@@ -26,7 +27,7 @@ from cliploc_ros.core.watch.look import (
     look_at,
     measure,
 )
-from cliploc_ros.core.watch.watch import Belief, ImageFaults, Watch, WatchState
+from cliploc_ros.core.watch.watch import Belief, Watch, WatchState
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
@@ -59,11 +60,14 @@ def test_good_images_have_no_fault(images):
     assert faults_of(images, poses(6)) == [''] * 6
 
 
-@pytest.mark.parametrize('change', [lambda one: one // 20, lambda one: np.full_like(one, 90)])
-def test_a_fault_that_lasts_is_named(images, change):
+@pytest.mark.parametrize(('change', 'word', 'looks'), [
+    (lambda one: one // 20, 'dark', 3),
+    (lambda one: np.full_like(one, 90), 'covered', 3),
+    (lambda one: cv2.GaussianBlur(one, (0, 0), 6.0), 'blurred', 5)])
+def test_a_fault_that_lasts_is_named(images, change, word, looks):
     found = faults_of([images[0], *map(change, images)], poses(7))
-    assert found[:3] == [''] * 3
-    assert 'dark, covered' in found[3]
+    assert found[:looks] == [''] * looks
+    assert word in found[looks]
     # one good image ends it
     again = faults_of([*map(change, images), images[0]], poses(7))
     assert again[-1] == ''
@@ -72,6 +76,17 @@ def test_a_fault_that_lasts_is_named(images, change):
 def test_the_same_image_is_frozen_only_for_a_robot_that_moves(images):
     assert 'frozen' in faults_of([images[0]] * 6, poses(6))[-1]
     assert faults_of([images[0]] * 6, poses(6, step_m=0.0)) == [''] * 6
+
+
+def test_a_standing_robot_before_a_smooth_wall_is_no_fault(images):
+    smooth = [cv2.GaussianBlur(images[0], (0, 0), 6.0) + np.uint8(row) for row in range(6)]
+    assert faults_of(smooth, poses(6, step_m=0.0)) == [''] * 6
+
+
+@pytest.mark.full
+@pytest.mark.parametrize('shape', [(1, 1, 3), (480, 3, 3), (1080, 1920, 3)])
+def test_images_of_any_shape(shape):
+    faults_of([np.zeros(shape, dtype=np.uint8)] * 4, poses(4))
 
 
 CAMERA = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
@@ -258,6 +273,17 @@ def test_a_jump_in_place_or_in_heading_alone_speaks_against_the_new_pose(change)
     belief.add(seen, 3.0, is_full=True)
     belief.wait(seen, moved(np.eye(4), *change))
     assert belief.has_jumped and belief.probability < 0.5
+
+
+def test_without_odometry_the_watch_learns_more_slowly(room):
+    chances = []
+    for odom in (True, False):
+        watch = Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
+        wrong = moved(np.eye(4), 2.0, 0.5)
+        chances.append([report.probability for report in follow(watch, room, drive(12), wrong,
+                                                          odom=odom)])
+    assert chances[0][3] < chances[1][3]
+    assert chances[1][-1] < 0.05
 
 
 def test_missing_landmarks_are_named(watch, room):

@@ -6,33 +6,20 @@ The probability that a localizer is right is estimated by a Bayes filter over lo
 a localizer may get lost or recover, so the probability decays to one half with time and distance.
 A pose that jumps relative to odometry starts a new hypothesis. Looks from the same spot share
 errors, such as the errors of the map, so further looks of a standing robot add little information.
-
-Each sign of a fault must persist for several looks. An image that stays bitwise identical while
-the robot moves is frozen.
-
-If the stated orientation of the mount is wrong, it is off by the same angle in all looks at right
-poses. Each look gives the turn from the given pose to the fitted pose. The errors of both poses
-change along the way, while the turn of the camera is constant, so it is the median of the turns. A
-constant yaw error of the localizer has the same effect as a camera that is turned about the
-vertical: the images cannot distinguish the two.
 """
 
 import math
-import zlib
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import (
     SAME_PLACE,
-    SAME_VIEW,
     invert_transform,
     is_rigid,
     pose_error,
@@ -42,8 +29,8 @@ from cliploc_ros.core.map.visibility import Missing
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import vertical_of
+from cliploc_ros.core.watch.camera import CameraTurn, ImageFaults, TurnEstimate
 from cliploc_ros.core.watch.look import (
-    Alignment,
     LookEvidence,
     align,
     by_keyframes,
@@ -130,98 +117,6 @@ def _correlation(earlier: _Look, look: _Look) -> float:
         away = way_m / terms.correlated_m + turn_deg / terms.correlated_deg
     # looks with contradictory evidence are not repetitions: the robot was carried away, or back
     return terms.correlated * math.exp(-away - abs(earlier.log_odds - look.log_odds) / terms.most)
-
-
-class ImageFaults:
-    """Detects images of one camera that show nothing or are frozen."""
-
-    def __init__(self) -> None:
-        self._bare = self._frozen = 0  # number of such images in a row
-        self._pose = np.full((4, 4), np.nan)
-        self._checksum = -1
-
-    def add(self, image: NDArray[np.uint8], pose: NDArray[np.float64]) -> str:
-        """Add an image (h, w, 3) and its pose (4, 4); return the fault as text, empty if none.
-
-        The pose should come from odometry if available.
-        """
-        terms = CALIBRATION.images
-        width = int(terms.width_px)
-        height = max(1, round(image.shape[0] * width / image.shape[1]))
-        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
-        is_dark = grey.mean() < terms.dark and np.quantile(grey, terms.dark_part) < terms.dark_high
-        self._bare = self._bare + 1 if is_dark or grey.std() < terms.bare else 0
-        moved = not SAME_VIEW.agree(pose, self._pose)  # True for the first image: NaN
-        checksum = zlib.crc32(np.ascontiguousarray(image))
-        self._frozen = self._frozen + moved if checksum == self._checksum else 0
-        self._checksum = checksum
-        if moved:
-            self._pose = pose
-        if self._bare >= terms.bare_looks:
-            return 'the camera is in the dark, covered, or faces a bare wall'
-        return 'the image is frozen' if self._frozen >= terms.frozen_looks else ''
-
-
-@dataclass(frozen=True)
-class CameraTurn:
-    """Rotation of the camera relative to its stated mount."""
-
-    #: (3,): rotation vector that turns the stated axes of the camera into the true axes [deg];
-    #: optical axes: x right, y down, z forward
-    rotvec_deg: NDArray[np.float64]
-    sigma_deg: float  #: Standard deviation on each axis
-    #: Whether the axis is vertical: a constant yaw error of the localizer looks the same
-    is_yaw: bool = False
-
-    @property
-    def stated_from_true(self) -> NDArray[np.float64]:
-        """Return the turn as a transform (4, 4)."""
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec(self.rotvec_deg, degrees=True).as_matrix()
-        return turn
-
-    def in_words(self) -> str:
-        """Return the turn as text, such as 'turned by 3.1 degrees about y'."""
-        angle = float(np.linalg.norm(self.rotvec_deg))
-        shares = np.abs(self.rotvec_deg) / max(angle, 1e-9)
-        names = [name for name, share in zip('xyz', shares, strict=True) if share > 0.4]
-        found = f'turned by {angle:.1f} degrees about {" and ".join(names)}'
-        return f'{found}, or the yaw of the localizer is off' if self.is_yaw else found
-
-
-class TurnEstimate:
-    """Estimate of the turn from the last looks; a look from the same spot replaces the last."""
-
-    def __init__(self) -> None:
-        #: Rotation vectors (3,) [deg] in the axes of the stated camera
-        self._turns: deque[NDArray[np.float64]] = deque(maxlen=int(CALIBRATION.turn.most_looks))
-        #: None while it is unknown or not significant
-        self.turn: CameraTurn | None = None
-
-    def add(self, alignment: Alignment, given: NDArray[np.float64], is_new: bool) -> None:
-        """Add a look at a right pose (4, 4)."""
-        terms = CALIBRATION.turn
-        if alignment.fit.support.inliers < terms.matched:
-            return
-        if self._turns and not is_new:
-            self._turns.pop()
-        self._turns.append(Rotation.from_matrix(
-            given[:3, :3].T @ alignment.fit.pose[:3, :3]).as_rotvec(degrees=True))
-        if len(self._turns) < terms.least_looks:
-            return
-        turns = np.array(self._turns)
-        median = np.median(turns, axis=0)
-        # of a normal distribution: its deviation by the median deviation, that of its median by
-        # the deviation; consecutive looks are correlated in pairs
-        sigmas = (1.4826 * np.median(np.abs(turns - median), axis=0)
-                  * math.sqrt(math.pi / 2) * math.sqrt(2.0 / len(turns)))
-        angle = float(np.linalg.norm(median))
-        axis = median / max(angle, 1e-12)
-        is_sure = angle >= max(terms.least_deg,
-                               terms.least_sigmas * float(np.linalg.norm(axis * sigmas)))
-        self.turn = CameraTurn(median, float(sigmas.max()), bool(
-            abs(given[2, :3] @ axis) > terms.yaw_share)) if is_sure else None
 
 
 class WatchState(StrEnum):
