@@ -45,6 +45,8 @@ logger = logging.getLogger(__name__)
 #: Value of keyframes_file that selects the layer next to the map, if it exists.
 NEXT_TO_MAP = 'auto'
 _DIGITS = 12
+# A map file that changes while it is read is read again.
+_ATTEMPTS = 3
 # A search ends this long before its request, see Localizer.answer.
 _LATE_S = 0.1
 
@@ -273,31 +275,41 @@ def load_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
     The hash is the beginning of the output of `cat FILE... | sha256sum`. For a map in parameters
     it is the hash of its landmarks.
 
-    MapError: the map is invalid; the message names the source, the landmark and the field.
+    MapError: the map is invalid, and the message names the source, the landmark and the field; or
+    a file changes repeatedly while it is read.
     """
-    if files:
+    for _ in range(_ATTEMPTS if files else 0):
+        before = _hash_of(files)
         landmark_map = join_maps([LandmarkMap.from_file(file) for file in files], files)
-        try:
-            content = b''.join(map(read_file, files))
-        except OSError as error:
-            raise MapError(f'{", ".join(files)}: {error}') from error
-    else:
-        parameters = node.get_parameters_by_prefix('map')
-        if not parameters:
-            raise MapError('no map: set map_file, or load a map with --params-file')
-        tree: dict[str, Any] = {}
-        for name, parameter in parameters.items():
-            *path, last = name.split('.')
-            branch = tree
-            for key in path:
-                branch = branch.setdefault(key, {})
-                if not isinstance(branch, dict):
-                    raise MapError(f"parameters: map.{name}: '{key}' has both a value and fields")
-            branch[last] = parameter.value
-        landmark_map = LandmarkMap.from_mapping(tree, 'parameters')
-        content = b''.join([
-            repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
-                  landmark_map.class_ids)).encode(),
-            landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
-            landmark_map.quats_xyzw.tobytes()])
+        if before == _hash_of(files):
+            return landmark_map, before
+    if files:
+        raise MapError(f'{", ".join(files)}: changes while it is read; write a new file, then '
+                       'rename it')
+    parameters = node.get_parameters_by_prefix('map')
+    if not parameters:
+        raise MapError('no map: set map_file, or load a map with --params-file')
+    tree: dict[str, Any] = {}
+    for name, parameter in parameters.items():
+        *path, last = name.split('.')
+        branch = tree
+        for key in path:
+            branch = branch.setdefault(key, {})
+            if not isinstance(branch, dict):
+                raise MapError(f"parameters: map.{name}: '{key}' has both a value and fields")
+        branch[last] = parameter.value
+    landmark_map = LandmarkMap.from_mapping(tree, 'parameters')
+    content = b''.join([
+        repr((landmark_map.frame_id, landmark_map.landmark_ids, landmark_map.labels,
+              landmark_map.class_ids)).encode(),
+        landmark_map.centers.tobytes(), landmark_map.semi_axes.tobytes(),
+        landmark_map.quats_xyzw.tobytes()])
     return landmark_map, hashlib.sha256(content).hexdigest()[:_DIGITS]
+
+
+def _hash_of(files: Sequence[str]) -> str:
+    """Return the hash of files; empty if one cannot be read, which LandmarkMap.from_file reports."""
+    try:
+        return hashlib.sha256(b''.join(map(read_file, files))).hexdigest()[:_DIGITS]
+    except OSError:
+        return ''

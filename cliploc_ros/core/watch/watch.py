@@ -18,12 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.calibration import CALIBRATION
-from cliploc_ros.core.geometry.transforms import (
-    SAME_PLACE,
-    invert_transform,
-    is_rigid,
-    pose_error,
-)
+from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, is_rigid, pose_error
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.map.visibility import Missing
 from cliploc_ros.core.observation import Observation
