@@ -308,7 +308,7 @@ def load_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
 
 
 def _hash_of(files: Sequence[str]) -> str:
-    """Return the hash of files; empty if one cannot be read, which LandmarkMap.from_file reports."""
+    """Return the hash of files; empty if one cannot be read, which from_file reports."""
     try:
         return hashlib.sha256(b''.join(map(read_file, files))).hexdigest()[:_DIGITS]
     except OSError:
