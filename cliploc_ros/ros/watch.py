@@ -105,7 +105,8 @@ class Watcher:
         self._cost_s = 0.0
         # The state and the problem that were logged last, and when (monotonic clock) [s].
         self._said, self._said_at = (WatchState.UNCERTAIN, ''), -math.inf
-        self._reaction = ''  # to a lost robot
+        # Reaction to a lost robot, and whether it is at rest.
+        self._reaction, self._is_at_rest = '', False
         self._rest_stamp: Time | None = None
         # Stamp of the newest checked image, and whether the localizer ever had a pose.
         self._image_stamp, self._had_pose = Time(), False
@@ -155,6 +156,7 @@ class Watcher:
         report = known.report
         health.values |= {
             'watch': str(known.state), 'watch reason': known.reason, 'on lost': self._reaction,
+            'lost and at rest': known.state is WatchState.LOST and self._is_at_rest,
             'watch look [ms]': f'{1e3 * self._cost_s:.1f}'}
         if report is not None:
             turned = '' if report.camera_turn is None else \
@@ -264,6 +266,8 @@ class Watcher:
             self._state.publish(String(data=str(known.state)))
         if known.state is WatchState.LOCALIZED:
             self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
+        if known.state is not WatchState.LOST:
+            self._is_at_rest = False
         # stamps and ages make each problem a new text
         now, said = time.monotonic(), (known.state, re.sub(r'\d[\d.]*', '', known.problem))
         if said != self._said and (known.state is not before.state
@@ -300,7 +304,8 @@ class Watcher:
         """Relocalize a robot at rest at increasing intervals, unless on_lost is report."""
         parameters = self._node.settings.values
         self._reaction = self._why_not_at_rest(parameters, stamp)
-        if self._reaction:
+        self._is_at_rest = not self._reaction
+        if not self._is_at_rest:
             return
         left_s = self._next_request_at - time.monotonic()
         if parameters.on_lost == 'report' or stopped.is_set():
