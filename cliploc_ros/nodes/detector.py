@@ -216,8 +216,6 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         since = self._newest.waiting_since
         health.values |= {'images dropped': self._newest.dropped, 'queue age [s]':
                           f'{0.0 if since is None else time.monotonic() - since:.2f}'}
-        if self._first_boxes_s is not None:
-            health.values['first boxes after [s]'] = f'{self._first_boxes_s:.2f}'
 
     def _update(self) -> None:
         """Subscribe to the images of each camera whose detections have a subscriber."""

@@ -29,10 +29,11 @@ HEIGHTS = replace(OPTIONS, height_range_m=(0.8, 2.2))
 def judge(office_map):
     """Return the results of queries by seed, and the share within their 95 % ellipsoids."""
     def run(options, *queries):
-        found, = summarize([result for trial, its in enumerate(queries) for result in run_trial(
-            office_map, Method('auto', options), trial, its)])
-        right = found.accepted & (found.errors_m < 1.0)
-        within = float((found.nees[right] < chi2.ppf(0.95, 6)).mean())
+        results = [result for trial, its in enumerate(queries)
+                   for result in run_trial(office_map, Method('auto', options), trial, its)]
+        found, = summarize(results)
+        within = float(np.mean([result.nees < chi2.ppf(0.95, 6) for result in results
+                                if result.accepted and result.error_m < 1.0]))
         print(f'\nsuccess {[round(found.success(limit), 3) for limit in LIMITS_M]}, precision '
               f'{found.precision():.3f}, recall {found.recall():.3f}, {within:.3f} within')
         return found, within
