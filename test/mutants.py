@@ -378,7 +378,7 @@ class Judge:
         self._is_sound: dict[str, bool] = {}
 
     def outcome(self, mutant: Mutant) -> tuple[Mutant, int, str]:
-        """Return a fault, the number of tests that could detect it, and the one that did."""
+        """Return a fault, the number of tests that could detect it, and the test that did."""
         tests = self._tests[mutant.kernels]
         names = [name for name in tests.of(mutant) if self._is_sound.get(name, True)]
         while names:

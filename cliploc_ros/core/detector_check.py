@@ -21,6 +21,8 @@ from cliploc_ros.errors import did_you_mean
 _MOST_FRAMES, _LEAST = 20, 3
 # Maximum number of names in a message, and of their characters.
 _MOST_NAMES, _MOST_CHARACTERS = 5, 30
+# Number of boxes of a frame that are kept.
+_MOST_BOXES = 1000
 # Kinds of refusals that a faulty detector explains.
 _ITS_KINDS = (RefusalKind.TOO_FEW_OBJECTS, RefusalKind.UNEXPLAINED)
 _TURN = '; turn the camera'
@@ -46,7 +48,8 @@ class DetectorCheck:
 
     def add(self, given: Detections, usable: Detections) -> None:
         """Add the detections of a frame, and the usable ones among them."""
-        self._frames.append((given, usable))
+        # frames are kept, and a message may have 100,000 boxes
+        self._frames.append((given.select(np.arange(min(len(given), _MOST_BOXES))), usable))
 
     @property
     def faults(self) -> list[Fault]:

@@ -51,6 +51,8 @@ BATCH = 4
 # Time that a request needs after its last crops: for searches, in units of the time budget and at
 # most this share of the time left, and for the answer [s]. Chosen.
 _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
+# Remedy where the end of a request cuts off the search.
+_RAISE = '; raise timeout_s'
 _NO_LOOKS = Looks()
 _NO_ROWS = np.empty(0, dtype=np.int64)
 
@@ -400,11 +402,16 @@ class Localizer:
                              by_keyframes=query.by_keyframes and (
                                  seen is None or seen.is_complete),
                              is_thorough=seen is not None and seen.is_thorough)
-        if (self._keyframes is not None and query.images and not self.query.by_keyframes
-                and not found.accepted):
-            late = 'keyframes: time was up; raise timeout_s'
-            found = replace(found, reason=f'{found.reason}; {late}') if found.solved else replace(
-                found, reason=late, refusal_kind=RefusalKind.TIME_UP)
+        if found.refusal_kind is RefusalKind.SEARCH_CUT_SHORT and time.monotonic() >= request:
+            found = replace(found, reason=found.reason.partition('; raise ')[0] + _RAISE)
+        if self._keyframes is not None and query.images and not found.accepted:
+            if not self.query.by_keyframes:
+                late = 'keyframes: time was up' + _RAISE
+                found = replace(found, reason=f'{found.reason}; {late}') if found.solved else \
+                    replace(found, reason=late, refusal_kind=RefusalKind.TIME_UP)
+            elif seen is not None and query.is_thorough and not seen.is_thorough:
+                found = replace(found, reason=f'{found.reason}; thorough search of keyframes: '
+                                              'time was up' + _RAISE)
         if is_alone:
             return found
         while earlier and sum(len(instant.searched) for instant in earlier) + len(beside) \

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.kernels.compiled import KernelCache
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layer_of_map
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
@@ -47,8 +46,6 @@ NEXT_TO_MAP = 'auto'
 _DIGITS = 12
 # A map file that changes while it is read is read again.
 _ATTEMPTS = 3
-# A search ends this long before its request, see Localizer.answer.
-_LATE_S = 0.1
 
 
 class Keyframes(NamedTuple):
@@ -129,13 +126,6 @@ class FrameLocalizer:
         query = replace(self.instants.query(frame, parameters, known),
                         is_thorough=not math.isinf(deadline))
         found = self.answer(query, parameters.options(), times, deadline)
-        if not found.accepted and query.is_thorough and found.keyframe_search == 'fast':
-            found = replace(found, reason=f'{found.reason}; thorough search of keyframes: time '
-                                          'was up; raise timeout_s')
-        if found.refusal_kind is RefusalKind.SEARCH_CUT_SHORT and time.monotonic() > deadline - \
-                _LATE_S:  # the request ended the search, not its time budget
-            found = replace(found, reason=found.reason.partition('; raise ')[0]
-                            + '; raise timeout_s')
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest
         if (found.accepted and found.map_from_camera is not None

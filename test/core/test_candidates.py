@@ -208,6 +208,7 @@ def test_other_programs_do_not_cut_a_search_but_the_end_of_its_request_does():
     cut = Localizer(relocalizer).answer(Query((observation,)), deadline=time.monotonic())
     assert cut.tried < Localizer(relocalizer).answer(Query((observation,))).tried
     assert cut.refusal_kind == RefusalKind.SEARCH_CUT_SHORT
+    assert cut.reason.endswith('; raise timeout_s') and 'budget' not in cut.reason
 
 
 @pytest.mark.clock

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Successive frames of one camera: which frames are fused, and which looks must agree."""
 
+import threading
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -624,3 +625,16 @@ def test_a_search_of_keyframes_that_time_cuts_off_is_named_and_repeated():
     assert answers[0] == 'time_up'
     assert Localizer(RELOCALIZER, Late(None)).answer(Query(
         (frame(0.0),), (image,), None)).reason == '', 'accepted without keyframes'
+
+
+def test_a_thorough_search_of_keyframes_that_time_forbids_is_named():
+    class Slow(Says):
+        def localize_features(self, features, camera, guesses, deadline, constraint, fast):
+            if deadline < np.inf:  # the fast search takes all time
+                threading.Event().wait(deadline - time.monotonic())
+            return Recognition(is_thorough=fast is not None)
+    image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    asked = Query((frame(0.0, detections=NOTHING),), (image,), None)
+    late, in_time = (Localizer(RELOCALIZER, Slow(None)).answer(asked, deadline=deadline).reason
+                     for deadline in (time.monotonic() + 1.0, np.inf))
+    assert late == f'{in_time}; thorough search of keyframes: time was up; raise timeout_s'
