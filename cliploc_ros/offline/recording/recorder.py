@@ -188,8 +188,10 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
             logger.warning('recording again, because the options changed: %s', file)
         except DatasetError as error:
             logger.warning('recording again: %s', error)
-    with closing(_open_outputs(file.with_name(outputs_name(frames, described)))) as outputs:
-        recorded = _with_odometry(_record(frames, options, described, outputs), odometry)
+    path = file.with_name(outputs_name(frames, described))
+    with closing(_open_outputs(path)) as outputs:
+        recorded = _with_odometry(_record(
+            frames, options, described, outputs, outputs.path == path), odometry)
     save_observations(file, recorded)
     logger.warning('wrote %s', file)
     return recorded
@@ -256,9 +258,12 @@ def _again(seen: SeenFrame, raw: RawFrame) -> SeenFrame:
                    depth_spreads=depths[1])
 
 
-def _record(frames: Frames, options: RecordingOptions, described: str, outputs: Log
-            ) -> PosedDetections:
-    """Run the networks on all keyframes without an earlier output."""
+def _record(frames: Frames, options: RecordingOptions, described: str, outputs: Log,
+            lasts: bool) -> PosedDetections:
+    """Run the networks on all keyframes without an earlier output.
+
+    The file of outputs is removed at the end, unless it `lasts`: a later run finds it.
+    """
     earlier = {(entry.camera, entry.place, entry.stamp_ns): entry for entry in outputs.read()[0]}
     if earlier:
         logger.warning('using the boxes of %d images of earlier runs: %s', len(earlier),
@@ -288,12 +293,12 @@ def _record(frames: Frames, options: RecordingOptions, described: str, outputs: 
                         check_depth_unit(np.concatenate([frame.depths for frame in seen]),
                                          str(frames.source))
     except BaseException:
-        if is_kept:
+        if is_kept and lasts:
             logger.warning('the boxes of this run are kept in %s: run again to continue from '
                            'there, or delete it', outputs.path)
         raise
     finally:
-        if not is_kept:
+        if not (is_kept and lasts):
             outputs.remove()
     if unusable:
         if len(unusable) > MOST_LEFT_OUT * (len(seen) + len(unusable)):
