@@ -9,10 +9,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as ParameterMsg
 from rclpy.exceptions import InvalidServiceNameException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.validate_topic_name import validate_topic_name
+from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from cliploc_ros.errors import CliplocError, OptionsError
 
@@ -84,9 +85,9 @@ class NotRunningError(CliplocError):
 def check_name(name: str) -> None:
     """Raise OptionsError unless the value of `--relocalizer` is a valid name of a node."""
     try:
-        validate_topic_name(f'{name}/relocalize', is_service=True)
-    except InvalidServiceNameException as error:
-        raise OptionsError(f'--relocalizer: {error}') from error
+        validate_full_topic_name(expand_topic_name(name, 'node', '/'), is_service=True)
+    except (InvalidServiceNameException, ValueError) as error:
+        raise OptionsError(f'--relocalizer: {str(error).partition(", at ")[0]}') from error
 
 
 def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, list[Parameter]]:

@@ -19,7 +19,9 @@ from test_prior_node import SEARCH, TWINS, at
 from tester import class_matching, make_frame
 
 from cliploc_ros.core.keyframes.layer import layer_path, save_layer
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.qos import LATCHED
+from cliploc_ros.ros.running import check_name
 
 LINE = re.compile('^(.{12}) (pass|fail|not checked|refused) +(.*)$', re.MULTILINE)
 WHOLE = {'parameters': 'valid', 'map': '12 landmarks', 'camera': 'it publishes image, ',
@@ -163,3 +165,9 @@ def test_a_relocalizer_that_does_not_run_is_named(examine):
     found, code = examine('--relocalizer', 'nobody')
     assert (code, list(found), found['relocalizer'][0]) == (1, ['relocalizer'], 'fail')
     assert '/nobody' in found['relocalizer'][1]
+
+
+@pytest.mark.parametrize('name', ['', '/a//b', 'a b', '/a/', '7', '/', '{x}'])
+def test_what_is_no_name_of_a_node_is_refused(name):
+    with pytest.raises(OptionsError, match='--relocalizer: '):
+        check_name(name)
