@@ -68,8 +68,9 @@ def check_weights_file(path: Path) -> None:
         raise ModelError(f'{path} is a web page, not weights: download the file behind it')
     if head.startswith(b'PK') and not zipfile.is_zipfile(path):
         raise damaged(path, 'the end of the archive is missing')
-    heads = _ONNX_HEAD if path.suffix == '.onnx' else _HEADS
-    if path.suffix != '.safetensors' and not head.startswith(heads):
+    if path.suffix == '.onnx' and not head.startswith(_ONNX_HEAD):
+        raise damaged(path, 'it does not begin like an ONNX file')
+    if path.suffix not in ('.onnx', '.safetensors') and not head.startswith(_HEADS):
         raise ModelError(f'{path} holds no weights: it is not a file of PyTorch, and its name is '
                          'not that of an ONNX or safetensors file')
     # The format: eight bytes with the length of a JSON header, the header, the tensors.

@@ -233,7 +233,7 @@ def test_damaged_files(load, tmp_path):
     (tmp_path / 'cut.onnx').write_bytes(content[:len(content) // 2])
     assert 'truncated or corrupt' in refusal(load, tmp_path / 'cut.onnx')
     (tmp_path / 'text.onnx').write_text('hello')
-    assert 'holds no weights' in refusal(load, tmp_path / 'text.onnx')
+    assert 'does not begin like an ONNX file' in refusal(load, tmp_path / 'text.onnx')
     (tmp_path / 'empty.onnx').touch()
     assert 'is empty' in refusal(load, tmp_path / 'empty.onnx')
     assert 'does not exist' in refusal(load, tmp_path / 'gone.onnx')
