@@ -35,7 +35,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import pdist
 
 from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.finalists import Match
@@ -173,7 +172,9 @@ def _of_group(centers: NDArray[np.float64], inliers: float, misfit: float) -> fl
     object elsewhere in the room, tell groups apart.
     """
     terms = CALIBRATION.group
-    if inliers >= terms.large or pdist(centers).max(initial=0.0) > terms.extent_m:
+    # scipy's pdist would take a tenth of the time of a support
+    if inliers >= terms.large or np.linalg.norm(
+            centers[:, None] - centers, axis=2).max(initial=0.0) > terms.extent_m:
         return 0.0
     share = np.interp(inliers, (terms.small, terms.large), (1.0, 0.0))
     return float(share * (terms.unmapped

@@ -4,13 +4,15 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.confidence import (
+    ComparedFrame,
     Setting,
     Support,
     compared_frame,
@@ -32,7 +34,8 @@ from cliploc_ros.core.search.frame_search import SearchedFrame
 _NONE = np.empty(0, dtype=np.int64)
 
 
-class JoinedFrames(NamedTuple):
+@dataclass(frozen=True)
+class JoinedFrames:
     """The data on which poses are compared: F searched frames, joined to a rig, and the map."""
 
     landmark_map: LandmarkMap
@@ -40,6 +43,17 @@ class JoinedFrames(NamedTuple):
     frames: Sequence[SearchedFrame]
     rig: Rig  #: The rig of these frames
     cameras: NDArray[np.float64]  #: (F, 4, 4): camera_from_last of each frame
+
+    @cached_property
+    def compared(self) -> list[ComparedFrame]:
+        """Return the data of each frame that the supports of all poses need."""
+        compared = []
+        for frame in self.frames:
+            seen = frame.observation if self.options.needs_similarities \
+                else replace(frame.observation, similarities=None)
+            compared.append(compared_frame(self.landmark_map, seen.detections, frame.scene,
+                                           seen.similarities, seen.similarity_rows))
+        return compared
 
     @property
     def knows_vertical(self) -> bool:
@@ -125,14 +139,8 @@ def contenders_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: 
 def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],
                 matches: Sequence[list[tuple[Match, ...]]]) -> list[Support]:
     """Return the support of each pose (m, 4, 4), from its matches in each frame."""
-    compared = []
-    for frame in joined.frames:
-        seen = frame.observation if joined.options.needs_similarities \
-            else replace(frame.observation, similarities=None)
-        compared.append(compared_frame(joined.landmark_map, seen.detections, frame.scene,
-                                       seen.similarities, seen.similarity_rows))
     last_from_cameras = np.linalg.inv(joined.cameras)
-    return [support(joined.landmark_map, compared, pose @ last_from_cameras, found)
+    return [support(joined.landmark_map, joined.compared, pose @ last_from_cameras, found)
             for pose, found in zip(poses, matches, strict=True)]
 
 

@@ -66,7 +66,11 @@ class Finalist(NamedTuple):
 
 def poses_of(found: Sequence[Finalist]) -> NDArray[np.float64]:
     """Return map_from_camera (m, 4, 4) of each finalist."""
-    return np.array([pose.map_from_camera for pose in found]).reshape(-1, 4, 4)
+    poses = np.tile(np.eye(4), (len(found), 1, 1))
+    backs = np.array([pose.rotation for pose in found]).reshape(-1, 3, 3).transpose(0, 2, 1)
+    poses[:, :3, :3] = backs
+    poses[:, :3, 3:] = -backs @ np.array([pose.translation for pose in found]).reshape(-1, 3, 1)
+    return poses
 
 
 def find_with_rivals(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, deadline: Deadline

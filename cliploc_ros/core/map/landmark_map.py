@@ -119,9 +119,14 @@ class ClassIndex:
 
         1 for a class of the landmark without a known weight, 0 for other classes.
         """
-        known = [self.weights.get(pair, 1.0) for pair in zip(landmarks.tolist(), classes.tolist(),
-                                                             strict=True)]
-        return np.asarray(self.have(landmarks, classes) * np.array(known, dtype=np.float64))
+        pairs = zip(landmarks.tolist(), classes.tolist(), strict=True)
+        return np.array([self._shares.get(pair, 0.0) for pair in pairs])
+
+    @cached_property
+    def _shares(self) -> dict[tuple[int, int], float]:
+        """Return the weight of each membership; see weights."""
+        return {(row, number): self.weights.get((row, number), 1.0)
+                for row, number in self.members.tolist()}
 
     @cached_property
     def _other_keys(self) -> NDArray[np.int64]:
