@@ -70,20 +70,19 @@ class Alike(NamedTuple):
 
     @property
     def are_rooms(self) -> NDArray[np.bool_]:
-        """Return which places (m,) are separate rooms, with landmarks of their own.
+        """Return which places (m,) are rooms of their own, or the other half of a symmetric room.
 
-        Their landmarks lie beyond the given place. If the rooms are so near that the given place
-        has landmarks of both, a move takes the landmarks of one room, one by one, to landmarks
-        that it takes nowhere. Moves that fit by chance take several landmarks to one, or
-        landmarks to each other's places. Rooms that are furnished alike may have the same
-        posters, too.
+        Their landmarks lie beyond the given place. If the places are so near that the given place
+        has landmarks of both, a move takes each landmark to another one. Moves that fit by chance
+        take several landmarks to one, or a landmark to itself. Rooms that are furnished alike
+        may have the same posters, too.
         """
-        least = _TERMS.least_share * len(self.landmarks)
         beyond = self.found & ~np.isin(self.others, self.landmarks)
-        own = np.array([len({*others[found]} - {*self.landmarks[found]})
-                        for others, found in zip(self.others, self.found, strict=True)])
-        return np.asarray((beyond.sum(axis=1) >= least) | (own >= np.maximum(
-            least, _TERMS.one_to_one * self.found.sum(axis=1))))
+        moved = self.found & (self.others != self.landmarks)
+        distinct = np.array([len({*others[found]})
+                             for others, found in zip(self.others, moved, strict=True)])
+        return np.asarray((beyond.sum(axis=1) >= _TERMS.least_share * len(self.landmarks))
+                          | (distinct >= _TERMS.one_to_one * self.found.sum(axis=1)))
 
 
 def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
