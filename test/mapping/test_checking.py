@@ -20,11 +20,10 @@ from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import MappingError, OptionsError
+from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
 from cliploc_ros.offline.evaluation.pages import CHECK, CHECK_DATA, write_check
-from cliploc_ros.offline.mapping.check.advice import give_advice
-from cliploc_ros.offline.mapping.check.checking import check_map
+from cliploc_ros.offline.mapping.check.checking import check_map, give_advice
 from cliploc_ros.offline.mapping.check.landmark_faults import check_landmarks, hear_witness
 from cliploc_ros.offline.mapping.check.places import LookAlike, find_look_alikes, make_grid
 from cliploc_ros.offline.mapping.check.relocalization import (
@@ -228,9 +227,6 @@ def test_systematic_errors_are_measured(spoil, name, value, tolerance):
                                                        witness.shown)}
     assert found[name].is_significant
     assert found[name].value == pytest.approx(value, abs=tolerance)
-    # one sensor is blamed, whatever else its error would fit better
-    assert len({result.cause for result in found.values()
-                if result.is_significant and not result.follows}) == 1
     # a turned mount looks almost like a shifted principal point
     assert found[name].explained > 0.8 * max(result.explained for result in found.values())
 
@@ -334,10 +330,12 @@ def test_a_recording_of_another_place_is_refused(detections, table, named):
         check_map(table, detections, options=QUICK)
 
 
-@pytest.mark.parametrize('change', [{'folds': 1}, {'frames': 0}, {'spacing_m': 0.0}])
-def test_options_are_checked(change):
-    with pytest.raises(OptionsError, match=next(iter(change))):
-        CheckOptions(**change)
+@pytest.mark.parametrize(('option', 'value'), [('--folds', '1'), ('--headings', '361'),
+                                               ('--grid', '0')])
+def test_options_are_checked(option, value, capsys):
+    with pytest.raises(SystemExit):
+        main(['map.yaml', option, value])
+    assert option in capsys.readouterr().err
 
 
 class _Tags(HTMLParser):

@@ -83,7 +83,7 @@ def test_each_change_is_reported_and_nothing_else():
     assert set(found.landmark_ids[updated.first_new:]) == ids(report.new)
     assert set(np.unique(updated.shown)) <= set(range(-1, len(found)))
     assert len(set(found.landmark_ids)) == len(found) == len(later)
-    assert report.as_dict()['missing'][0]['last_seen'] == 1.0
+    assert report.missing[0].last_seen == 1.0
 
 
 def test_windows_of_frames_do_not_matter(monkeypatch):
@@ -94,7 +94,7 @@ def test_windows_of_frames_do_not_matter(monkeypatch):
     whole = update_map(things, walk)
     monkeypatch.setattr(evidence, '_WINDOW', 7)
     parted = update_map(things, walk)
-    assert parted.report.as_dict() == whole.report.as_dict()
+    assert parted.report == whole.report
     np.testing.assert_array_equal(parted.landmark_map.centers, whole.landmark_map.centers)
     np.testing.assert_array_equal(parted.shown, whole.shown)
 

@@ -120,15 +120,10 @@ def _sample(views: Views) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def _pick(views: Views, frames: NDArray[np.int64], rows: NDArray[np.int64]) -> Views:
     """Return views of the given frames and rows of boxes, each frame with full weight."""
     offsets = np.searchsorted(rows, views.offsets)
-    return views._replace(
-        rotations=views.rotations[frames], translations=views.translations[frames],
-        stamps_s=views.stamps_s[frames], cameras=views.cameras[frames],
-        levers=views.levers[frames], bounds=views.bounds[frames],
+    return views.select(frames, rows)._replace(
         viewpoints=np.arange(len(frames)), weights=np.ones(len(frames)),
         offsets=np.append(offsets[frames], len(rows)),
-        frames=np.searchsorted(frames, views.frames[rows]), classes=views.classes[rows],
-        edges=views.edges[rows], stiffness=views.stiffness[rows], is_open=views.is_open[rows],
-        depths=views.depths[rows], depth_stiffness=views.depth_stiffness[rows])
+        frames=np.searchsorted(frames, views.frames[rows]))
 
 
 def _cost_function(given: Views, refined: Views, landmarks: Landmarks, shown: NDArray[np.int64]

@@ -18,16 +18,10 @@ from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.evidence import gather_evidence
 from cliploc_ros.offline.mapping.fitting import descend, fit_ellipsoid
-from cliploc_ros.offline.mapping.landmarks import (
-    LANDMARK_SIZE,
-    Landmarks,
-    box_iou,
-    group_boxes,
-    project_box,
-)
+from cliploc_ros.offline.mapping.landmarks import Landmarks, box_iou, group_boxes, project_box
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.sizes import log_sizes
-from cliploc_ros.offline.mapping.views import Views
+from cliploc_ros.offline.mapping.views import NO_SIZE, Views
+from cliploc_ros.offline.vocabulary.vocabulary import size_of_class
 
 # Distance of the centre behind the visible surface, as a share of the radius that the box
 # suggests, and its standard deviation. Chosen: the share is 1 for a ball, 0 for a picture on a
@@ -81,9 +75,13 @@ def add_depths(views: Views, detections: PosedDetections,
     sigmas = np.sqrt(np.square(_DEPTH_SIGMA * centers) + np.square(spreads)
                      + np.square(_CENTER_SIGMA * radii * centers))
     known = np.isfinite(centers) & np.isfinite(sigmas)
+    # the factor that covers almost all objects counts as two standard deviations
+    sizes = np.array([NO_SIZE if size is None else
+                      (np.log(0.5 * size.extent_m), 2.0 / np.log(size.factor))
+                      for size in map(size_of_class, detections.class_names)])
     return views._replace(depths=np.where(known, centers, 0.0), depth_stiffness=np.where(
         known, 1.0 / np.where(known, sigmas, 1.0), 0.0),
-        sizes=log_sizes(detections.class_names)[detections.classes])
+        sizes=sizes[detections.classes])
 
 
 def box_radii(views: Views, rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -219,7 +217,6 @@ def _pair_hypotheses(views, rows, seeds, draws):
     stamps = views.stamps_s[views.frames[rows]]
     places = np.searchsorted(rows, seeds)
     partners = np.empty(len(rows), dtype=np.int64)
-    information = np.empty((LANDMARK_SIZE, LANDMARK_SIZE))
     point = np.empty(3)
     pair = np.empty(2, dtype=np.int64)
     count, valid = 0, 0
@@ -240,7 +237,7 @@ def _pair_hypotheses(views, rows, seeds, draws):
         centers[count] = point
         bases[count] = radius * np.eye(3)
         pair[0], pair[1] = rows[first], rows[second]
-        descend(views, pair, centers[count], bases[count], _PAIR_STEPS, information)
+        descend(views, pair, centers[count], bases[count], _PAIR_STEPS)
         count += 1
     return centers[:count].copy(), bases[:count].copy()
 

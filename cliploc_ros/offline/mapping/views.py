@@ -26,6 +26,11 @@ _LEAST_JUMP_M, _LEAST_JUMP_DEG = 0.5, 30.0
 _MAX_EMPTY_SHARE = 0.5
 # A camera that moves by more than this relative to the first one is not on a rig with it.
 _MOST_PLAY_M = 0.5
+# Arrays of Views with a row for each frame, and for each box.
+_OF_FRAMES = ('rotations', 'translations', 'stamps_s', 'cameras', 'levers', 'viewpoints',
+              'weights', 'bounds')
+_OF_BOXES = ('frames', 'classes', 'edges', 'stiffness', 'is_open', 'depths', 'depth_stiffness',
+             'sizes')
 
 
 class Views(NamedTuple):
@@ -58,7 +63,7 @@ class Views(NamedTuple):
     depths: NDArray[np.float64]
     depth_stiffness: NDArray[np.float64]
     #: (n, 2): logarithm of half the longest extent [m] of objects of the box's class and its
-    #: inverse standard deviation, see cliploc_ros.offline.mapping.sizes; only with depth
+    #: inverse standard deviation, see triangulation.add_depths; only with depth
     sizes: NDArray[np.float64]
 
     @property
@@ -86,16 +91,15 @@ class Views(NamedTuple):
 
     def between(self, first: int, last: int) -> 'Views':
         """Return the frames from first up to last, last excluded; nothing is copied."""
-        frames = slice(first, last)
         boxes = slice(int(self.offsets[first]), int(self.offsets[last]))
-        return Views(
-            self.rotations[frames], self.translations[frames], self.stamps_s[frames],
-            self.cameras[frames], self.levers[frames], self.viewpoints[frames],
-            self.weights[frames],
-            self.offsets[first:last + 1] - boxes.start, self.frames[boxes] - first,
-            self.classes[boxes], self.edges[boxes], self.stiffness[boxes], self.is_open[boxes],
-            self.bounds[frames], self.depths[boxes], self.depth_stiffness[boxes],
-            self.sizes[boxes])
+        return self.select(slice(first, last), boxes)._replace(
+            offsets=self.offsets[first:last + 1] - boxes.start, frames=self.frames[boxes] - first)
+
+    def select(self, frames: slice | NDArray[np.int64], boxes: slice | NDArray[np.int64]
+               ) -> 'Views':
+        """Return the given frames and boxes; the caller renumbers offsets and frames."""
+        return self._replace(**{name: getattr(self, name)[rows] for names, rows in (
+            (_OF_FRAMES, frames), (_OF_BOXES, boxes)) for name in names})
 
 
 def make_views(detections: PosedDetections) -> Views:

@@ -23,9 +23,8 @@ from cliploc_ros.offline.mapping.evidence import (
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions
-from cliploc_ros.offline.mapping.sizes import size_of_class
 from cliploc_ros.offline.mapping.views import Views
-from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
+from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes, size_of_class
 
 # A thinner landmark was seen from one side, or is a sheet: boxes hardly constrain its position.
 _MIN_THINNESS = 0.05

@@ -170,7 +170,9 @@ class CheckReport:
     @property
     def localized(self) -> tuple[str, ...]:
         """Return how many frames and positions localize a robot, by evidence, as sentences."""
-        found = [tell_positions(self.grid, self.keyframes)]
+        near, by_objects = self.grid.is_near, self.grid.accepted > 0
+        reached = by_objects if self.keyframes is None else self.keyframes.headings > 0
+        found = [_tell_localized('positions', by_objects[near], reached[near])]
         if self.recording is not None and (judged := self.recording.judged):
             found.insert(0, _tell_localized(
                 'recorded frames',
@@ -236,13 +238,6 @@ class CheckReport:
         return sum(landmark.weight for landmark in self.landmarks
                    if landmark.severity >= SERIOUS) / sum(
             landmark.weight for landmark in self.landmarks)
-
-
-def tell_positions(grid: GridCheck, keyframes: KeyframeCheck | None) -> str:
-    """Return how many grid positions near the recording localize a robot, by evidence."""
-    by_objects = grid.accepted > 0
-    reached = by_objects if keyframes is None else by_objects | (keyframes.headings > 0)
-    return _tell_localized('positions', by_objects[grid.is_near], reached[grid.is_near])
 
 
 def _tell_localized(what: str, by_objects: NDArray[np.bool_], by_any: NDArray[np.bool_]) -> str:
@@ -314,9 +309,6 @@ def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
     Cameras are at positions (n, 3) [m] and look along unit vectors (n, 3).
     """
     places, axes = layer.map_from_camera[:, :3, 3], layer.map_from_camera[:, :3, 2]
-    found = np.zeros(len(positions), dtype=np.bool_)
-    for row, (position, axis) in enumerate(zip(positions, forward, strict=True)):
-        angles = np.degrees(np.arccos(np.clip(axes @ axis, -1.0, 1.0)))
-        costs = np.linalg.norm(places - position, axis=1) / NEAR_M + angles / NEAR_DEG
-        found[row] = bool((costs < 1.0).any())
-    return found
+    angles = np.degrees(np.arccos(np.clip(forward @ axes.T, -1.0, 1.0)))
+    distances = np.linalg.norm(positions[:, None] - places, axis=2)
+    return np.asarray((distances / NEAR_M + angles / NEAR_DEG < 1.0).any(axis=1))

@@ -10,8 +10,7 @@ the new centre counts. An ellipsoid without position_sigma was made by hand, and
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,10 +105,6 @@ class UpdateReport:
     doubtful: tuple[UpdatedLandmark, ...]
     left_out: tuple[LeftOut, ...]  #: New objects that are not good enough for the map
     notes: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain values, for JSON."""
-        return asdict(self)
 
     def lines(self) -> list[str]:
         """Return the report as text."""
