@@ -50,17 +50,6 @@ def test_every_landmark_is_found_where_it_is():
         assert np.sort(built.landmark_map.semi_axes[row]) == pytest.approx(np.sort(axes), abs=.015)
 
 
-def test_noise_and_missed_boxes_cost_little():
-    table = make_table()
-    built = build_map(see(table, walk_around(), noise_px=3.0, missed=0.4))
-    assert len(built.landmark_map) == len(table)
-    assert nearest_errors(built.landmark_map, table).max() < 0.01
-    for details in built.landmark_map.details:
-        assert 0.3 < details.seen_ratio < 0.9
-        assert details.baseline_deg > 90.0
-        assert details.position_sigma < 0.02
-
-
 def test_many_views_leave_an_uncertainty_that_all_share():
     few, many = (build_map(see(make_table(), walk_around(frames), noise_px=3.0)).landmark_map
                  for frames in (20, 180))
@@ -133,8 +122,6 @@ def test_joint_refinement_corrects_poses_and_landmarks():
 
 @pytest.mark.parametrize(('change', 'message'), [
     (lambda one: one.select_frames([3]), 'took 1 viewpoints'),
-    (lambda one: one.with_poses(np.tile(one.map_from_camera[0], (len(one), 1, 1))),
-     'check that the poses'),
     (lambda one: one.select_boxes(np.zeros(len(one.classes), dtype=np.bool_)),
      'have no detections'),
     # a base whose x axis points forward like the camera's z axis
@@ -187,9 +174,12 @@ def test_a_camera_that_stands_still_gives_few_frames():
 def test_a_long_recording_gives_one_landmark_for_each_object():
     table = make_table()
     detections = see(table, walk_around(frames=240, turn_deg=1100.0), noise_px=2.0, missed=0.3)
-    built = build_map(replace(detections, stamps_s=2.0 * np.arange(240)))
-    assert len(built.landmark_map) == len(table)
-    assert nearest_errors(built.landmark_map, table).max() < 0.01
+    built = build_map(replace(detections, stamps_s=2.0 * np.arange(240))).landmark_map
+    assert len(built) == len(table)
+    assert nearest_errors(built, table).max() < 0.01
+    for details in built.details:
+        assert 0.3 < details.seen_ratio < 0.9
+        assert details.baseline_deg > 90.0 and details.position_sigma < 0.02
 
 
 def test_a_map_is_made_written_and_updated(tmp_path):
@@ -257,12 +247,11 @@ def test_with_parallax_boxes_decide_and_an_error_of_scale_is_corrected():
     assert nearest_errors(built.landmark_map, table).max() < 0.01
 
 
-@pytest.mark.parametrize(('scale', 'factor'), [(5.0, '5'), (0.2, '0.2')])
-def test_depth_in_another_unit_is_refused(scale, factor):
+def test_depth_in_another_unit_is_refused():
     table = make_table()
     boxes = see(table, walk_around(frames=30))
-    with pytest.raises(MappingError, match=rf'depth is {factor}.* `depth_unit`'):
-        build_map(measure_depth(boxes, table, scale=scale))
+    with pytest.raises(MappingError, match=r'depth is 0\.2.* `depth_unit`'):
+        build_map(measure_depth(boxes, table, scale=0.2))
 
 
 @pytest.fixture(scope='module')
@@ -293,11 +282,4 @@ def test_far_landmarks_are_passed_over_without_a_loss(floor, seen):
     assert list(zip(found.boxes.tolist(), found.landmarks.tolist(), strict=True)) == sorted(
         expected)
     assert len(expected) > 900
-
-
-def test_no_landmarks_and_no_boxes(floor, seen):
-    views = make_views(seen)
-    none = landmarks_of_map(floor.select([0]), ())
-    assert none.classes.tolist() == [-1]
-    assert len(find_overlaps(views, none, 0.2).boxes) == 0
-    assert len(find_overlaps(views.between(0, 0), none, 0.2).boxes) == 0
+    assert len(find_overlaps(views.between(0, 0), landmarks, 0.2).boxes) == 0

@@ -13,16 +13,16 @@ from walk import look_at, make_table, nearest_errors, see, walk_around
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.offline.mapping.building import build_map
-from cliploc_ros.offline.mapping.joint import State
-from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
-from cliploc_ros.offline.mapping.odometry import link_frames
-from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
-from cliploc_ros.offline.mapping.pose_noise import (
+from cliploc_ros.offline.mapping.joint import (
     _BENDING,
+    State,
     estimate_pose_errors,
     shared_by_neighbours,
     significant_pose_errors,
 )
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
+from cliploc_ros.offline.mapping.odometry import link_frames
+from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
 from cliploc_ros.offline.mapping.views import Views, make_views
 
 ESTIMATING = MappingOptions(estimate_pose_errors=True)
@@ -249,7 +249,4 @@ def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change
 
 def test_frames_without_odometry_are_not_joined(linked):
     assert joined(build_map(moved_odometry(linked, lose), OPTIONS)) == 40
-
-
-def test_poses_that_are_taken_as_they_are_need_no_odometry(linked):
-    assert joined(build_map(linked)) is None
+    assert joined(build_map(linked)) is None, 'poses that are taken as they are need none'

@@ -22,7 +22,7 @@ from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
 from cliploc_ros.ros.conversions import pose_from_msg
 from studies.watch.__main__ import run
 from studies.watch.judge import KIDNAPPED, alarm_table, judge, right_table, simulated_drive
-from studies.watch.recordings import WatchedLook, alarms_of, summarize_watch, write_watch
+from studies.watch.recordings import WatchedLook, alarms_of, summarize_watch
 
 pytestmark = pytest.mark.full
 
@@ -58,15 +58,6 @@ def test_figures_of_a_short_drive():
     assert found['wrong_stretches'] == [
         {'stamp_s': 8.0, 'seconds': 4.0, 'metres': 1.0, 'looks': 3}]
     assert found['states'] == {'localized': 3, 'uncertain': 1, 'lost': 3}
-
-
-def test_without_truth_nothing_is_false(tmp_path):
-    looks = looked(['localized', 'lost'], [None, None], [0.9, 0.01])
-    found = summarize_watch(looks)
-    assert found['false_alarms'] is None
-    assert found['wrong_stretches'] == []
-    assert 'false' not in write_watch(tmp_path, looks)
-    assert summarize_watch([])['looks'] == 0
 
 
 @pytest.fixture(scope='module')

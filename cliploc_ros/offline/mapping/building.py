@@ -23,7 +23,16 @@ from cliploc_ros.offline.mapping.evidence import (
     reasons_against,
 )
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
-from cliploc_ros.offline.mapping.joint import pose_changes, pose_errors, refine_jointly
+from cliploc_ros.offline.mapping.joint import (
+    estimate_pose_errors,
+    estimated_note,
+    left_by_poses,
+    pose_changes,
+    pose_errors,
+    refine_jointly,
+    shared_by_neighbours,
+    significant_pose_errors,
+)
 from cliploc_ros.offline.mapping.landmarks import (
     Landmarks,
     group_boxes,
@@ -32,13 +41,6 @@ from cliploc_ros.offline.mapping.landmarks import (
 )
 from cliploc_ros.offline.mapping.odometry import link_frames
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.offline.mapping.pose_noise import (
-    estimate_pose_errors,
-    estimated_note,
-    left_by_poses,
-    shared_by_neighbours,
-    significant_pose_errors,
-)
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection, refine_mount
 from cliploc_ros.offline.mapping.triangulation import (
@@ -139,13 +141,6 @@ class MappingReport:
     pose_change_deg: float
     left_out: tuple[LeftOut, ...]  #: The landmarks with the greatest support first
     notes: tuple[str, ...]  #: Problems with the input, and what to do about them
-
-    @staticmethod
-    def of_nothing(detections: PosedDetections, error: MappingError) -> 'MappingReport':
-        """Return the report of a recording that shows no landmarks."""
-        return MappingReport(
-            len(detections), 0, len(detections.classes), 0, 0.0, 0.0, 0.0, 0.0, 0.0,
-            error.left_out if isinstance(error, NothingFoundError) else (), (str(error),))
 
     def lines(self) -> list[str]:
         """Return the report as text."""

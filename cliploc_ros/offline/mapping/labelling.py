@@ -80,26 +80,20 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
     labels = list(landmark_map.labels)
     details = list(landmark_map.details or [LandmarkDetails()] * len(labels))
     for row in np.nonzero(embeddings.is_known)[0]:
-        fitting = best_phrases(embeddings.means[row].astype(np.float32),
-                                [part for name in classes_of(landmark_map, int(row))
-                                 for part in phrases[name]])
-        labels[row] = fitting[0][0]
-        details[row] = replace(details[row], labels=fitting)
+        mean = embeddings.means[row].astype(np.float32)
+        similarities = {
+            text: float(similarity) for name in classes_of(landmark_map, int(row))
+            for texts, rows in phrases[name]
+            for text, similarity in zip(texts, rows @ mean, strict=True)}
+        best = sorted(similarities, key=lambda text: -similarities[text])[:_LABELS]
+        weights = np.exp(_CLIP_SCALE * np.array([similarities[text] - similarities[best[0]]
+                                                 for text in best]))
+        # the map file stores five digits and allows no weight of 0
+        weights = np.maximum(weights / weights.sum(), 1e-4)
+        labels[row] = best[0]
+        details[row] = replace(details[row], labels=tuple(
+            zip(best, weights.tolist(), strict=True)))
     return replace(landmark_map, labels=tuple(labels), details=tuple(details))
-
-
-def best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]
-                  ) -> tuple[tuple[str, float], ...]:
-    """Return the best phrases and their weights, best first."""
-    similarities = {
-        text: float(similarity) for texts, rows in phrases
-        for text, similarity in zip(texts, rows @ mean, strict=True)}
-    best = sorted(similarities, key=lambda text: -similarities[text])[:_LABELS]
-    weights = np.exp(_CLIP_SCALE * np.array([similarities[text] - similarities[best[0]]
-                                             for text in best]))
-    # the map file stores five digits and allows no weight of 0
-    weights = np.maximum(weights / weights.sum(), 1e-4)
-    return tuple(zip(best, weights.tolist(), strict=True))
 
 
 def choose_medoids(crops: NDArray[np.float32], weights: NDArray[np.float64]) -> list[int]:

@@ -176,8 +176,9 @@ def make_map(detections: PosedDetections, labeller: Labeller,
         made = MadeMap(landmark_map, built.report, embeddings, mount=built.mount)
     except MappingError as error:
         failure = error
-        made = MadeMap(LandmarkMap.empty(options.frame_id),
-                       MappingReport.of_nothing(detections, error))
+        made = MadeMap(LandmarkMap.empty(options.frame_id), MappingReport(
+            len(detections), 0, len(detections.classes), 0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            getattr(error, 'left_out', ()), (str(error),)))
     try:
         if frames is not None and layer is not None:
             return replace(made, layer=build_layer(frames, made.landmark_map, layer))

@@ -66,9 +66,6 @@ class OdometryErrors:
         return np.asarray(sigmas * [1.0, np.radians(1.0)])
 
 
-_ODOMETRY_ERRORS = OdometryErrors()
-
-
 #: Classes of COCO that move by themselves, or are thrown or driven.
 MOVING_CLASSES = (
     'person', 'bird', 'cat', 'dog', 'horse', 'sheep', 'cow', 'elephant', 'bear', 'zebra',
@@ -93,7 +90,7 @@ class MappingOptions:
     #: Without pose_errors, estimate them, and refine the poses if they are significant
     estimate_pose_errors: bool = False
     #: Errors of the odometry between frames, which constrains the poses in their refinement
-    odometry_errors: OdometryErrors = _ODOMETRY_ERRORS
+    odometry_errors: OdometryErrors = field(default_factory=OdometryErrors)
     refine_mount: bool = False  #: Correct the mount of the camera, which all poses share
     #: The coordinate frame and the origin that the map file names
     frame_id: str = 'map'

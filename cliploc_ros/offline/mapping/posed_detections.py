@@ -104,11 +104,6 @@ class PosedDetections:
         """Return the name of a frame's camera; '' for a single unnamed camera."""
         return self.camera_names[self.frame_cameras[frame]]
 
-    @property
-    def of_first_camera(self) -> NDArray[np.float64]:
-        """Return the poses (k, 4, 4) of the first camera."""
-        return self.map_from_camera[self.frame_cameras == 0]
-
     def every(self, step: int, first: int = 0) -> NDArray[np.int64]:
         """Return every n-th frame of each camera, in the order of time.
 

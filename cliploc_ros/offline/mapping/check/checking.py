@@ -19,28 +19,25 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.building import Progress
-from cliploc_ros.offline.mapping.check.landmark_faults import (
-    Witness,
-    check_landmarks,
-    find_map_overlaps,
-    hear_witness,
-)
-from cliploc_ros.offline.mapping.check.places import (
+from cliploc_ros.offline.mapping.check.findings import (
     RADIUS_M,
     LookAlike,
+    Witness,
+    check_landmarks,
     find_look_alikes,
+    find_map_overlaps,
+    hear_witness,
     make_grid,
 )
 from cliploc_ros.offline.mapping.check.relocalization import (
     ImageOf,
     RecordedKeyframes,
-    Tell,
     Trial,
-    each_pose,
     make_folds,
     measure_detector,
     refused_spans,
     sample_frames,
+    try_poses,
     try_recording,
 )
 from cliploc_ros.offline.mapping.check.report import (
@@ -142,10 +139,11 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     tilt = '' if detections is None else tilt_note(detections.map_from_camera)
     notes.append(tilt or _where_cameras_can_be(recorded))  # a tilted map has no true heights
     overlaps = find_map_overlaps(landmark_map, witness, views)
-    places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
+    places = make_grid(landmark_map, None if recorded is None or detections is None else recorded[
+        detections.frame_cameras == 0],
                        options)
-    trials = _told(each_pose(model, landmark_map, places.poses, options), len(places.poses),
-                   partial(tell, 'relocalizing on the grid'))
+    trials = try_poses(model, landmark_map, places.poses, options,
+                       partial(tell, 'relocalizing on the grid'))
     verdicts = np.array([trial.verdict for trial in trials], dtype=np.str_)
     verdicts = verdicts.reshape(-1, options.headings)
     grid = GridCheck(
@@ -164,15 +162,6 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
                    measures=tuple(find_measures(report, thresholds or Thresholds())))
 
 
-def _told(trials: Iterator[Trial], count: int, tell: Tell) -> list[Trial]:
-    """Collect `count` trials and report progress."""
-    done = []
-    for trial in trials:
-        done.append(trial)
-        tell(len(done) / count)
-    return done
-
-
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
                      witness: Witness, models: Sequence[DetectorModel], options: CheckOptions,
                      tell: Progress, keyframes: RecordedKeyframes | None) -> RecordingCheck:
@@ -189,8 +178,8 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
                            partial(tell, 'relocalizing recorded frames'), keyframes)
     sampled = sample_frames(detections, options.frames)
     own = [sampled[detections.frame_cameras[sampled] == number] for number in range(len(models))]
-    simulated = [trial for model, frames in zip(models, own, strict=True) for trial in _told(
-        each_pose(model, landmark_map, detections.map_from_camera[frames], options), len(frames),
+    simulated = [trial for model, frames in zip(models, own, strict=True) for trial in try_poses(
+        model, landmark_map, detections.map_from_camera[frames], options,
         partial(tell, 'relocalizing simulated frames'))]
     tell('looking for systematic errors', 0.0)
     return RecordingCheck(

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
-from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck, Overlap
-from cliploc_ros.offline.mapping.check.places import Grid, LookAlike
+from cliploc_ros.offline.mapping.check.findings import Grid, LandmarkCheck, LookAlike, Overlap
 from cliploc_ros.offline.mapping.check.relocalization import (
     LANDMARKS_FOR_A_POSE,
     Trial,
