@@ -14,13 +14,13 @@ from walk import (
     join_maps,
     look_at,
     make_table,
+    measure_depth,
     nearest_errors,
     see,
     walk_around,
     without,
 )
 
-from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import MappingError, ModelError
@@ -208,22 +208,6 @@ def test_labels_are_class_names_where_clip_is_missing(tmp_path):
     words.write_text('cup: [our cup]')
     with pytest.raises(ModelError, match='no_clip'):
         find_labeller(detections, None, words)
-
-
-def measure_depth(detections, table, scale=1.0, holes=0.0, seed=0):
-    """Add the depth of the ellipsoid's surface in each box, with errors."""
-    rng = np.random.default_rng(seed)
-    depths = np.full(len(detections.classes), np.nan, dtype=np.float32)
-    for row, frame in enumerate(detections.frames):
-        camera_from_map = invert_transform(detections.map_from_camera[frame])
-        centers = table.centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
-        pixels = centers[:, :2] / centers[:, 2:] * 500.0 + [320.0, 240.0]
-        box = detections.bboxes_xyxy[row]
-        nearest = np.linalg.norm(pixels - 0.5 * (box[:2] + box[2:]), axis=1).argmin()
-        if rng.random() >= holes:
-            surface = centers[nearest, 2] - 0.8 * table.semi_axes[nearest].min()
-            depths[row] = scale * surface * rng.normal(1.0, 0.02)
-    return replace(detections, depths=depths, depth_spreads=np.full_like(depths, 0.02))
 
 
 def test_depth_replaces_parallax():

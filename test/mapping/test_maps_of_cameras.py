@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from walk import CAMERA, CLASSES, nearest_errors, see_rows
+from walk import CAMERA, CLASSES, measure_depth, nearest_errors, see_rows
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import make_transform
@@ -154,23 +154,14 @@ def test_viewpoints_and_samples_are_those_of_each_camera():
 
 
 def test_depth_of_each_camera_has_its_own_scale():
-    detections, true = drive('front', 'left')
-    depths = np.full(len(detections.classes), np.nan, dtype=np.float32)
-    for row, frame in enumerate(detections.frames):
-        # depth of the object in the box
-        offsets = ROOM.centers - true[frame, :3, 3]
-        ahead = offsets @ true[frame, :3, :3]
-        box, camera = detections.bboxes_xyxy[row], detections.camera_of(frame)
-        pixels = ahead[:, :2] / ahead[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        near = np.linalg.norm(pixels - 0.5 * (box[:2] + box[2:]), axis=1) + 1e6 * (ahead[:, 2] < 0)
-        depths[row] = ahead[near.argmin(), 2] - 0.6 * ROOM.semi_axes[near.argmin()].mean()
-    right = build_map(replace(detections, depths=depths)).report.notes
-    assert not right
+    detections = measure_depth(drive('front', 'left')[0], ROOM)
+    depths = detections.depths
+    assert not build_map(detections).report.notes
     is_left = detections.frame_cameras[detections.frames] == 1
     long = build_map(replace(detections, depths=np.where(is_left, 1.2 * depths, depths)))
     note, = long.report.notes
-    assert ' of left is 1.2' in note
-    with pytest.raises(MappingError, match=' of left is 1e'):
+    assert float(re.search(r' of left is ([\d.]+)', note)[1]) == pytest.approx(1.2, abs=0.02)
+    with pytest.raises(MappingError, match=r' of left is .* wrong unit'):
         build_map(replace(detections, depths=np.where(is_left, 1000.0 * depths, depths)))
 
 

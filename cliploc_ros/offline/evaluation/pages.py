@@ -241,7 +241,7 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
             rows.append(('recorded frames within reach of a keyframe',
                          f'{layer.recorded.mean():.0%} of {len(layer.recorded)}'))
         rows.append(('grid positions within reach of a keyframe',
-                     f'{layer.reached_positions:.0%} of {int(layer.grid.is_near.sum())}'))
+                     f'{layer.reached_positions:.0%} of {int(report.grid.is_near.sum())}'))
     return rows
 
 

@@ -70,7 +70,7 @@ _HEIGHT_MARGIN_M = 0.3
 # Least number of classes to estimate the scale of a map, and the least factor that is reported:
 # ellipsoids enclose objects loosely, or only parts of them. Chosen.
 _LEAST_CLASSES, _OFF = 3, 1.8
-_MOST_OF_A_KIND, _MOST_MISLED = 5, 3
+_MOST_OF_A_KIND = 5
 # Shorter runs of refused frames, and smaller areas of the grid, get no advice.
 _MIN_SPAN = 2
 # Cosine of the angle between views of one side: 45 degrees, chosen.
@@ -321,14 +321,13 @@ def _on_corrections(report: CheckReport) -> Iterator[Advice]:
     yield Advice(f'{_REMEDIES[best.cause]}: the boxes fit better if you change {changes}{then}')
 
 
-def _on_misled(report: CheckReport, misled: Sequence[Trial]) -> Iterator[Advice]:
+def _on_misled(report: CheckReport, misled: Sequence[Trial]) -> list[Advice]:
     wrong = [trial for trial in misled if not _sees_double(trial.position, report.look_alikes)]
-    for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))[:_MOST_MISLED]:
-        yield Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be '
-                     f'misled by {trial.error_m:.1f} m: raise the parameter min_confidence, or '
-                     'map more distinct objects there', view=trial)
-    if len(wrong) > _MOST_MISLED:
-        yield Advice(f'and {len(wrong) - _MOST_MISLED} more views that mislead a robot')
+    return _some([Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be '
+                         f'misled by {trial.error_m:.1f} m: raise the parameter min_confidence, '
+                         'or map more distinct objects there', view=trial)
+                  for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))],
+                 'views that mislead a robot')
 
 
 def _on_spans(report: CheckReport, trials: Sequence[Trial]) -> Iterator[Advice]:

@@ -128,18 +128,8 @@ class KeyframeCheck:
     #: (F,): recorded frames within reach of a keyframe; empty without a recording
     recorded: NDArray[np.bool_]
     headings: NDArray[np.int64]  #: (P,): number of headings within reach, by grid position
-    grid: Grid
-
-    @property
-    def without(self) -> NDArray[np.int64]:
-        """Return the rows of the grid positions near the recording that no keyframe reaches."""
-        return np.nonzero(self.grid.is_near & (self.headings == 0))[0]
-
-    @property
-    def reached_positions(self) -> float:
-        """Return the share of the grid positions near the recording with a heading in reach."""
-        near = int(self.grid.is_near.sum())
-        return 1.0 - len(self.without) / near if near else 0.0
+    without: NDArray[np.int64]  #: Rows of the positions near the recording without such a heading
+    reached_positions: float  #: Share of the positions near the recording with such a heading
 
 
 @dataclass(frozen=True)
@@ -296,9 +286,12 @@ def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
     poses = np.empty((0, 4, 4)) if recorded is None else recorded
     reached = in_reach(layer, np.array([trial.position for trial in grid.trials]),
                        np.array([trial.forward for trial in grid.trials]))
+    headings = reached.reshape(grid.visible.shape).sum(axis=1)
+    without = np.nonzero(grid.is_near & (headings == 0))[0]
+    near = int(grid.is_near.sum())
     return KeyframeCheck(
         len(layer), int(layer.offsets[-1]), in_reach(layer, poses[:, :3, 3], poses[:, :3, 2]),
-        reached.reshape(grid.visible.shape).sum(axis=1), grid)
+        headings, without, 1.0 - len(without) / near if near else 0.0)
 
 
 def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
