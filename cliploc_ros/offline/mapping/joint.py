@@ -64,7 +64,7 @@ _HIGHEST = np.log([1.0, 20.0, 100.0, 5.0])
 _POSE_ERROR_S = 3.0
 # Boxes that are matched wrongly before the poses are refined bend the map: the error of a part
 # is this multiple of the mean error of its poses. Chosen on maps of TUM fr3 from poses off by 5
-# and 10 cm over 3 s (seeds 0 to 4 of studies/speed/pose_errors.py).
+# and 10 cm over 3 s (five seeds).
 _BENDING = 1.6
 
 
