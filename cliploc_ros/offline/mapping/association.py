@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Associate boxes with landmarks: one to one in every frame, with the greatest total overlap."""
 
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +14,6 @@ from cliploc_ros.offline.mapping.views import Views
 
 #: A box and a landmark that overlap less do not belong together.
 ASSOCIATION_IOU = 0.2
-# Tolerance, so that rounding does not exclude a landmark [m].
-_SLACK = 1e-6
 
 
 class Overlaps(NamedTuple):
@@ -51,12 +48,9 @@ def _overlaps(views, centers, bases, members, starts, min_iou):
     projected = np.empty((len(centers), 4))
     projected_in = np.full(len(centers), -1)
     visible = np.zeros(len(centers), dtype=np.bool_)
-    sizes = np.sqrt((bases * bases).sum(axis=2).sum(axis=1))  # never below a semi-axis
     for row in range(len(views.frames)):
         frame, number = views.frames[row], views.classes[row]
         for landmark in members[starts[number]:starts[number + 1]]:
-            if not _may_show(views, row, centers[landmark], sizes[landmark]):
-                continue
             if projected_in[landmark] != frame:
                 projected_in[landmark] = frame
                 visible[landmark] = project_box(
@@ -74,22 +68,6 @@ def _overlaps(views, centers, bases, members, starts, min_iou):
                 boxes[count], landmarks[count], ious[count] = row, landmark, iou
                 count += 1
     return boxes[:count].copy(), landmarks[:count].copy(), ious[:count].copy()
-
-
-@compiled
-def _may_show(views, row, center, radius):
-    """Tell whether a box may show a part of a sphere: it reaches into the box's pyramid."""
-    r, t = views.rotations[views.frames[row]], views.translations[views.frames[row]]
-    z = r[2, 0] * center[0] + r[2, 1] * center[1] + r[2, 2] * center[2] + t[2]
-    if z < -radius:
-        return False
-    for axis in range(2):
-        x = (r[axis, 0] * center[0] + r[axis, 1] * center[1] + r[axis, 2] * center[2] + t[axis])
-        low, high = views.edges[row, axis], views.edges[row, axis + 2]
-        if (low * z - x > radius * sqrt(1.0 + low * low) + _SLACK
-                or x - high * z > radius * sqrt(1.0 + high * high) + _SLACK):
-            return False
-    return True
 
 
 def associate(views: Views, landmarks: Landmarks, min_iou: float = ASSOCIATION_IOU,

@@ -7,7 +7,6 @@ landmark in nearly the same direction that is no nearer.
 """
 
 from dataclasses import dataclass, replace
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -249,15 +248,21 @@ def _count_views(views, centers, bases, radii, reaches, least, is_solid, shown):
     """Return the columns (4, L) of a Sight."""
     count = len(centers)
     farthest = reaches.max() if count else 0.0
-    boxes, offsets = np.empty((count, 4)), np.empty((count, 3))
-    distances, near = np.empty(count), np.empty(count, dtype=np.int64)
+    boxes, near = np.empty((count, 4)), np.empty(count, dtype=np.int64)
     counts = np.zeros((4, count), dtype=np.int64)
     # the latest viewpoint of each camera that counts, for "in view" and for "seen"
     latest = np.full((2, views.cameras.max() + 1 if len(views.cameras) else 0, count), -1)
     for frame in range(len(views.rotations)):
         first, last = views.offsets[frame], views.offsets[frame + 1]
-        in_front = _project_near(views.rotations[frame], views.translations[frame], centers, bases,
-                                 farthest, boxes, offsets, distances, near)
+        rotation, translation = views.rotations[frame], views.translations[frame]
+        offsets = centers @ rotation.T + translation
+        distances = np.sqrt((offsets * offsets).sum(axis=1))
+        in_front = 0
+        for place in range(count):
+            if 0.0 < offsets[place, 2] <= farthest and project_box(
+                    rotation, translation, centers[place], bases[place], boxes[place]):
+                near[in_front] = place
+                in_front += 1
         was_seen = np.zeros(count, dtype=np.bool_)
         for row in range(first, last):
             if shown[row] >= 0:
@@ -283,32 +288,6 @@ def _count_views(views, centers, bases, radii, reaches, least, is_solid, shown):
             counts[kind] += counted & (latest[kind, camera] != viewpoint)
             latest[kind, camera][counted] = viewpoint
     return counts
-
-
-@compiled
-def _project_near(rotation, translation, centers, bases, farthest, boxes, offsets, distances,
-                  near):
-    """Write box, offset and distance of the places in front of a camera; return their number."""
-    count = 0
-    for place in range(len(centers)):
-        z = translation[2]
-        for k in range(3):
-            z += rotation[2, k] * centers[place, k]
-        if not 0.0 < z <= farthest:
-            continue
-        if not project_box(rotation, translation, centers[place], bases[place], boxes[place]):
-            continue
-        square = 0.0
-        for i in range(3):
-            value = translation[i]
-            for k in range(3):
-                value += rotation[i, k] * centers[place, k]
-            offsets[place, i] = value
-            square += value * value
-        distances[place] = sqrt(square)
-        near[count] = place
-        count += 1
-    return count
 
 
 @compiled
