@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.landmarks import group_boxes
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE
@@ -173,14 +174,11 @@ def _inverses(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
     """Return a mask (F,) that keeps an even sample of at most `most` frames of each viewpoint."""
-    order = np.argsort(views.viewpoints, kind='stable')
-    _, starts, of_frames, counts = np.unique(
-        views.viewpoints[order], return_index=True, return_inverse=True, return_counts=True)
-    places = np.empty(len(order), dtype=np.int64)
-    places[order] = np.arange(len(order)) - starts[of_frames]
-    totals = np.empty_like(places)
-    totals[order] = np.maximum(counts[of_frames], most)
-    return np.asarray((places * most) // totals != ((places - 1) * most) // totals)
+    kept = np.zeros(len(views.viewpoints), dtype=np.bool_)
+    for frames in group_boxes(views.viewpoints, int(views.viewpoints.max(initial=-1)) + 1):
+        steps = np.arange(-1, len(frames)) * most // len(frames)
+        kept[frames] = steps[1:] != steps[:-1]
+    return kept
 
 
 def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:

@@ -274,11 +274,9 @@ def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
     positions, spacing = _positions(low[:2] - margin, high[:2] + margin, height, options)
     # positions inside a landmark are left out
     inside = np.zeros(len(positions), dtype=np.bool_)
-    for center, upper in zip(landmark_map.centers, landmark_map.shapes, strict=True):
-        xx, xy, xz, yy, yz, zz = upper
-        shape = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        offsets = positions - center
-        inside |= np.einsum('pi,pi->p', offsets, np.linalg.solve(shape, offsets.T).T) < 1.0
+    for center, basis in zip(landmark_map.centers, landmarks_of_map(landmark_map, ()).bases,
+                             strict=True):
+        inside |= np.linalg.norm(np.linalg.solve(basis, (positions - center).T), axis=0) < 1.0
     positions = positions[~inside]
     near = np.ones(len(positions), dtype=np.bool_)
     if path is not None:
