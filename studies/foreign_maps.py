@@ -38,9 +38,9 @@ from cliploc_ros.offline.datasets.given_map import (
     read_bytes,
 )
 from cliploc_ros.offline.datasets.parsing import FieldError, Fields, naming, parse_all
-from cliploc_ros.offline.vocabulary.vocabulary import coco_classes
+from cliploc_ros.offline.vocabulary.vocabulary import shipped_classes
 
-COCO = coco_classes()
+COCO = shipped_classes()[:80]
 _MAX_ASYMMETRY = 1e-3
 _LEAST_SCALE = 1e-9
 _NOTE = ('a monocular map of OA-SLAM has no metric scale, and its axes are those of the first '

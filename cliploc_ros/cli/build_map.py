@@ -133,7 +133,7 @@ def build(options: argparse.Namespace) -> int:
         _write_report(options.report, {'failure': str(error),
                                        'left_out': [asdict(landmark) for landmark in left_out]})
         raise
-    _write_report(options.report, made.report.as_dict())
+    _write_report(options.report, asdict(made.report))
     recording = sources.recording_of(options, source.file, scale, rotation)
     path, is_poor = _write(options, made, name, recording, [labeller.note, note])
     print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
@@ -239,7 +239,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
 
     from cliploc_ros.cli.sources import metres_of
     from cliploc_ros.offline.mapping.make_map import scale_of_objects
-    from cliploc_ros.offline.mapping.tilt import find_levelling
+    from cliploc_ros.offline.mapping.posed_detections import find_levelling
 
     scale, rotation = 1.0, np.eye(3)
     if folder_of(options) is None:  # folders are levelled when they are read

@@ -66,15 +66,15 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
     option(group, '--frames N', 'greatest number of recorded frames to relocalize (%(default)s)',
-           command.positive_int, CheckOptions.frames)
+           command.within(1, 10**6), CheckOptions.frames)
     option(group, '--folds N', 'folds of the cross-validation, 2 or more (%(default)s)',
-           command.within(2, 10**6), CheckOptions.folds)
+           command.within(2, 100), CheckOptions.folds)
     option(group, '--grid METRES', 'spacing of the camera positions, larger in large maps '
-           '(%(default)s)', command.positive, CheckOptions.spacing_m)
+           '(%(default)s)', command.within(0.01, 1e4), CheckOptions.spacing_m)
     option(group, '--positions N', 'greatest number of camera positions (%(default)s)',
-           command.positive_int, CheckOptions.max_positions)
+           command.within(1, 10**5), CheckOptions.max_positions)
     option(group, '--headings N', 'directions at each position (%(default)s)',
-           command.positive_int, CheckOptions.headings)
+           command.within(1, 360), CheckOptions.headings)
     option(group, '--camera-height METRES', 'height of the grid (as recorded, otherwise .3 m '
            'above the median landmark)', command.finite)
     option(group, '--gravity', 'the robot knows the vertical')
@@ -107,7 +107,7 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.offline.evaluation import pages
     from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
     from cliploc_ros.offline.mapping.check.checking import check_map
-    from cliploc_ros.offline.mapping.tilt import tilt_note
+    from cliploc_ros.offline.mapping.posed_detections import tilt_note
 
     begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)

@@ -69,7 +69,7 @@ def make_parser() -> argparse.ArgumentParser:
 def serve(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C; return the exit code."""
     # Imported late, so that --help is fast.
-    from cliploc_ros.offline.mapping.tilt import tilt_note
+    from cliploc_ros.offline.mapping.posed_detections import tilt_note
     from cliploc_ros.offline.studio.page import serve_studio
     from cliploc_ros.offline.studio.web import once
 

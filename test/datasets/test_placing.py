@@ -14,7 +14,7 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import agreement
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import AXES, check_axes, find_layout, read_folder
-from cliploc_ros.offline.mapping.tilt import find_vertical
+from cliploc_ros.offline.mapping.posed_detections import find_vertical
 
 pytestmark = pytest.mark.needs('pycolmap')
 # of a camera in a body with x forward, y left, z up

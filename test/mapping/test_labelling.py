@@ -11,7 +11,6 @@ from walk import make_table, see, walk_around
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.labelling import embed_landmarks, label_landmarks
-from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.vocabulary.vocabulary import Phrases
 
 SIZE = 32
@@ -26,7 +25,7 @@ def make_phrases(name, count, rng):
                    unit(rng.normal(size=(count, SIZE))))
 
 
-def with_crops(detections: PosedDetections, crops) -> PosedDetections:
+def with_crops(detections, crops):
     return replace(detections, embeddings=np.asarray(crops, dtype=np.float16),
                    encoder_key='simulated')
 

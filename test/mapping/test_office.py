@@ -56,7 +56,8 @@ def held_out(observations, split, landmark_map):
     return quality.explained, quality.median_iou
 
 
-@pytest.mark.parametrize('name', ['even', 'block0', 'block1'])
+@pytest.mark.parametrize('name', ['even', *(pytest.param(name, marks=pytest.mark.full)
+                                           for name in ('block0', 'block1'))])
 def test_other_frames_are_explained(observations, splits, even_map, required, name):
     built = even_map if name == 'even' else build_map(
         observations.select_frames(splits[name]['map'])).landmark_map

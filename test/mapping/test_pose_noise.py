@@ -13,16 +13,16 @@ from walk import look_at, make_table, nearest_errors, see, walk_around
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.offline.mapping.building import build_map
-from cliploc_ros.offline.mapping.joint import State
-from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
-from cliploc_ros.offline.mapping.odometry import link_frames
-from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
-from cliploc_ros.offline.mapping.pose_noise import (
+from cliploc_ros.offline.mapping.joint import (
     _BENDING,
+    State,
     estimate_pose_errors,
     shared_by_neighbours,
     significant_pose_errors,
 )
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
+from cliploc_ros.offline.mapping.odometry import link_frames
+from cliploc_ros.offline.mapping.options import MappingOptions, OdometryErrors, PoseErrors
 from cliploc_ros.offline.mapping.views import Views, make_views
 
 ESTIMATING = MappingOptions(estimate_pose_errors=True)
@@ -44,6 +44,8 @@ def draft_of(detections):
 
 def test_true_poses_are_found_to_be_true(seen):
     assert significant_pose_errors(*draft_of(seen)) is None
+    few = see(make_table(), walk_around(frames=12))
+    assert estimate_pose_errors(*draft_of(few), make_views(few)) is None, 'too few boxes'
     plain, built = build_map(seen), build_map(seen, ESTIMATING)
     assert built.report == plain.report
     assert (built.landmark_map.centers == plain.landmark_map.centers).all()
@@ -60,11 +62,6 @@ def test_errors_are_estimated(seen, kind, given):
     assert given.sigma_m / 2 < found.sigma_m < 2 * given.sigma_m
     assert given.sigma_deg / 2.5 < found.sigma_deg < 2 * given.sigma_deg
     assert (found.correlation_s < 0.3) == (kind == 'independent')
-
-
-def test_too_few_boxes_give_no_estimate():
-    few = see(make_table(), walk_around(frames=12))
-    assert estimate_pose_errors(*draft_of(few), make_views(few)) is None
 
 
 def test_a_wrong_mount_is_corrected():
@@ -237,10 +234,10 @@ def test_a_slip_is_left_out_and_one_that_the_poses_hide_does_little_harm(
 
 
 @pytest.mark.parametrize('change', [
-    scaled(1.25), scaled(1e300), lambda poses: np.concatenate([poses[:10], poses[:-10]]),
+    scaled(1.25), lambda poses: np.concatenate([poses[:10], poses[:-10]]),
     lambda poses: poses @ look_at(np.array([1.0, 0.0, 0.8])),
     lambda poses: lose(poses, slice(None)),
-], ids=['a fourth too far', 'huge', 'two seconds late', 'another camera', 'none'])
+], ids=['a fourth too far', 'two seconds late', 'another camera', 'none'])
 def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change):
     built = build_map(moved_odometry(linked, change), OPTIONS)
     assert any('is left out: ' in note for note in built.report.notes)
@@ -249,7 +246,4 @@ def test_odometry_that_contradicts_the_poses_is_left_out(linked, without, change
 
 def test_frames_without_odometry_are_not_joined(linked):
     assert joined(build_map(moved_odometry(linked, lose), OPTIONS)) == 40
-
-
-def test_poses_that_are_taken_as_they_are_need_no_odometry(linked):
-    assert joined(build_map(linked)) is None
+    assert joined(build_map(linked)) is None, 'poses that are taken as they are need none'

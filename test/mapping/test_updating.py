@@ -18,7 +18,6 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.mapping import evidence
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.update.updating import update_map
 from demo import ASSETS
@@ -42,27 +41,16 @@ def make_things(count=20, seed=5) -> LandmarkMap:
                        rng.uniform(0.06, 0.12, (count, 3)), quats, details)
 
 
+THINGS, FEW = make_things(), make_things(12)
+
+
 def ids(landmarks):
     return {landmark.landmark_id for landmark in landmarks}
 
 
-def test_nothing_changed():
-    things = make_things()
-    updated = update_map(things, see(things, POSES, noise_px=2.0, missed=0.3))
-    report = updated.report
-    assert len(report.confirmed) == len(things)
-    assert report.moved == report.missing == report.new == report.not_observed == ()
-    assert updated.landmark_map.landmark_ids == things.landmark_ids
-    assert updated.landmark_map.labels == things.labels
-    assert np.linalg.norm(updated.landmark_map.centers - things.centers, axis=1).max() < 0.02
-    assert report.offset_m < 0.01
-    assert report.lines()[0].startswith('20 confirmed')
-
-
 def test_each_change_is_reported_and_nothing_else():
-    things = make_things()
-    old = without(things, 5, 17)  # these two are new
-    later = without(moved(things, {12: (1.6, 0.1, 0.8)}), 7, 10)
+    old = without(THINGS, 5, 17)  # these two are new
+    later = without(moved(THINGS, {12: (1.6, 0.1, 0.8)}), 7, 10)
     updated = update_map(old, see(later, POSES, noise_px=2.0, missed=0.2))
     report = updated.report
     assert ids(report.moved) == {'thing_12'}
@@ -72,10 +60,10 @@ def test_each_change_is_reported_and_nothing_else():
     (one,) = report.moved
     assert one.center == pytest.approx((1.6, 0.1, 0.8), abs=0.03)
     assert one.distance_m == pytest.approx(np.linalg.norm(
-        np.array([1.6, 0.1, 0.8]) - things.centers[12]), abs=0.03)
+        np.array([1.6, 0.1, 0.8]) - THINGS.centers[12]), abs=0.03)
     assert all('seen in 0' in landmark.evidence for landmark in report.missing)
     for row in (5, 17):
-        assert min(np.linalg.norm(np.array(landmark.center) - things.centers[row])
+        assert min(np.linalg.norm(np.array(landmark.center) - THINGS.centers[row])
                    for landmark in report.new) < 0.03
     found = updated.landmark_map
     assert 'thing_7' not in found.landmark_ids
@@ -83,30 +71,16 @@ def test_each_change_is_reported_and_nothing_else():
     assert set(found.landmark_ids[updated.first_new:]) == ids(report.new)
     assert set(np.unique(updated.shown)) <= set(range(-1, len(found)))
     assert len(set(found.landmark_ids)) == len(found) == len(later)
-    assert report.as_dict()['missing'][0]['last_seen'] == 1.0
-
-
-def test_windows_of_frames_do_not_matter(monkeypatch):
-    """Also if they split the frames of one viewpoint."""
-    things = make_things()
-    walk = see(without(moved(things, {12: (1.6, 0.1, 0.8)}), 7), np.repeat(POSES, 3, axis=0),
-               noise_px=2.0, missed=0.2)
-    whole = update_map(things, walk)
-    monkeypatch.setattr(evidence, '_WINDOW', 7)
-    parted = update_map(things, walk)
-    assert parted.report.as_dict() == whole.report.as_dict()
-    np.testing.assert_array_equal(parted.landmark_map.centers, whole.landmark_map.centers)
-    np.testing.assert_array_equal(parted.shown, whole.shown)
+    assert report.missing[0].last_seen == 1.0
 
 
 def test_what_is_kept_of_a_landmark():
-    things = make_things()
-    details = list(things.details)
+    details = list(THINGS.details)
     details[4] = LandmarkDetails(labels=(('a thing', 0.7), ('a cup', 0.3)), source='a person',
-                                 class_weights=((things.class_ids[4], 0.9), ('vase', 0.1)))
-    old = replace(things, details=tuple(details),
-                  labels=(*things.labels[:4], 'named by a person', *things.labels[5:]))
-    found = update_map(old, see(things, POSES, noise_px=2.0)).landmark_map
+                                 class_weights=((THINGS.class_ids[4], 0.9), ('vase', 0.1)))
+    old = replace(THINGS, details=tuple(details),
+                  labels=(*THINGS.labels[:4], 'named by a person', *THINGS.labels[5:]))
+    found = update_map(old, see(THINGS, POSES, noise_px=2.0)).landmark_map
     assert found.labels[4] == 'named by a person'
     kept = found.details[4]
     assert (kept.labels, kept.class_weights, kept.source) == (
@@ -122,18 +96,17 @@ def test_what_is_kept_of_a_landmark():
 
 def test_the_better_position_wins():
     """A landmark is refitted if the recording determines it better; otherwise it stays."""
-    things = make_things()
     rng = np.random.default_rng(0)
-    wrong = things.centers + rng.normal(scale=0.03, size=things.centers.shape)
+    wrong = THINGS.centers + rng.normal(scale=0.03, size=THINGS.centers.shape)
     sigmas = [0.05] * 10 + [0.002] * 10
-    old = replace(things, centers=wrong, details=tuple(
+    old = replace(THINGS, centers=wrong, details=tuple(
         replace(detail, position_sigma=sigma)
-        for detail, sigma in zip(things.details, sigmas, strict=True)))
-    updated = update_map(old, see(things, POSES, noise_px=2.0))
-    assert len(updated.report.confirmed) == len(things)
+        for detail, sigma in zip(THINGS.details, sigmas, strict=True)))
+    updated = update_map(old, see(THINGS, POSES, noise_px=2.0))
+    assert len(updated.report.confirmed) == len(THINGS)
     found = updated.landmark_map
-    errors = np.linalg.norm(found.centers - things.centers, axis=1)
-    before = np.linalg.norm(wrong - things.centers, axis=1)
+    errors = np.linalg.norm(found.centers - THINGS.centers, axis=1)
+    before = np.linalg.norm(wrong - THINGS.centers, axis=1)
     assert errors[:10].mean() < 0.4 * before[:10].mean()
     assert all(detail.position_sigma < 0.02 for detail in found.details[:10])
     kept = (found.centers[10:] == wrong[10:]).all(axis=1)
@@ -141,25 +114,23 @@ def test_the_better_position_wins():
 
 
 def test_what_a_new_object_hides_is_not_missing():
-    things = make_things()
     hidden = 8
-    poses = np.array([look_at(np.array([things.centers[hidden, 0] + x, -3.0, 1.0]))
+    poses = np.array([look_at(np.array([THINGS.centers[hidden, 0] + x, -3.0, 1.0]))
                       for x in np.linspace(-0.8, 0.8, 30)])
-    later = without(things, hidden)
-    screen = replace(things.select([hidden]), landmark_ids=('screen',), class_ids=('book',),
-                     centers=things.centers[[hidden]] - (0.0, 0.35, 0.0),
+    later = without(THINGS, hidden)
+    screen = replace(THINGS.select([hidden]), landmark_ids=('screen',), class_ids=('book',),
+                     centers=THINGS.centers[[hidden]] - (0.0, 0.35, 0.0),
                      semi_axes=np.array([[0.3, 0.05, 0.3]]), quats_xyzw=np.array([[0, 0, 0, 1.0]]))
     both = join_maps(later, screen)
-    assert 'thing_8' in ids(update_map(things, see(later, poses)).report.missing)
-    report = update_map(things, see(both, poses)).report
+    assert 'thing_8' in ids(update_map(THINGS, see(later, poses)).report.missing)
+    report = update_map(THINGS, see(both, poses)).report
     assert 'thing_8' in ids(report.not_observed)
     assert len(report.new) == 1
 
 
 def test_what_was_not_in_view_stays_as_it_is():
-    things = make_things()
-    far = replace(things, centers=things.centers + np.array([0.0, 40.0, 0.0]))
-    updated = update_map(join_maps(things, far), see(things, POSES, missed=0.2))
+    far = replace(THINGS, centers=THINGS.centers + np.array([0.0, 40.0, 0.0]))
+    updated = update_map(join_maps(THINGS, far), see(THINGS, POSES, missed=0.2))
     assert ids(updated.report.not_observed) == {f'{name}_b' for name in far.landmark_ids}
     np.testing.assert_array_equal(updated.landmark_map.centers[20:], far.centers)
     assert updated.landmark_map.details[20:] == far.details
@@ -167,8 +138,7 @@ def test_what_was_not_in_view_stays_as_it_is():
 
 def test_what_a_wall_hides_is_not_missing():
     """No landmark beside or behind it is detected, so a wall may be in front."""
-    things = make_things()
-    old = moved(things, {row: things.centers[row] + (0.0, 3.0, 0.0) for row in range(16, 20)})
+    old = moved(THINGS, {row: THINGS.centers[row] + (0.0, 3.0, 0.0) for row in range(16, 20)})
     poses = np.array([look_at(np.array([x, -2.2, 1.1]), (0.0, 0.0, 0.8))
                       for x in np.linspace(-1.0, 1.0, 40)])
     report = update_map(old, see(without(old, 16, 17, 18, 19), poses)).report
@@ -177,24 +147,22 @@ def test_what_a_wall_hides_is_not_missing():
 
 
 def test_one_missed_look_and_a_class_that_the_detector_never_finds_are_no_proof():
-    things = make_things()
-    old = replace(things, class_ids=('teapot', *things.class_ids[1:]))
+    old = replace(THINGS, class_ids=('teapot', *THINGS.class_ids[1:]))
     looks = np.array([look_at(np.array([2.4 * np.cos(a), 2.4 * np.sin(a), 1.4]))
                       for a in np.linspace(0.0, 1.2, 6)])
-    few = update_map(things, see(without(things, 7), looks[:4])).report
+    few = update_map(THINGS, see(without(THINGS, 7), np.repeat(looks[:4], 5, axis=0))).report
     assert 'thing_7' in ids(few.not_observed)
-    many = update_map(old, see(without(things, 0, 7), POSES)).report
+    many = update_map(old, see(without(THINGS, 0, 7), POSES)).report
     assert ids(many.missing) == {'thing_7'} and ids(many.not_observed) == {'thing_0'}
     assert any('teapot' in note for note in many.notes)
 
 
 def test_an_offset_of_the_coordinate_frame_is_corrected_and_noted():
-    things = make_things()
-    later = moved(things, {12: (1.6, 0.1, 0.8)})
+    later = moved(THINGS, {12: (1.6, 0.1, 0.8)})
     offset = make_transform(Rotation.from_euler('z', 2.0, degrees=True).as_matrix(),
                             np.array([0.06, -0.04, 0.01]))
     detections = see(later, POSES, noise_px=2.0).with_poses(offset @ POSES)
-    updated = update_map(things, detections)
+    updated = update_map(THINGS, detections)
     assert ids(updated.report.moved) == {'thing_12'}
     assert updated.report.missing == updated.report.new == ()
     assert updated.report.offset_m == pytest.approx(0.073, abs=0.02)
@@ -254,36 +222,33 @@ def test_two_objects_that_exchanged_places(alike):
     """Their looks distinguish them, unless they are identical."""
     things = make_things(12)
     first, second = 1, 7  # of one class
-    equal = things.semi_axes.copy()
+    equal, looks = things.semi_axes.copy(), unit_rows(len(things))
     equal[second] = equal[first]
-    things = replace(things, semi_axes=equal)
-    looks = unit_rows(len(things))
     if alike:
         looks[second] = looks[first]
+    things = replace(things, semi_axes=equal)
     later = moved(things, {first: things.centers[second], second: things.centers[first]})
     updated = update_map(things, seen_with_looks(later, looks),
                          embeddings=embeddings_of(things.landmark_ids, looks))
     report = updated.report
     assert ids(report.moved) == (set() if alike else {'thing_1', 'thing_7'})
     assert report.missing == report.new == ()
-    if not alike:
-        assert all('looks different' in landmark.evidence for landmark in report.moved)
-        np.testing.assert_allclose(updated.landmark_map.centers[first], things.centers[second],
-                                   atol=0.03)
+    assert all('looks different' in landmark.evidence for landmark in report.moved)
+    assert np.linalg.norm(updated.landmark_map.centers - (things if alike else later).centers,
+                          axis=1).max() < 0.03
     assert updated.embeddings.landmark_ids == updated.landmark_map.landmark_ids
 
 
 def test_looks_tell_a_moved_object_from_a_new_one():
-    things = make_things(12)
-    later = moved(things, {4: (1.7, 0.0, 0.8)})
-    looks = unit_rows(len(things) + 1)
-    same = update_map(things, seen_with_looks(later, looks),
-                      embeddings=embeddings_of(things.landmark_ids, looks[:-1]))
+    later = moved(FEW, {4: (1.7, 0.0, 0.8)})
+    looks = unit_rows(len(FEW) + 1)
+    same = update_map(FEW, seen_with_looks(later, looks),
+                      embeddings=embeddings_of(FEW.landmark_ids, looks[:-1]))
     assert ids(same.report.moved) == {'thing_4'}
     other_looks = looks.copy()
     other_looks[4] = looks[-1]
-    other = update_map(things, seen_with_looks(later, other_looks),
-                       embeddings=embeddings_of(things.landmark_ids, looks[:-1]))
+    other = update_map(FEW, seen_with_looks(later, other_looks),
+                       embeddings=embeddings_of(FEW.landmark_ids, looks[:-1]))
     assert other.report.moved == ()
     assert ids(other.report.missing) == {'thing_4'}
     assert len(other.report.new) == 1
@@ -293,10 +258,9 @@ def test_looks_tell_a_moved_object_from_a_new_one():
 
 
 def test_what_is_left_out_has_its_reason():
-    things = make_things(12)
-    later = join_maps(things, replace(things.select([0]), centers=np.array([[1.9, 0.0, 0.8]])))
+    later = join_maps(FEW, replace(FEW.select([0]), centers=np.array([[1.9, 0.0, 0.8]])))
     poses = np.array([look_at(np.array([-2.6, y, 1.1])) for y in np.linspace(-0.3, 0.3, 30)])
-    report = update_map(things, see(later, poses, noise_px=1.0)).report
+    report = update_map(FEW, see(later, poses, noise_px=1.0)).report
     assert report.new == ()
     (one,) = [one for one in report.left_out if np.hypot(one.center[0] - 1.9, one.center[1]) < 0.6]
     assert one.support >= 20
@@ -319,9 +283,8 @@ def test_an_object_that_could_be_either_of_two_says_so():
 
 
 def test_new_ids_are_unused():
-    things = make_things(12)
-    old = without(replace(things, landmark_ids=('book_1', 'cup_1', *things.landmark_ids[2:])), 3)
-    updated = update_map(old, see(things, POSES))
+    old = without(replace(FEW, landmark_ids=('book_1', 'cup_1', *FEW.landmark_ids[2:])), 3)
+    updated = update_map(old, see(FEW, POSES))
     (one,) = updated.report.new
     assert one.class_id == 'book'
     assert one.landmark_id == 'book_2'
@@ -329,15 +292,12 @@ def test_new_ids_are_unused():
 
 @pytest.mark.parametrize('details', [
     (),
-    LandmarkDetails(),
-    LandmarkDetails(position_sigma=0.0, support=0, seen_ratio=0.0, baseline_deg=0.0),
     LandmarkDetails(position_sigma=1e6, support=10**9, seen_ratio=1.0, last_seen=1e300),
     LandmarkDetails(seen_ratio=40.0, class_weights=(('dragon', 1.0), ('cup', 1e-9))),
 ])
 def test_odd_fields_of_a_map_do_no_harm(details):
-    things = make_things(12)
-    old = replace(things, details=details and (details,) * len(things))
-    updated = update_map(old, see(without(things, 5), POSES, noise_px=1.0))
+    old = replace(FEW, details=details and (details,) * len(FEW))
+    updated = update_map(old, see(without(FEW, 5), POSES, noise_px=1.0))
     assert ids(updated.report.missing) <= {'thing_5'}
     assert len(updated.report.confirmed) >= 10
     assert np.isfinite(updated.landmark_map.centers).all()
@@ -345,8 +305,6 @@ def test_odd_fields_of_a_map_do_no_harm(details):
 
 @pytest.mark.parametrize(('change', 'message'), [
     (lambda one: one.select_frames([3]), 'took 1 viewpoints'),
-    (lambda one: one.select_boxes(np.zeros(len(one.classes), dtype=np.bool_)),
-     'have no detections'),
     (lambda one: replace(one, class_names=('a', 'b', 'c')), 'does not belong'),
     (lambda one: one.with_poses(one.map_from_camera[::-1].copy()), 'does not belong'),
 ])
@@ -357,9 +315,8 @@ def test_useless_recordings_say_what_to_correct(change, message):
 
 def test_a_lost_landmark_beside_a_like_one_comes_back():
     """Its neighbour of the same class overlaps many of its boxes, and must not claim them."""
-    things = make_things(12)
-    pair = moved(replace(things, semi_axes=np.full_like(things.semi_axes, 0.12)),
-                 {3: things.centers[0] + (0.26, 0.0, 0.0)})
+    pair = moved(replace(FEW, semi_axes=np.full_like(FEW.semi_axes, 0.12)),
+                 {3: FEW.centers[0] + (0.26, 0.0, 0.0)})
     updated = update_map(without(pair, 3), see(pair, POSES, noise_px=2.0, missed=0.3))
     assert updated.report.moved == updated.report.missing == ()
     (one,) = updated.report.new
@@ -404,19 +361,18 @@ def test_a_landmark_that_is_never_seen_is_removed_or_named():
 
 def test_an_object_that_comes_back_gets_its_id_back():
     """Also after another update and in another place; meanwhile no other landmark gets the id."""
-    things = make_things(12)
-    named = replace(things, labels=('named by a person', *things.labels[1:]))
-    away = update_map(named, see(without(things, 0, 7), POSES, missed=0.2))
+    named = replace(FEW, labels=('named by a person', *FEW.labels[1:]))
+    away = update_map(named, see(without(FEW, 0, 7), POSES, missed=0.2))
     assert away.removed.landmark_ids == ('thing_0', 'thing_7')
-    still = update_map(away.landmark_map, see(without(things, 0, 7), POSES, missed=0.2, seed=1),
+    still = update_map(away.landmark_map, see(without(FEW, 0, 7), POSES, missed=0.2, seed=1),
                        removed=away.removed)
     assert still.report.missing == still.report.new == ()
     assert still.removed.landmark_ids == away.removed.landmark_ids
-    later = moved(things, {7: things.centers[7] + (1.2, 0.3, 0.0)})
+    later = moved(FEW, {7: FEW.centers[7] + (1.2, 0.3, 0.0)})
     back = update_map(still.landmark_map, see(later, POSES, missed=0.2, seed=2),
                       removed=still.removed)
     found = back.landmark_map
-    assert set(found.landmark_ids) == set(things.landmark_ids) and not len(back.removed)
+    assert set(found.landmark_ids) == set(FEW.landmark_ids) and not len(back.removed)
     assert found.labels[found.landmark_ids.index('thing_0')] == 'named by a person'
     for row in (0, 7):
         assert found.centers[found.landmark_ids.index(f'thing_{row}')] == pytest.approx(
@@ -424,8 +380,7 @@ def test_an_object_that_comes_back_gets_its_id_back():
     assert sum('is back' in note for note in back.report.notes) == 2
 
 
-@pytest.mark.parametrize(('sigma_m', 'noise'), [(0.02, (0.0, 0.0)), (0.05, (0.0, 0.0)),
-                                                (0.05, (0.05, 1.0))])
+@pytest.mark.parametrize(('sigma_m', 'noise'), [(0.02, (0.0, 0.0)), (0.05, (0.05, 1.0))])
 def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, noise):
     things, rng = make_things(), np.random.default_rng(0)
     old = replace(things, details=tuple(replace(detail, position_sigma=sigma_m)
@@ -436,6 +391,9 @@ def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, no
         scale=np.radians(noise[1]), size=(len(POSES), 3))).as_matrix() @ poses[:, :3, :3]
     updated = update_map(old, see(things, POSES, noise_px=2.0, missed=0.3).with_poses(poses),
                          MappingOptions(estimate_pose_errors=True))
+    assert updated.landmark_map.landmark_ids == things.landmark_ids
+    assert len(updated.report.confirmed) == len(things) and not updated.report.moved
+    assert updated.report.lines()[0].startswith('20 confirmed')
     ways = np.linalg.norm(updated.landmark_map.centers - things.centers, axis=1)
     assert np.median(ways) < 0.01
     assert (updated.report.pose_change_m > 0.04) == (noise[0] > 0.0)
@@ -490,9 +448,6 @@ def test_the_map_holds_what_is_there_now(updated, report):
         updated / 'map.yaml')
     kept = [name for name in old.landmark_ids if name not in CHANGES['removed']]
     assert new.landmark_ids[:len(kept)] == tuple(kept)
-    labels = dict(zip(new.landmark_ids, new.labels, strict=True))
-    for name, label in zip(old.landmark_ids, old.labels, strict=True):
-        assert labels.get(name, label) == label
     # pairs have swapped places
     places = dict(zip(old.landmark_ids, old.centers, strict=True))
     for name in CHANGES['moved']:
@@ -521,7 +476,7 @@ def test_new_landmarks_have_phrases_and_all_have_embeddings(updated, report):
 
 
 @pytest.mark.parametrize(('text', 'options', 'message'), [
-    (None, (), 'no such file'), ('', (), 'map'), ('a: [1', (), 'map.yaml'),
+    (None, (), 'no such file'), ('a: [1', (), 'map.yaml'),
     ((ROOM / 'map.yaml').read_text(), ('--refine-mount',), '--refine-mount')])
 def test_an_unusable_old_map_and_wrong_options_are_refused_before_the_work(
         tmp_path, capsys, text, options, message):

@@ -92,6 +92,23 @@ def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0, camera
         CLASSES, classes[shown], np.full(len(bboxes), 0.9)), shown
 
 
+def measure_depth(detections, table, scale=1.0, holes=0.0):
+    """Add the depth of the ellipsoid's surface in each box, with errors."""
+    rng = np.random.default_rng(0)
+    depths = np.full(len(detections.classes), np.nan, dtype=np.float32)
+    for row, frame in enumerate(detections.frames):
+        camera, pose = detections.camera_of(frame), detections.map_from_camera[frame]
+        ahead = (table.centers - pose[:3, 3]) @ pose[:3, :3]
+        pixels = ahead[:, :2] / ahead[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        box = detections.bboxes_xyxy[row]
+        away = np.linalg.norm(pixels - 0.5 * (box[:2] + box[2:]), axis=1)
+        nearest = (away + 1e6 * (ahead[:, 2] < 0.0)).argmin()
+        if rng.random() >= holes:
+            surface = ahead[nearest, 2] - 0.6 * table.semi_axes[nearest].mean()
+            depths[row] = scale * surface * rng.normal(1.0, 0.02)
+    return replace(detections, depths=depths, depth_spreads=np.full_like(depths, 0.02))
+
+
 def nearest_errors(built: LandmarkMap, table: LandmarkMap):
     """Return the distance [m] from each true landmark to the nearest built one of its class."""
     errors = []

@@ -101,26 +101,27 @@ def clip(tmp_path_factory):
 
 
 # ---- phrases are encoded once, class by class
-PHRASES = {'mug': ('a red mug', 'a blue mug with white dots'), 'box': ('a box',)}
+MUG, BOX, CAN = ('a red mug', 'a blue mug with white dots'), ('a box',), ('a can', 'a tin')
 
 
 def test_each_class_is_encoded_once(clip, caplog):
     weights = resolve_clip_weights(clip)
-    found = embed_phrases(weights, clip, PHRASES)
-    assert list(found) == list(PHRASES)
-    for name, texts in PHRASES.items():
-        np.testing.assert_allclose(found[name], encode_labels(weights, texts, clip), atol=1e-6)
+    found = embed_phrases(weights, clip, [MUG, BOX])
+    assert list(found) == [MUG, BOX]
+    for texts, (own, rows) in found.items():
+        assert own == texts
+        np.testing.assert_allclose(rows, encode_labels(weights, texts, clip), atol=1e-6)
     assert '3 phrases of 2 ' in caplog.text
     caplog.clear()
-    more = embed_phrases(weights, clip, PHRASES | {'can': ('a can', 'a tin')})
+    more = embed_phrases(weights, clip, [MUG, BOX, CAN])
     assert '2 phrases of 1 ' in caplog.text
     caplog.clear()
-    again = embed_phrases(weights, clip, {'can': ('a can', 'a tin'), 'mug': PHRASES['mug']})
+    again = embed_phrases(weights, clip, [CAN, MUG])
     assert caplog.text == ''
-    assert list(again) == ['can', 'mug']
-    np.testing.assert_array_equal(again['can'], more['can'])
-    np.testing.assert_array_equal(again['mug'], found['mug'])
-    assert embed_phrases(weights, clip, {}) == {}
+    assert list(again) == [CAN, MUG]
+    np.testing.assert_array_equal(again[CAN].embeddings, more[CAN].embeddings)
+    np.testing.assert_array_equal(again[MUG].embeddings, found[MUG].embeddings)
+    assert embed_phrases(weights, clip, []) == {}
 
 
 # ---- the rows of a map: labels, images, or both

@@ -6,27 +6,19 @@ import csv
 import fcntl
 import io
 import json
-import os
 import re
-import shutil
-import signal
-import subprocess
 import sys
 import tarfile
 import threading
-import time
 import zipfile
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import urlparse
 
-import numpy as np
 import pytest
 import yaml
-from disks import small_disk
 
 from cliploc_ros.cli import build_map, evaluate
-from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 from cliploc_ros.offline.datasets.bag_poses import PoseSource
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
@@ -38,13 +30,10 @@ pytestmark = pytest.mark.full
 PROJECT = Path(__file__).resolve().parents[2]
 SHIPPED = yaml.safe_load((PROJECT / 'studies/reproduce.yaml').read_text())
 ARCHIVE = 'rgbd_dataset_freiburg3_demo.tgz'
-# huggingface_hub writes 10 MiB at a time, so the archive is longer and is interrupted later.
-FILLER_BYTES, HELD_BYTES = 12 * 2**20, 11 * 2**20
-PATIENCE_S = 120
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Sends files or their remaining parts; interrupts one after its first bytes."""
+    """Sends files or their remaining parts."""
 
     def do_GET(self):
         server, name = self.server, self.path.strip('/')
@@ -62,11 +51,7 @@ class Handler(BaseHTTPRequestHandler):
         if start:
             self.send_header('Content-Range', f'bytes {start}-{len(content) - 1}/{len(content)}')
         self.end_headers()
-        if name == server.held:
-            self.wfile.write(content[start:HELD_BYTES])
-            server.released.wait(PATIENCE_S)
-        else:
-            self.wfile.write(content[start:])
+        self.wfile.write(content[start:])
 
     def log_message(self, *_):
         """Say nothing."""
@@ -79,11 +64,10 @@ def server():
         serving.files = {name: (ASSETS / name).read_bytes()
                          for name in ('yolo.onnx', 'clip.json', 'clip.safetensors')}
         serving.files[ARCHIVE] = archive_of_walk()
-        serving.asked, serving.held, serving.released = [], '', threading.Event()
+        serving.asked = []
         thread = threading.Thread(target=serving.serve_forever, args=(0.05,))
         thread.start()
         yield serving
-        serving.released.set()
         serving.shutdown()
         thread.join()
 
@@ -93,9 +77,6 @@ def archive_of_walk():
     content = io.BytesIO()
     with tarfile.open(fileobj=content, mode='w:gz', compresslevel=1) as archive:
         archive.add(ASSETS / 'mapping', 'rgbd_dataset_freiburg3_demo')
-        filler = tarfile.TarInfo('rgbd_dataset_freiburg3_demo/depth')
-        filler.size = FILLER_BYTES
-        archive.addfile(filler, io.BytesIO(np.random.default_rng(0).bytes(FILLER_BYTES)))
     return content.getvalue()
 
 
@@ -143,56 +124,21 @@ def refused(run_here):
     return run
 
 
-def kill_once(sources, out, condition):
-    """Kill a run as soon as a condition holds."""
-    log = out.with_suffix('.log')
-    with log.open('w') as file, subprocess.Popen(
-            [sys.executable, '-m', 'studies.reproduce', 'fr3', '--yes', '--trials', '2', '--out',
-             out, '--sources', sources], cwd=PROJECT, stdout=file, stderr=file) as process:
-        deadline = time.monotonic() + PATIENCE_S
-        while not condition():
-            assert process.poll() is None and time.monotonic() < deadline, log.read_text()
-            time.sleep(0.02)
-        process.send_signal(signal.SIGKILL)
-
-
-def results_of(out):
-    """Return all results that do not depend on the speed of the machine."""
-    def lasting(row):
-        return {name: value for name, value in row.items() if '_ms' not in name}
-
-    with (out / 'table.csv').open() as file:
-        table = [lasting(row) for row in csv.DictReader(file)]
-    return table, [lasting(row) for row in json.loads(
-        (out / 'fr3/evaluation/results.json').read_text())]
-
-
-def test_a_run_that_is_killed_twice_goes_on(server, write_sources, cache, run_here, tmp_path):
-    sources, out = write_sources(), tmp_path / 'out'
-    part, whole = (out / 'downloads' / f'{ARCHIVE}{end}' for end in ('.partial', ''))
-    server.held = ARCHIVE
-    kill_once(sources, out, lambda: part.exists() and part.stat().st_size)
-    size = part.stat().st_size
-    assert 0 < size <= HELD_BYTES and not whole.exists()
-    server.held = ''
-    kill_once(sources, out, lambda: any(
-        file.stat().st_size for file in out.glob('fr3/.mapped.cliploc-*.outputs')))
-    assert (ARCHIVE, f'bytes={size}-') in server.asked
-    assert whole.read_bytes() == server.files[ARCHIVE]
-    assert not (out / 'fr3/map.yaml').exists()
-    asked = len(server.asked)
-    arguments = ('fr3', '--yes', '--trials', 2, '--sources', sources, '--out')
-    done = run_here(reproduce.main, *arguments, out)
+def test_a_run_that_was_interrupted_goes_on(server, write_sources, run_here, tmp_path):
+    out, content = tmp_path / 'out', server.files[ARCHIVE]
+    (out / 'downloads').mkdir(parents=True)
+    (out / 'downloads' / f'{ARCHIVE}.partial').write_bytes(content[:10_000])
+    arguments = ('fr3', '--yes', '--trials', 2, '--sources', write_sources(), '--out', out)
+    done = run_here(reproduce.main, *arguments)
     assert done.returncode == 0, done.stderr
-    assert len(server.asked) == asked, 'all was there'
+    assert (ARCHIVE, 'bytes=10000-') in server.asked
+    assert (out / 'downloads' / ARCHIVE).read_bytes() == content
     check_results(out, done.stdout)
-    once = run_here(reproduce.main, *arguments, tmp_path / 'once')
-    assert once.returncode == 0, once.stderr
-    assert results_of(out) == results_of(tmp_path / 'once')
-    before = (out / 'fr3/map.yaml').stat().st_mtime_ns
-    again = run_here(reproduce.main, *arguments, out)
+    asked, before = len(server.asked), (out / 'fr3/map.yaml').stat().st_mtime_ns
+    again = run_here(reproduce.main, *arguments)
     assert again.returncode == 0 and (out / 'fr3/map.yaml').stat().st_mtime_ns == before
-    other = run_here(reproduce.main, *arguments, out, '--trials', 3)
+    assert len(server.asked) == asked, 'all was there'
+    other = run_here(reproduce.main, *arguments, '--trials', 3)
     assert other.returncode == 1 and 'was begun with other --sources or --trials' in other.stderr
 
 
@@ -201,7 +147,6 @@ def check_results(out, printed):
     assert text in printed
     row = next(line for line in text.splitlines() if re.match('hybrid +b-prosac', line))
     assert row.split()[-3:] == ['0.72±0.0283', '0.983±0.0638', '0.926±0.226']
-    assert re.search(r'\.\d\d±\.\d\d / \.\d\d±\.\d\d / \.\d\d±\.\d\d', row)
     assert re.search('^auto  ', text, re.MULTILINE)
     assert 'No frame of this is real.' in text
     with (out / 'table.csv').open() as file:
@@ -209,17 +154,14 @@ def check_results(out, printed):
     assert (*rows,) == (*PAPER_METHODS, 'auto')
     assert (rows['clip_bf']['paper_success'], rows['clip_bf']['paper_success_std'],
             rows['auto']['paper_success']) == ('0.68', '0.0', '')
-    latex = (out / 'table.tex').read_text()
-    assert latex.count(r' \\') == 1 + len(rows) and '±' not in latex
-    page = (out / 'page.html').read_text()
-    assert page.count('src="data:image/png;base64,') == 3 and '0.72±0.0283' in page
+    assert (out / 'table.tex').read_text().count(r' \\') == 1 + len(rows)
+    assert (out / 'page.html').read_text().count('src="data:image/png;base64,') == 3
     with tarfile.open(out / 'results.tar') as archive:
         names = archive.getnames()
         about = json.load(archive.extractfile('reproduction/about.json'))
     assert names == [f'reproduction/{name}' for name in (
         'table.txt', 'table.csv', 'table.tex', 'page.html', 'about.json', 'fr3/map.yaml',
         'fr3/evaluation/results.json', 'fr3/evaluation/summary.csv')]
-    assert (out / 'results.tar').stat().st_size < 3e6
     assert set(about['digests']) == {ARCHIVE, 'yolo.onnx', 'clip.json', 'clip.safetensors'}
 
 
@@ -229,8 +171,7 @@ def test_it_says_what_it_downloads_and_asks(server, write_sources, run_here, tmp
     monkeypatch.setattr(sys, 'stdin', io.StringIO('n\n'))
     done = run_here(reproduce.main, *given)
     assert done.returncode == 1 and 'nothing was downloaded' in done.stdout
-    for said in (f'/{ARCHIVE}', 'Apache-2.0', '10 MB to download', 'a guess',
-                 'No frame of this is real.'):
+    for said in (f'/{ARCHIVE}', 'Apache-2.0', '10 MB to download', 'No frame of this is real.'):
         assert said in done.stdout
     done = run_here(reproduce.main, *given)  # the input has ended
     assert done.returncode == 1 and 'give --yes' in done.stderr
@@ -242,7 +183,7 @@ def test_it_says_what_it_downloads_and_asks(server, write_sources, run_here, tmp
 
 
 def test_what_cannot_be_downloaded(server, write_sources, refused, tmp_path):
-    given = ('--yes', '--sources', write_sources(), '--out', tmp_path / 'out')
+    given = ('--yes', '--sources', write_sources(sha256='0' * 64), '--out', tmp_path / 'out')
     weights = server.files.pop('yolo.onnx')
     said = refused(*given)
     assert 'cannot download' in said and '404' in said and 'Check network and address' in said
@@ -252,69 +193,32 @@ def test_what_cannot_be_downloaded(server, write_sources, refused, tmp_path):
     part.write_bytes(bytes(len(weights) + 1))
     assert '416' in refused(*given)
     assert not part.exists()
-
-
-def test_a_server_that_is_off(server, write_sources, refused, tmp_path):
-    sources = write_sources()
-    sources.write_text(sources.read_text().replace(str(server.server_port), '9'))
-    said = refused('--yes', '--sources', sources, '--out', tmp_path / 'out')
-    assert 'cannot download' in said and 'refused' in said
-    assert f'put the file there yourself, as {tmp_path}/out/downloads/yolo.onnx' in said
-
-
-def test_another_file_at_an_address(server, write_sources, refused, tmp_path):
-    given = ('--yes', '--sources', write_sources(sha256='0' * 64), '--out', tmp_path / 'out')
     said = refused(*given)
     assert f'expected {"0" * 64}' in said and f'kept as {ARCHIVE}.refused' in said
     # a digest that was unknown at first is compared later
     (tmp_path / 'out/downloads/yolo.onnx').write_bytes(b'something else')
     assert 'yolo.onnx has SHA-256' in refused(*given)
     assert not (tmp_path / 'out/downloads/yolo.onnx').exists()
-
-
-def test_an_archive_that_is_cut_short(server, write_sources, refused, tmp_path):
     server.files[ARCHIVE] = server.files[ARCHIVE][:-1000]
-    said = refused('--yes', '--sources', write_sources(), '--out', tmp_path / 'out')
+    said = refused('--yes', '--sources', write_sources(), '--out', tmp_path / 'other')
     assert 'cannot be unpacked' in said and 'run again to download it' in said
-    assert not [entry for entry in (tmp_path / 'out/downloads').iterdir() if ARCHIVE in entry.name]
 
 
-def test_a_full_disk(write_sources, refused, tmp_path):
-    (tmp_path / 'out').mkdir()
-    sources = write_sources(megabytes=1e9)
-    said = refused('--yes', '--sources', sources, '--out', tmp_path / 'out')
-    assert 'GB are needed: make room, or set --out to another disk' in said
-    sources.write_text(re.sub('(megabytes|unpacked): .*', r'\1: 0', sources.read_text()))
-    done = subprocess.run(
-        [*small_disk(tmp_path / 'out'), sys.executable, '-m', 'studies.reproduce', 'fr3', '--yes',
-         '--out', tmp_path / 'out', '--sources', sources], cwd=PROJECT, capture_output=True,
-        text=True, env=os.environ)
-    assert done.returncode == 1
-    assert 'is full: make room, or set --out to another disk' in done.stderr
-    assert 'Traceback' not in done.stderr
-
-
-def test_another_run_in_the_folder(write_sources, refused, tmp_path):
-    (tmp_path / 'out').mkdir()
+def test_a_disk_that_is_too_small_and_another_run(write_sources, refused, tmp_path):
+    given = ('--yes', '--out', tmp_path / 'out', '--sources')
+    assert 'GB are needed: make room, or set --out to another disk' in refused(
+        *given, write_sources(megabytes=1e9))
+    (tmp_path / 'out').mkdir(exist_ok=True)
     with (tmp_path / 'out/.lock').open('w') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        assert 'another run is at work' in refused(
-            '--yes', '--sources', write_sources(), '--out', tmp_path / 'out')
-
-
-def test_an_output_that_cannot_be_written(write_sources, refused):
-    said = refused('--yes', '--sources', write_sources(), '--out', '/proc/nowhere')
-    assert '/proc/nowhere: cannot be written to' in said
+        assert 'another run is at work' in refused(*given, write_sources())
 
 
 def test_sources_that_lack_something(refused, tmp_path):
     file = tmp_path / 'sources.yaml'
-    for text in ('networks: []\n', 'networks: []\nsequences: {fr2: {name: a}}\n'):
-        file.write_text(text)
-        assert 'is not like reproduce.yaml' in refused('--sources', file)
-    content = sources_of('http://127.0.0.1:9')
-    content['sequences'] = {}
-    file.write_text(yaml.safe_dump(content))
+    file.write_text('networks: []\nsequences: {fr2: {name: a}}\n')
+    assert 'is not like reproduce.yaml' in refused('--sources', file)
+    file.write_text(yaml.safe_dump(sources_of('http://127.0.0.1:9') | {'sequences': {}}))
     assert 'has no sequence fr3' in refused('--sources', file)
 
 
@@ -339,11 +243,6 @@ def test_seven_scenes_is_an_archive_in_an_archive(shared_data, tmp_path):
         for name in ('mapped', 'asked')]
     assert [len(some) for some in stamps] == [5, 3]
     assert not set(stamps[0]) & set(stamps[1])
-    shutil.rmtree(tmp_path / 'frames')
-    with pytest.raises(DatasetError, match='no item named'):
-        reproduce.unpacked(reproduce.Recording(
-            name='', url=one.url, megabytes=1, licence='', unpacked=1, queries=3,
-            inner='other.zip'), tmp_path, tmp_path)
 
 
 def test_the_form_of_the_shipped_sources():
@@ -358,15 +257,8 @@ def test_the_form_of_the_shipped_sources():
         assert Path(address.path).suffix in ('.tgz', '.zip', '.pt')
         assert re.fullmatch('([0-9a-f]{64})?', download.sha256)
         assert download.licence and download.megabytes > 0
-    encoder = sources.networks[1]
-    assert encoder.sha256 in encoder.url
-    paper = (PROJECT.parent / 'shared/paper/clip-loc.tex')
-    numbers = set(re.findall(r'[\d.]+\\pm[\d.]+', paper.read_text())) if paper.exists() else None
     for name in ('fr2', 'fr3'):
-        table = sources.recordings[name].paper
-        assert (*table,) == PAPER_METHODS
-        printed = {cell.replace('±', r'\pm') for row in table.values() for cell in row}
-        assert numbers is None or printed <= numbers
+        assert (*sources.recordings[name].paper,) == PAPER_METHODS
     networks = [*sources.options, *(word for network in sources.networks
                                     for word in (network.option, network.file))]
     build_map.make_parser().parse_args(
@@ -374,5 +266,3 @@ def test_the_form_of_the_shipped_sources():
     for recording in sources.recordings.values():
         evaluate.make_parser().parse_args(
             ['--bag', 'a', '--map', 'b', *networks, *sources.asking, *recording.asking])
-    assert subprocess.run(['bash', '-n', PROJECT / 'script/reproduce'], check=False
-                          ).returncode == 0

@@ -32,14 +32,10 @@ def queries(place):
     (wrong_sensors.scaled_boxes, 0.5, (50.0, 100.0, 150.0, 120.0)),
     (wrong_sensors.shifted_boxes, 0.05, (132.0, 200.0, 332.0, 240.0)),
     (wrong_sensors.turned_boxes, 90.0, (240.0, 100.0, 280.0, 300.0)),
-    (wrong_sensors.turned_boxes, 180.0, (340.0, 240.0, 540.0, 280.0)),
     (wrong_sensors.mirrored_boxes, 0.0, (340.0, 200.0, 540.0, 240.0)),
     (wrong_sensors.mirrored_boxes, 1.0, (100.0, 240.0, 300.0, 280.0)),
     (wrong_sensors.of_convention, 0.0, (200.0, 220.0, 200.0, 40.0)),
-    (wrong_sensors.of_convention, 1.0, (100.0, 200.0, 200.0, 40.0)),
     (wrong_sensors.of_convention, 2.0, (0.15625, 5 / 12, 0.46875, 0.5)),
-    (wrong_sensors.of_convention, 3.0, (200.0, 100.0, 240.0, 300.0)),
-    (wrong_sensors.of_convention, 4.0, (-50.0, 80.0, 250.0, 320.0)),
     (wrong_sensors.of_convention, 5.0, (100.0, 200.0, 400.0, 440.0))])
 def test_boxes_are_of_another_image_or_convention(queries, change, level, expected):
     box = Detections(np.array([[100.0, 200.0, 300.0, 240.0]]), ('cup',), np.ones(1))

@@ -3,28 +3,18 @@
 """The study of the watch: simulated and recorded localizers."""
 
 import json
-import shutil
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
-from cliploc_ros.offline.datasets.bag_messages import pose_message, stamp_ns
-from cliploc_ros.offline.datasets.bag_poses import PoseSource, bag_odometry
-from cliploc_ros.offline.datasets.bags import BagReader, BagWriter
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.tum import read_tum
-from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
-from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
-from cliploc_ros.ros.conversions import pose_from_msg
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from studies.watch.__main__ import run
 from studies.watch.judge import KIDNAPPED, alarm_table, judge, right_table, simulated_drive
-from studies.watch.recordings import WatchedLook, alarms_of, summarize_watch, write_watch
+from studies.watch.recordings import WatchedLook, alarms_of, summarize_watch
 
 pytestmark = pytest.mark.full
+
 
 def test_wrong_poses_are_noticed_and_right_ones_are_not_lost():
     right, alarms = judge(simulated_drive('room', 1000, 80), 0, wrong_poses=True)
@@ -34,10 +24,6 @@ def test_wrong_poses_are_noticed_and_right_ones_are_not_lost():
     assert np.mean(jumps) > 0.9
     assert '| room |' in right_table([right])
     assert '| all |' in alarm_table(alarms)
-
-
-ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
-IMAGES = 24
 
 
 def looked(states, errors_m, chances):
@@ -60,59 +46,21 @@ def test_figures_of_a_short_drive():
     assert found['states'] == {'localized': 3, 'uncertain': 1, 'lost': 3}
 
 
-def test_without_truth_nothing_is_false(tmp_path):
-    looks = looked(['localized', 'lost'], [None, None], [0.9, 0.01])
-    found = summarize_watch(looks)
-    assert found['false_alarms'] is None
-    assert found['wrong_stretches'] == []
-    assert 'false' not in write_watch(tmp_path, looks)
-    assert summarize_watch([])['looks'] == 0
-
-
-@pytest.fixture(scope='module')
-def observations(tmp_path_factory):
-    """Return the first images of the demo's walk; halfway the localizer jumps by 2 m."""
-    folder = tmp_path_factory.mktemp('watched')
-    shutil.copytree(ASSETS / 'sequence', folder / 'tum')
-    images = folder / 'tum/rgb.txt'
-    rows = [line for line in images.read_text().splitlines() if not line.startswith('#')]
-    images.write_text('\n'.join(rows[:IMAGES]) + '\n')
-    sequence = read_tum(folder / 'tum')
-    convert_tum(sequence, find_camera(None, sequence.folder)[0], folder / 'plain',
-                ConversionOptions(world_frame='map', image_format='compressed'))
-    with BagReader(folder / 'plain') as reader, BagWriter(folder / 'bag') as writer:
-        for topic in reader.topics.values():
-            writer.add_topic(topic.name, topic.msgtype)
-        for name in ('/localizer', '/wheels'):
-            writer.add_topic(name, 'geometry_msgs/msg/PoseStamped')
-        for message in reader.messages():
-            writer.write(message.topic, message.stamp_ns, message.data)
-            if message.topic == '/ground_truth':
-                truth = reader.deserialize(message)
-                pose, stamp = pose_from_msg(truth.pose), stamp_ns(truth)
-                jump = 2.0 * (stamp > sequence.stamps_ns[IMAGES // 2])
-                writer.write('/wheels', message.stamp_ns, pose_message(stamp, 'odom', pose))
-                writer.write('/localizer', message.stamp_ns, pose_message(
-                    stamp, 'map', make_transform(np.eye(3), np.array([jump, 0.1, 0.0])) @ pose))
-    frames = bag_frames(folder / 'bag', BagTopics('/image/compressed', '/camera_info'),
-                        PoseSource('/localizer', topic_gap_ns=10**9))
-    record_once(frames, RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx')), None,
-                                         EVERY_FRAME, ''), folder / 'seen.npz',
-                {'': bag_odometry(folder / 'bag', '/image/compressed',
-                                  PoseSource('/wheels', topic_gap_ns=10**9))})
-    return folder / 'seen.npz'
-
-
-def watch(observations, out, *arguments):
-    run(list(map(str, ('localizer', '--observations', observations, '--map', ASSETS / 'map.yaml',
-                       '--out', out, *arguments))))
-    return json.loads((out / 'watch.json').read_text())
-
-
-def test_a_localizer_that_jumps_is_noticed(observations, tmp_path):
-    found = watch(observations, tmp_path, '--period', 0.5, '--truth',
-                  ASSETS / 'sequence/groundtruth.txt')
-    assert found['looks'] == len(found['every_look']) == IMAGES
+def test_a_localizer_that_jumps_is_noticed(shared_data, tmp_path):
+    """The office at 1 Hz; from the 25th frame on, the localizer is off by 2 m."""
+    office = shared_data / 'tum_fr3_office'
+    seen = load_observations(office / 'observations.npz')
+    stamps = seen.stamps_s - seen.stamps_s[0]
+    seen = seen.select_frames(np.searchsorted(stamps, np.arange(0.0, 48.0)))
+    poses = seen.map_from_camera.copy()
+    poses[24:, 0, 3] += 2.0
+    save_observations(tmp_path / 'seen.npz', replace(
+        seen.with_poses(poses), odom_from_camera=seen.map_from_camera))
+    run(list(map(str, ('localizer', '--observations', tmp_path / 'seen.npz', '--map',
+                       office / 'map.yaml', '--out', tmp_path, '--period', 0.5, '--truth',
+                       office / 'groundtruth.txt'))))
+    found = json.loads((tmp_path / 'watch.json').read_text())
+    assert found['looks'] == len(found['every_look']) == 48
     assert found['alarms'] == 1
     assert found['false_alarms'] == 0
     stretch, = found['wrong_stretches']

@@ -27,7 +27,7 @@ from cliploc_ros.offline.evaluation.figures import (
 )
 from cliploc_ros.offline.evaluation.pages import FIRST_ADVICE, GRADES, grade
 from cliploc_ros.offline.mapping.association import associate
-from cliploc_ros.offline.mapping.check.places import RADIUS_M
+from cliploc_ros.offline.mapping.check.findings import RADIUS_M
 from cliploc_ros.offline.mapping.check.relocalization import ImageOf, refused_spans
 from cliploc_ros.offline.mapping.check.report import Advice, CheckReport
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map

@@ -18,7 +18,7 @@ import numpy as np
 from cliploc_ros.files.storage import write_text
 from cliploc_ros.offline import page as html
 from cliploc_ros.offline.evaluation.summary import Summary, find_best
-from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck
+from cliploc_ros.offline.mapping.check.findings import LandmarkCheck
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts
 from cliploc_ros.offline.mapping.check.report import (
     SERIOUS,
@@ -241,7 +241,7 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
             rows.append(('recorded frames within reach of a keyframe',
                          f'{layer.recorded.mean():.0%} of {len(layer.recorded)}'))
         rows.append(('grid positions within reach of a keyframe',
-                     f'{layer.reached_positions:.0%} of {int(layer.grid.is_near.sum())}'))
+                     f'{layer.reached_positions:.0%} of {int(report.grid.is_near.sum())}'))
     return rows
 
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Associate boxes with landmarks: one to one in every frame, with the greatest total overlap."""
 
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -10,15 +9,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.core.map.culling import morton_codes
 from cliploc_ros.offline.mapping.landmarks import Landmarks, box_iou, project_box
 from cliploc_ros.offline.mapping.views import Views
 
 #: A box and a landmark that overlap less do not belong together.
 ASSOCIATION_IOU = 0.2
-_GROUP_SIZE = 8
-# Tolerance, so that rounding does not exclude a landmark [m].
-_SLACK = 1e-6
 
 
 class Overlaps(NamedTuple):
@@ -32,50 +27,20 @@ class Overlaps(NamedTuple):
 
 def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float) -> Overlaps:
     """Return the pairs that overlap by more than min_iou, for each class of a landmark."""
-    classes = int(max(views.classes.max(initial=0), landmarks.names[:, 1].max(initial=0))) + 1
-    boxes, numbers, ious = _overlaps(views, landmarks.centers, landmarks.bases,
-                                     _make_groups(landmarks, classes), min_iou)
+    names = landmarks.names[np.argsort(landmarks.names[:, 1], kind='stable')]
+    starts = np.searchsorted(names[:, 1], np.arange(views.classes.max(initial=0) + 2))
+    boxes, numbers, ious = _overlaps(views, landmarks.centers, landmarks.bases, names[:, 0],
+                                     starts, min_iou)
     order = np.lexsort((numbers, boxes))
     return Overlaps(boxes[order], numbers[order], ious[order])
 
 
-class _Groups(NamedTuple):
-    """Groups of nearby landmarks of one class with a bounding sphere, to avoid most projections.
-
-    Class k has the groups from starts[k] up to starts[k + 1], group g the landmarks
-    members[offsets[g]:offsets[g + 1]]. Landmark l lies within sizes[l] of its centre.
-    """
-
-    starts: NDArray[np.int64]
-    offsets: NDArray[np.int64]
-    members: NDArray[np.int64]
-    centers: NDArray[np.float64]
-    radii: NDArray[np.float64]
-    sizes: NDArray[np.float64]
-
-
-def _make_groups(landmarks: Landmarks, classes: int) -> _Groups:
-    """Return groups of landmarks; landmarks without a class are in no group."""
-    rows, of_names = landmarks.names.T
-    order = np.lexsort((morton_codes(landmarks.centers)[rows], of_names))
-    members, own = rows[order], of_names[order]
-    first = np.searchsorted(own, np.arange(classes + 1))
-    starts = np.concatenate([[0], np.cumsum(-(-np.diff(first) // _GROUP_SIZE))])
-    group_of = starts[own] + (np.arange(len(own)) - first[own]) // _GROUP_SIZE
-    offsets = np.searchsorted(group_of, np.arange(starts[-1] + 1))
-    sizes = np.linalg.norm(landmarks.bases, axis=(1, 2))  # never below a semi-axis
-    if len(members) == 0:
-        return _Groups(starts, offsets, members, np.empty((0, 3)), np.empty(0), sizes)
-    points = landmarks.centers[members]
-    centers = np.add.reduceat(points, offsets[:-1]) / np.diff(offsets)[:, None]
-    reaches = np.linalg.norm(points - centers[group_of], axis=1) + sizes[members]
-    return _Groups(starts, offsets, members, centers,
-                   np.maximum.reduceat(reaches, offsets[:-1]), sizes)
-
-
 @compiled
-def _overlaps(views, centers, bases, groups, min_iou):
-    """Return boxes, landmarks and IoUs."""
+def _overlaps(views, centers, bases, members, starts, min_iou):
+    """Return boxes, landmarks and IoUs.
+
+    Class k has the landmarks members[starts[k]:starts[k + 1]].
+    """
     capacity = 4 * len(views.frames) + 64
     boxes, landmarks = np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64)
     ious = np.empty(capacity)
@@ -85,45 +50,24 @@ def _overlaps(views, centers, bases, groups, min_iou):
     visible = np.zeros(len(centers), dtype=np.bool_)
     for row in range(len(views.frames)):
         frame, number = views.frames[row], views.classes[row]
-        for group in range(groups.starts[number], groups.starts[number + 1]):
-            if not _may_show(views, row, groups.centers[group], groups.radii[group]):
+        for landmark in members[starts[number]:starts[number + 1]]:
+            if projected_in[landmark] != frame:
+                projected_in[landmark] = frame
+                visible[landmark] = project_box(
+                    views.rotations[frame], views.translations[frame], centers[landmark],
+                    bases[landmark], projected[landmark])
+            if not visible[landmark]:
                 continue
-            for landmark in groups.members[groups.offsets[group]:groups.offsets[group + 1]]:
-                if not _may_show(views, row, centers[landmark], groups.sizes[landmark]):
-                    continue
-                if projected_in[landmark] != frame:
-                    projected_in[landmark] = frame
-                    visible[landmark] = project_box(
-                        views.rotations[frame], views.translations[frame], centers[landmark],
-                        bases[landmark], projected[landmark])
-                if not visible[landmark]:
-                    continue
-                iou = box_iou(projected[landmark], views.edges[row], views.bounds[frame])
-                if iou > min_iou:
-                    if count == capacity:
-                        capacity *= 2
-                        boxes = np.append(boxes, np.empty_like(boxes))
-                        landmarks = np.append(landmarks, np.empty_like(landmarks))
-                        ious = np.append(ious, np.empty_like(ious))
-                    boxes[count], landmarks[count], ious[count] = row, landmark, iou
-                    count += 1
+            iou = box_iou(projected[landmark], views.edges[row], views.bounds[frame])
+            if iou > min_iou:
+                if count == capacity:
+                    capacity *= 2
+                    boxes = np.append(boxes, np.empty_like(boxes))
+                    landmarks = np.append(landmarks, np.empty_like(landmarks))
+                    ious = np.append(ious, np.empty_like(ious))
+                boxes[count], landmarks[count], ious[count] = row, landmark, iou
+                count += 1
     return boxes[:count].copy(), landmarks[:count].copy(), ious[:count].copy()
-
-
-@compiled
-def _may_show(views, row, center, radius):
-    """Tell whether a box may show a part of a sphere: it reaches into the box's pyramid."""
-    r, t = views.rotations[views.frames[row]], views.translations[views.frames[row]]
-    z = r[2, 0] * center[0] + r[2, 1] * center[1] + r[2, 2] * center[2] + t[2]
-    if z < -radius:
-        return False
-    for axis in range(2):
-        x = (r[axis, 0] * center[0] + r[axis, 1] * center[1] + r[axis, 2] * center[2] + t[axis])
-        low, high = views.edges[row, axis], views.edges[row, axis + 2]
-        if (low * z - x > radius * sqrt(1.0 + low * low) + _SLACK
-                or x - high * z > radius * sqrt(1.0 + high * high) + _SLACK):
-            return False
-    return True
 
 
 def associate(views: Views, landmarks: Landmarks, min_iou: float = ASSOCIATION_IOU,

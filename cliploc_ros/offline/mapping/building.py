@@ -4,8 +4,8 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,16 @@ from cliploc_ros.offline.mapping.evidence import (
     reasons_against,
 )
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
-from cliploc_ros.offline.mapping.joint import pose_changes, pose_errors, refine_jointly
+from cliploc_ros.offline.mapping.joint import (
+    estimate_pose_errors,
+    estimated_note,
+    left_by_poses,
+    pose_changes,
+    pose_errors,
+    refine_jointly,
+    shared_by_neighbours,
+    significant_pose_errors,
+)
 from cliploc_ros.offline.mapping.landmarks import (
     Landmarks,
     group_boxes,
@@ -32,13 +41,6 @@ from cliploc_ros.offline.mapping.landmarks import (
 )
 from cliploc_ros.offline.mapping.odometry import link_frames
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.offline.mapping.pose_noise import (
-    estimate_pose_errors,
-    estimated_note,
-    left_by_poses,
-    shared_by_neighbours,
-    significant_pose_errors,
-)
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection, refine_mount
 from cliploc_ros.offline.mapping.triangulation import (
@@ -139,17 +141,6 @@ class MappingReport:
     pose_change_deg: float
     left_out: tuple[LeftOut, ...]  #: The landmarks with the greatest support first
     notes: tuple[str, ...]  #: Problems with the input, and what to do about them
-
-    @staticmethod
-    def of_nothing(detections: PosedDetections, error: MappingError) -> 'MappingReport':
-        """Return the report of a recording that shows no landmarks."""
-        return MappingReport(
-            len(detections), 0, len(detections.classes), 0, 0.0, 0.0, 0.0, 0.0, 0.0,
-            error.left_out if isinstance(error, NothingFoundError) else (), (str(error),))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain values, for JSON."""
-        return asdict(self)
 
     def lines(self) -> list[str]:
         """Return the report as text."""
@@ -366,7 +357,12 @@ class _Builder(NamedTuple):
             evidence.position_sigma,
             left_by_poses(views, np.square(pose_errors(given, views)), shown, count)))
         shared = None if errors is None else shared_by_neighbours(views, shown, count, errors)
-        weights = [_class_weights(self.detections, boxes) for boxes in group_boxes(shown, count)]
+        class_names, weights = self.detections.class_names, list[tuple[tuple[str, float], ...]]()
+        for boxes in group_boxes(shown, count):  # the greatest share first
+            counts = np.bincount(self.detections.classes[boxes], minlength=len(class_names))
+            weights.append(tuple((class_names[number], float(counts[number] / counts.sum()))
+                                 for number in np.argsort(-counts, kind='stable')
+                                 if counts[number]))
         details = tuple(
             evidence.details(row, LandmarkDetails(
                 class_weights=weight if len(weight) > 1 else None,
@@ -409,14 +405,6 @@ def _one_of_each(views: Views, landmarks: Landmarks) -> tuple[Landmarks, NDArray
             return landmarks, shown
         landmarks = found.select(is_shown)
         landmarks = fit_landmarks(views, landmarks, associate(views, landmarks))
-
-
-def _class_weights(detections: PosedDetections, rows: NDArray[np.int64]
-                   ) -> tuple[tuple[str, float], ...]:
-    """Return the classes of some boxes with their shares, the greatest first."""
-    counts = np.bincount(detections.classes[rows], minlength=len(detections.class_names))
-    return tuple((detections.class_names[number], float(counts[number] / counts.sum()))
-                 for number in np.argsort(-counts, kind='stable') if counts[number])
 
 
 @dataclass(frozen=True)

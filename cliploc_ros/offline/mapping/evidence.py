@@ -7,7 +7,6 @@ landmark in nearly the same direction that is no nearer.
 """
 
 from dataclasses import dataclass, replace
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -35,8 +34,6 @@ _EXPLAINED_IOU = 0.3
 # classes, whichever is larger.
 _FEW_BOXES = 20
 _LEAST_QUANTILE = 0.1
-# Frames are processed in windows of this size: a table of all frames and places would be large.
-_WINDOW = 1000
 # Points of a box that are tested for occlusion: those of a 5 x 5 grid within the ellipse.
 _GRID = np.array([(x, y) for x in (-0.8, -0.4, 0.0, 0.4, 0.8) for y in (-0.8, -0.4, 0.0, 0.4, 0.8)
                   if x * x + y * y < 1.0])
@@ -62,10 +59,6 @@ class Evidence(NamedTuple):
     def seen_ratio(self) -> NDArray[np.float64]:
         """Return the share of the expected frames (L,) in which a landmark was detected."""
         return np.asarray(np.minimum(1.0, self.support / np.maximum(1, self.expected)))
-
-    def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> 'Evidence':
-        """Return the evidence for the given landmarks."""
-        return self._replace(**{name: column[rows] for name, column in self._asdict().items()})
 
     def details(self, row: int, given: LandmarkDetails) -> LandmarkDetails:
         """Return the given details of a landmark, updated with this evidence."""
@@ -223,29 +216,12 @@ def look_for(views: Views, places: Landmarks, shown: NDArray[np.int64],
     A place of class -1 has a class without boxes. Solid places contain an object, which may hide
     others.
     """
-    count = len(places.centers)
     extents = _least_extents(views, int(places.classes.max(initial=0)))
     least = np.where(places.classes < 0, extents[-1], extents[places.classes])
     radii = np.linalg.norm(places.bases, axis=1).max(axis=1, initial=0.0)
-    # first for "in view", then for "seen": frame counts (L,), and keys of (viewpoint, place)
-    frames = np.zeros((2, count), dtype=np.int64)
-    keys: tuple[list[NDArray[np.int64]], ...] = [], []
-    for first in range(0, max(1, len(views.rotations)), _WINDOW):
-        window = views.between(first, min(first + _WINDOW, len(views.rotations)))
-        own = shown[views.offsets[first]:][:len(window.frames)]
-        in_view = _in_view(
-            window, places.centers, places.bases, radii, 2.0 * radii / np.maximum(least, 1e-6),
-            least, is_solid, own)
-        rows, was_seen = np.nonzero(own >= 0)[0], np.zeros_like(in_view)
-        was_seen[window.frames[rows], own[rows]] = True
-        for number, of_frames in enumerate((in_view | was_seen, was_seen)):
-            frames[number] += of_frames.sum(axis=0)
-            in_frames, of_places = np.nonzero(of_frames)
-            keys[number].append(np.unique(window.viewpoints[in_frames] * count + of_places))
-    # frames of one viewpoint may lie in several windows
-    expected, seen = (np.bincount(np.unique(np.concatenate(own)) % max(count, 1), minlength=count)
-                      for own in keys)
-    return Sight(expected, seen, *frames)
+    return Sight(*_count_views(
+        views, places.centers, places.bases, radii, 2.0 * radii / np.maximum(least, 1e-6), least,
+        is_solid, shown))
 
 
 def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
@@ -268,21 +244,30 @@ def _least_extents(views: Views, last_class: int) -> NDArray[np.float64]:
 
 
 @compiled
-def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown):
-    """Return a mask (F, L) of the places in view in each frame."""
+def _count_views(views, centers, bases, radii, reaches, least, is_solid, shown):
+    """Return the columns (4, L) of a Sight."""
     count = len(centers)
     farthest = reaches.max() if count else 0.0
-    boxes, offsets = np.empty((count, 4)), np.empty((count, 3))
-    distances, near = np.empty(count), np.empty(count, dtype=np.int64)
-    was_seen = np.zeros(count, dtype=np.bool_)
-    in_view = np.zeros((len(views.rotations), count), dtype=np.bool_)
+    boxes, near = np.empty((count, 4)), np.empty(count, dtype=np.int64)
+    counts = np.zeros((4, count), dtype=np.int64)
+    # the latest viewpoint of each camera that counts, for "in view" and for "seen"
+    latest = np.full((2, views.cameras.max() + 1 if len(views.cameras) else 0, count), -1)
     for frame in range(len(views.rotations)):
         first, last = views.offsets[frame], views.offsets[frame + 1]
-        in_front = _project_near(views.rotations[frame], views.translations[frame], centers, bases,
-                                 farthest, boxes, offsets, distances, near)
+        rotation, translation = views.rotations[frame], views.translations[frame]
+        offsets = centers @ rotation.T + translation
+        distances = np.sqrt((offsets * offsets).sum(axis=1))
+        in_front = 0
+        for place in range(count):
+            if 0.0 < offsets[place, 2] <= farthest and project_box(
+                    rotation, translation, centers[place], bases[place], boxes[place]):
+                near[in_front] = place
+                in_front += 1
+        was_seen = np.zeros(count, dtype=np.bool_)
         for row in range(first, last):
             if shown[row] >= 0:
                 was_seen[shown[row]] = True
+        in_view = was_seen.copy()
         for i in range(in_front):
             place = near[i]
             box = boxes[place]
@@ -294,39 +279,15 @@ def _in_view(views, centers, bases, radii, reaches, least, is_solid, shown):
                 continue
             if not _has_beside(place, near[:in_front], was_seen, offsets, distances):
                 continue
-            in_view[frame, place] = _hidden(
+            in_view[place] |= _hidden(
                 place, near[:in_front], boxes, distances, radii, is_solid, shown, views.edges,
                 first, last) <= HIDDEN_SHARE
-        for row in range(first, last):
-            if shown[row] >= 0:
-                was_seen[shown[row]] = False
-    return in_view
-
-
-@compiled
-def _project_near(rotation, translation, centers, bases, farthest, boxes, offsets, distances,
-                  near):
-    """Write box, offset and distance of the places in front of a camera; return their number."""
-    count = 0
-    for place in range(len(centers)):
-        z = translation[2]
-        for k in range(3):
-            z += rotation[2, k] * centers[place, k]
-        if not 0.0 < z <= farthest:
-            continue
-        if not project_box(rotation, translation, centers[place], bases[place], boxes[place]):
-            continue
-        square = 0.0
-        for i in range(3):
-            value = translation[i]
-            for k in range(3):
-                value += rotation[i, k] * centers[place, k]
-            offsets[place, i] = value
-            square += value * value
-        distances[place] = sqrt(square)
-        near[count] = place
-        count += 1
-    return count
+        camera, viewpoint = views.cameras[frame], views.viewpoints[frame]
+        for kind, counted in enumerate((in_view, was_seen)):
+            counts[2 + kind] += counted
+            counts[kind] += counted & (latest[kind, camera] != viewpoint)
+            latest[kind, camera][counted] = viewpoint
+    return counts
 
 
 @compiled

@@ -54,8 +54,6 @@ class Fit(NamedTuple):
     center: NDArray[np.float64]
     basis: NDArray[np.float64]
     cost: float  #: Robust cost, the prior included
-    #: (9, 9): of centre and shape, see cliploc_ros.offline.mapping.landmarks
-    information: NDArray[np.float64]
 
 
 def fit_landmarks(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],
@@ -76,10 +74,8 @@ def fit_ellipsoid(views: Views, rows: NDArray[np.int64], center: NDArray[np.floa
     The fit takes at most the given number of Levenberg-Marquardt steps.
     """
     center, basis = center.copy(), basis.copy()
-    information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-    cost = descend(views, np.ascontiguousarray(rows, dtype=np.int64), center, basis, iterations,
-                   information)
-    return Fit(center, basis, cost, information)
+    cost = descend(views, np.ascontiguousarray(rows, dtype=np.int64), center, basis, iterations)
+    return Fit(center, basis, cost)
 
 
 def centre_covariance(views: Views, rows: NDArray[np.int64], center: NDArray[np.float64],
@@ -102,9 +98,9 @@ def centre_covariance(views: Views, rows: NDArray[np.int64], center: NDArray[np.
 
 
 @compiled
-def descend(views, rows, center, basis, iterations, information):
-    """Improve center and basis in place, write the information, and return the cost."""
-    gradient = np.zeros(LANDMARK_SIZE)
+def descend(views, rows, center, basis, iterations):
+    """Improve center and basis in place, and return the cost."""
+    information, gradient = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE)), np.zeros(LANDMARK_SIZE)
     trial_information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
     trial_gradient = np.zeros(LANDMARK_SIZE)
     trial_center, trial_basis = np.zeros(3), np.zeros((3, 3))

@@ -9,7 +9,7 @@ mean similarity to all crops or to the crops of its class.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -80,26 +80,20 @@ def label_landmarks(landmark_map: LandmarkMap, embeddings: LandmarkEmbeddings,
     labels = list(landmark_map.labels)
     details = list(landmark_map.details or [LandmarkDetails()] * len(labels))
     for row in np.nonzero(embeddings.is_known)[0]:
-        fitting = best_phrases(embeddings.means[row].astype(np.float32),
-                                [part for name in classes_of(landmark_map, int(row))
-                                 for part in phrases[name]])
-        labels[row] = fitting[0][0]
-        details[row] = replace(details[row], labels=fitting)
+        mean = embeddings.means[row].astype(np.float32)
+        similarities = {
+            text: float(similarity) for name in classes_of(landmark_map, int(row))
+            for texts, rows in phrases[name]
+            for text, similarity in zip(texts, rows @ mean, strict=True)}
+        best = sorted(similarities, key=lambda text: -similarities[text])[:_LABELS]
+        weights = np.exp(_CLIP_SCALE * np.array([similarities[text] - similarities[best[0]]
+                                                 for text in best]))
+        # the map file stores five digits and allows no weight of 0
+        weights = np.maximum(weights / weights.sum(), 1e-4)
+        labels[row] = best[0]
+        details[row] = replace(details[row], labels=tuple(
+            zip(best, weights.tolist(), strict=True)))
     return replace(landmark_map, labels=tuple(labels), details=tuple(details))
-
-
-def best_phrases(mean: NDArray[np.float32], phrases: Sequence[Phrases]
-                  ) -> tuple[tuple[str, float], ...]:
-    """Return the best phrases and their weights, best first."""
-    similarities = {
-        text: float(similarity) for texts, rows in phrases
-        for text, similarity in zip(texts, rows @ mean, strict=True)}
-    best = sorted(similarities, key=lambda text: -similarities[text])[:_LABELS]
-    weights = np.exp(_CLIP_SCALE * np.array([similarities[text] - similarities[best[0]]
-                                             for text in best]))
-    # the map file stores five digits and allows no weight of 0
-    weights = np.maximum(weights / weights.sum(), 1e-4)
-    return tuple(zip(best, weights.tolist(), strict=True))
 
 
 def choose_medoids(crops: NDArray[np.float32], weights: NDArray[np.float64]) -> list[int]:
@@ -125,41 +119,24 @@ def _unit_rows(rows: NDArray[np.floating]) -> tuple[NDArray[np.float32], NDArray
 
 
 def embed_phrases(weights: ClipWeights, options: ClipOptions,
-                  phrases: Mapping[str, Sequence[str]]) -> dict[str, NDArray[np.float32]]:
-    """Return the embeddings (P, d) of the P phrases of each class, as unit rows.
+                  phrases: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], Phrases]:
+    """Return groups of phrases with their embeddings.
 
-    The text tower is loaded only if a class is missing in the cache, and only once.
+    The text tower is loaded only if a group is missing in the cache, and only once. Put phrases
+    that change together into one group: the cache then keeps the others.
 
     ModelError, OptionsError: see cliploc_ros.models.clip_encoder.load_encoder.
     """
     cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'phrases', _MOST_FILES)
-    found, missing = {}, {}
-    for name, texts in phrases.items():
-        rows = cache.load(weights.key, texts, weights.embed_dim)
-        if rows is None:
-            missing[name] = texts
-        else:
-            found[name] = rows
+    found = {texts: cache.load(weights.key, texts, weights.embed_dim) for texts in phrases}
+    missing = [texts for texts, rows in found.items() if rows is None]
     if missing:
-        all_texts = [text for texts in missing.values() for text in texts]
+        all_texts = [text for texts in missing for text in texts]
         logger.warning('CLIP encodes %d phrases of %d classes; later runs use the cache',
                        len(all_texts), len(missing))
-        encoded = encode_labels(weights, all_texts, options)
-        ends = np.cumsum([len(texts) for texts in missing.values()])
-        for name, rows in zip(missing, np.split(encoded, ends[:-1]), strict=True):
-            cache.store(weights.key, missing[name], rows)
-            found[name] = rows
-    return {name: found[name] for name in phrases}
-
-
-def phrases_of_classes(weights: ClipWeights, options: ClipOptions,
-                       parts: Sequence[Mapping[str, Sequence[str]]]) -> dict[str, list[Phrases]]:
-    """Return the phrases of each class with their embeddings; errors as in embed_phrases.
-
-    Put phrases that change together into one part: the cache then keeps the other parts.
-    """
-    found: dict[str, list[Phrases]] = {}
-    for part in parts:
-        for name, rows in embed_phrases(weights, options, part).items():
-            found.setdefault(name, []).append(Phrases(tuple(part[name]), rows))
-    return found
+        ends = np.cumsum([len(texts) for texts in missing])
+        for texts, rows in zip(missing, np.split(encode_labels(weights, all_texts, options),
+                                                 ends[:-1]), strict=True):
+            cache.store(weights.key, texts, rows)
+            found[texts] = rows
+    return {texts: Phrases(texts, rows) for texts, rows in found.items() if rows is not None}

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mapping as a library: make a map with labels, embeddings and keyframes from a recording."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,11 +25,7 @@ from cliploc_ros.models.clip_weights import (
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.map_recording import MapRecording, recording_path, save_recording
 from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map
-from cliploc_ros.offline.mapping.labelling import (
-    embed_landmarks,
-    label_landmarks,
-    phrases_of_classes,
-)
+from cliploc_ros.offline.mapping.labelling import embed_landmarks, embed_phrases, label_landmarks
 from cliploc_ros.offline.mapping.landmarks import classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -37,7 +33,7 @@ from cliploc_ros.offline.mapping.systematic import MountCorrection
 from cliploc_ros.offline.mapping.update.updating import UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.offline.vocabulary.vocabulary import Vocabulary, load_vocabulary, shipped_phrases
+from cliploc_ros.offline.vocabulary.vocabulary import load_vocabulary, shipped_phrases
 
 # A scale by objects of known size: greatest number of trial maps, and the relative change of the
 # scale below which they end.
@@ -61,7 +57,7 @@ class MadeMap:
 class Labeller:
     """Labels landmarks with phrases, or with their class if there is no CLIP."""
 
-    vocabulary: Vocabulary
+    vocabulary: Mapping[str, tuple[str, ...]]  #: Further phrases by class
     #: The CLIP that made the embeddings of the recording, with its weights; None: labels are class
     #: names
     clip: ClipOptions | None = None
@@ -82,10 +78,11 @@ class Labeller:
             return landmark_map, embeddings
         names = sorted({name for row in range(len(landmark_map))
                         for name in classes_of(landmark_map, row)})
-        # in two parts: the user's phrases change more often than the shipped phrases
-        phrases = phrases_of_classes(self.weights, self.clip, [
-            {name: shipped_phrases(name) for name in names},
-            {name: texts for name, texts in self.vocabulary.added.items() if name in names}])
+        # the user's phrases change more often than the shipped phrases
+        parts = [(name, shipped_phrases(name)) for name in names] + [
+            (name, texts) for name, texts in self.vocabulary.items() if name in names]
+        found = embed_phrases(self.weights, self.clip, [texts for _, texts in parts])
+        phrases = {name: [found[texts] for own, texts in parts if own == name] for name in names}
         return label_landmarks(landmark_map, embeddings, phrases), embeddings
 
 
@@ -106,7 +103,7 @@ def find_labeller(detections: PosedDetections, clip: Callable[[], ClipOptions] |
     OptionsError, ModelError
         The vocabulary is invalid, or it is given although labels can only be class names.
     """
-    words = load_vocabulary(vocabulary)
+    words = {} if vocabulary is None else load_vocabulary(vocabulary)
     try:
         if clip is None:
             raise ModelError('`no_clip` was given')
@@ -179,8 +176,9 @@ def make_map(detections: PosedDetections, labeller: Labeller,
         made = MadeMap(landmark_map, built.report, embeddings, mount=built.mount)
     except MappingError as error:
         failure = error
-        made = MadeMap(LandmarkMap.empty(options.frame_id),
-                       MappingReport.of_nothing(detections, error))
+        made = MadeMap(LandmarkMap.empty(options.frame_id), MappingReport(
+            len(detections), 0, len(detections.classes), 0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            getattr(error, 'left_out', ()), (str(error),)))
     try:
         if frames is not None and layer is not None:
             return replace(made, layer=build_layer(frames, made.landmark_map, layer))

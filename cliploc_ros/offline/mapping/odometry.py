@@ -101,7 +101,7 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
         return None, 'odometry is left out: no two successive frames have it'
     with np.errstate(over='ignore', invalid='ignore'):  # NaN counts as a contradiction
         known = _Known(given, frames, odom_from_camera[frames], errors, noise)
-        if complaint := known.of_one_camera.contradiction():
+        if complaint := known.contradiction():
             return None, complaint
         pairs = known.compare(before, before + 1)
     kept = pairs.excess <= _JUMP
@@ -151,18 +151,16 @@ class _Known:
             np.interp(self._stamps_s, times, np.cumsum([0.0, *steps]))
             for steps in (steps_m, Rotation.from_matrix(turns).magnitude()))
 
-    @property
-    def of_one_camera(self) -> '_Known':
-        """Return the frames of the camera that has the most."""
-        rows = self._is_leading
-        return _Known(self._given, self._frames[rows], self._poses[rows], self._errors,
-                      self._noise)
-
     def contradiction(self) -> str:
-        """Return how odometry contradicts the poses overall; '' if it does not."""
-        starts = np.arange(len(self._frames) - 1)
-        ends = np.searchsorted(self._stamps_s, self._stamps_s[:-1] + _WINDOW_S)
-        windows = self.compare(starts, np.clip(ends, starts + 1, len(starts)))
+        """Return how odometry of the camera with the most frames contradicts the poses overall.
+
+        '' if it does not.
+        """
+        rows = np.nonzero(self._is_leading)[0]
+        starts, stamps_s = np.arange(len(rows) - 1), self._stamps_s[rows]
+        ends = np.clip(np.searchsorted(stamps_s, stamps_s[:-1] + _WINDOW_S), starts + 1,
+                       len(starts))
+        windows = self.compare(rows[:-1], rows[ends])
         is_far = ~(windows.excess <= _CONTRADICTION)
         tells = is_far | windows.is_motion.any(axis=1)
         if np.count_nonzero(is_far) <= _MAX_CONTRADICTIONS * np.count_nonzero(tells):

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.vocabulary.vocabulary import common_name
 
 #: Frames within this time are simultaneous [s]; the share of a pose error that simultaneous frames
@@ -67,9 +66,6 @@ class OdometryErrors:
         return np.asarray(sigmas * [1.0, np.radians(1.0)])
 
 
-_ODOMETRY_ERRORS = OdometryErrors()
-
-
 #: Classes of COCO that move by themselves, or are thrown or driven.
 MOVING_CLASSES = (
     'person', 'bird', 'cat', 'dog', 'horse', 'sheep', 'cow', 'elephant', 'bear', 'zebra',
@@ -94,7 +90,7 @@ class MappingOptions:
     #: Without pose_errors, estimate them, and refine the poses if they are significant
     estimate_pose_errors: bool = False
     #: Errors of the odometry between frames, which constrains the poses in their refinement
-    odometry_errors: OdometryErrors = _ODOMETRY_ERRORS
+    odometry_errors: OdometryErrors = field(default_factory=OdometryErrors)
     refine_mount: bool = False  #: Correct the mount of the camera, which all poses share
     #: The coordinate frame and the origin that the map file names
     frame_id: str = 'map'
@@ -109,13 +105,7 @@ class MappingOptions:
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """Options of a check.
-
-    Raises
-    ------
-    OptionsError
-        Names the option and what it allows.
-    """
+    """Options of a check."""
 
     #: Of the relocalizer that will use the map
     relocalizer: RelocalizerOptions = field(default_factory=RelocalizerOptions)
@@ -135,15 +125,6 @@ class CheckOptions:
     use_vertical: bool = False  #: The relocalizer knows the vertical
     wrong_m: float = 1.0  #: An accepted pose farther off than this misleads a robot [m]
     random_seed: int = 0  #: Equal seed and input give equal output
-
-    def __post_init__(self) -> None:
-        """Refuse values outside the range of an option."""
-        for name, low, high in (('folds', 2, 100), ('frames', 1, 1_000_000),
-                                ('max_positions', 1, 100_000), ('headings', 1, 360),
-                                ('spacing_m', 0.01, 1e4), ('block_s', 1e-3, 1e6)):
-            if not low <= getattr(self, name) <= high:
-                raise OptionsError(f'{name}: {getattr(self, name)} must lie between {low:g} and '
-                                   f'{high:g}')
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ where g are the gradients J^T W r of single viewpoints. The errors of edges in o
 correlated, which the sum takes into account (the sandwich estimator, White 1980).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -61,8 +60,6 @@ class Correction:
     effect_px: float
     is_significant: bool
     explained: float  #: Share of the robust cost of all edges that its cause removes, 0 to 1
-    #: It is no longer significant once the cause that explains most is corrected
-    follows: bool = False
 
 
 class _Cause(NamedTuple):
@@ -120,22 +117,10 @@ def find_corrections(detections: PosedDetections, views: Views, landmarks: Landm
         if np.count_nonzero(views.cameras[views.frames[shown >= 0]] == number) < _MIN_BOXES:
             continue
         name = f' of {detections.camera_names[number]}' if len(detections.cameras) > 1 else ''
-        causes = _causes(camera, views, number)
-        fits = [_fit(cause, views, landmarks, shown) for cause in causes]
-        best, state = max(fits, key=lambda fit: _is_significant(fit[0]) * fit[0][0].explained)
-        for cause, (corrections, _) in zip(causes, fits, strict=True):
-            follows = False
-            if corrections is not best and _is_significant(corrections):
-                again, _ = _fit(cause, state.views, state.landmarks, shown)
-                more = again[0].explained * (1.0 - best[0].explained)
-                follows = not (_is_significant(again) and more > _MIN_EXPLAINED)
-            found += [replace(correction, name=correction.name + name, follows=follows)
-                      for correction in corrections]
+        found += [replace(correction, name=correction.name + name)
+                  for cause in _causes(camera, views, number)
+                  for correction in _fit(cause, views, landmarks, shown)]
     return found
-
-
-def _is_significant(corrections: Sequence[Correction]) -> bool:
-    return any(correction.is_significant for correction in corrections)
 
 
 def _causes(camera: Camera, views: Views, number: int) -> tuple[_Cause, ...]:
@@ -176,12 +161,11 @@ def _twists(views: Views, is_own: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 class _Descent(NamedTuple):
-    """The best-fitting numbers (G,) of a cause, their deviations, and the corrected state."""
+    """The best-fitting numbers (G,) of a cause, their deviations, and the corrected views."""
 
     values: NDArray[np.float64]
     deviations: NDArray[np.float64]
     views: Views
-    landmarks: Landmarks
     linear: Linear
 
 
@@ -210,12 +194,12 @@ def _descend(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[n
         values, views, landmarks, linear = values + step, moved, refitted, trial
         if (np.abs(step) < precision * deviations).all():
             break
-    return _Descent(values, deviations, views, landmarks, linear)
+    return _Descent(values, deviations, views, linear)
 
 
 def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64]
-         ) -> tuple[list[Correction], _Descent]:
-    """Return the best-fitting values of a cause as corrections, and the corrected state."""
+         ) -> list[Correction]:
+    """Return the best-fitting values of a cause as corrections."""
     zeros = np.zeros(len(cause.names))
     found = _descend(cause, given, landmarks, shown, zeros, zeros, _STEPS, 0.2)
     own = cause.boxes[found.linear.rows]
@@ -230,7 +214,7 @@ def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.in
             cause.cause, name, unit, float(value) * factor, float(deviation) * abs(factor),
             effect_px, bool(abs(value) > _SIGNIFICANT * deviation and effect_px > _NOTABLE_PX
                             and explained > _MIN_EXPLAINED), explained))
-    return corrections, found
+    return corrections
 
 
 def _cost_of(linear: Linear, rows: NDArray[np.bool_] | slice = slice(None)) -> float:

@@ -9,7 +9,6 @@ continues. Every box is the seed of some hypotheses, so that rarely detected obj
 too.
 """
 
-from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +17,10 @@ from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.evidence import gather_evidence
 from cliploc_ros.offline.mapping.fitting import descend, fit_ellipsoid
-from cliploc_ros.offline.mapping.landmarks import (
-    LANDMARK_SIZE,
-    Landmarks,
-    box_iou,
-    group_boxes,
-    project_box,
-)
+from cliploc_ros.offline.mapping.landmarks import Landmarks, box_iou, group_boxes, project_box
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.sizes import log_sizes
-from cliploc_ros.offline.mapping.views import Views
+from cliploc_ros.offline.mapping.views import NO_SIZE, Views
+from cliploc_ros.offline.vocabulary.vocabulary import size_of_class
 
 # Distance of the centre behind the visible surface, as a share of the radius that the box
 # suggests, and its standard deviation. Chosen: the share is 1 for a ball, 0 for a picture on a
@@ -81,9 +74,13 @@ def add_depths(views: Views, detections: PosedDetections,
     sigmas = np.sqrt(np.square(_DEPTH_SIGMA * centers) + np.square(spreads)
                      + np.square(_CENTER_SIGMA * radii * centers))
     known = np.isfinite(centers) & np.isfinite(sigmas)
+    # the factor that covers almost all objects counts as two standard deviations
+    sizes = np.array([NO_SIZE if size is None else
+                      (np.log(0.5 * size.extent_m), 2.0 / np.log(size.factor))
+                      for size in map(size_of_class, detections.class_names)])
     return views._replace(depths=np.where(known, centers, 0.0), depth_stiffness=np.where(
         known, 1.0 / np.where(known, sigmas, 1.0), 0.0),
-        sizes=log_sizes(detections.class_names)[detections.classes])
+        sizes=sizes[detections.classes])
 
 
 def box_radii(views: Views, rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -92,13 +89,18 @@ def box_radii(views: Views, rows: NDArray[np.int64]) -> NDArray[np.float64]:
     return np.asarray(0.5 * np.sqrt(np.prod(np.maximum(extents, 0.0), axis=1)))
 
 
+def _middles(views: Views, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the middles (m, 3) of boxes on the plane z = 1."""
+    middles = 0.5 * (views.edges[rows, :2] + views.edges[rows, 2:])
+    return np.concatenate([middles, np.ones((len(rows), 1))], axis=1)
+
+
 def depth_hypotheses(views: Views, rows: NDArray[np.int64]
                      ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return centres (h, 3) and bases (h, 3, 3) of spheres at the measured depths of boxes."""
     rows = rows[views.depth_stiffness[rows] > 0.0]
-    edges, depths, frames = views.edges[rows], views.depths[rows], views.frames[rows]
-    points = np.concatenate([0.5 * (edges[:, :2] + edges[:, 2:]), np.ones((len(rows), 1))], axis=1)
-    in_camera = points * depths[:, None]
+    depths, frames = views.depths[rows], views.frames[rows]
+    in_camera = _middles(views, rows) * depths[:, None]
     centers = np.einsum('fji,fj->fi', views.rotations[frames],
                         in_camera - views.translations[frames])
     radii = np.maximum(box_radii(views, rows), 1e-3) * depths
@@ -160,7 +162,13 @@ def triangulate(views: Views, rows: NDArray[np.int64], min_viewpoints: int,
     if len(rows) < min_viewpoints:
         return Landmarks.none()
     seeds = np.repeat(rows, _PAIRS_PER_BOX)
-    of_pairs = _pair_hypotheses(views, rows, seeds, rng.random(len(seeds)))
+    # origins, unit rays in the map, and radii at distance 1
+    points = _middles(views, rows)
+    lengths = np.linalg.norm(points, axis=1)
+    rays = np.einsum('fji,fj->fi', views.rotations[views.frames[rows]], points / lengths[:, None])
+    of_pairs = _pair_hypotheses(views, rows, seeds, rng.random(len(seeds)),
+                                views.centers[views.frames[rows]], rays,
+                                box_radii(views, rows) / lengths)
     centers, bases = map(np.concatenate, zip(of_pairs, depth_hypotheses(views, rows), strict=True))
     frames, starts = np.unique(views.frames[rows], return_index=True)
     starts = np.append(starts, len(rows))
@@ -212,14 +220,12 @@ def _settle(views: Views, free_rows: NDArray[np.int64], support: NDArray[np.int6
 
 
 @compiled
-def _pair_hypotheses(views, rows, seeds, draws):
+def _pair_hypotheses(views, rows, seeds, draws, origins, rays, radii):
     """Return centres (h, 3) and bases (h, 3, 3) of pairs, each of a seed and a random partner."""
     centers, bases = np.empty((len(seeds), 3)), np.empty((len(seeds), 3, 3))
-    origins, rays, radii = _rays_of(views, rows)
     stamps = views.stamps_s[views.frames[rows]]
     places = np.searchsorted(rows, seeds)
     partners = np.empty(len(rows), dtype=np.int64)
-    information = np.empty((LANDMARK_SIZE, LANDMARK_SIZE))
     point = np.empty(3)
     pair = np.empty(2, dtype=np.int64)
     count, valid = 0, 0
@@ -240,26 +246,9 @@ def _pair_hypotheses(views, rows, seeds, draws):
         centers[count] = point
         bases[count] = radius * np.eye(3)
         pair[0], pair[1] = rows[first], rows[second]
-        descend(views, pair, centers[count], bases[count], _PAIR_STEPS, information)
+        descend(views, pair, centers[count], bases[count], _PAIR_STEPS)
         count += 1
     return centers[:count].copy(), bases[:count].copy()
-
-
-@compiled
-def _rays_of(views, rows):
-    """Return origins (m, 3), unit rays (m, 3) in the map, and radii (m,) at distance 1."""
-    origins, rays = np.empty((len(rows), 3)), np.empty((len(rows), 3))
-    radii = np.empty(len(rows))
-    for place in range(len(rows)):
-        row = rows[place]
-        rotation = views.rotations[views.frames[row]]
-        box = views.edges[row]
-        ray = np.array([0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3]), 1.0])
-        length = sqrt((ray * ray).sum())
-        origins[place] = -(rotation.T @ views.translations[views.frames[row]])
-        rays[place] = rotation.T @ (ray / length)
-        radii[place] = 0.5 * sqrt((box[2] - box[0]) * (box[3] - box[1])) / length
-    return origins, rays, radii
 
 
 @compiled

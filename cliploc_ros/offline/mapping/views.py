@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.landmarks import group_boxes
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE
@@ -26,6 +27,11 @@ _LEAST_JUMP_M, _LEAST_JUMP_DEG = 0.5, 30.0
 _MAX_EMPTY_SHARE = 0.5
 # A camera that moves by more than this relative to the first one is not on a rig with it.
 _MOST_PLAY_M = 0.5
+# Arrays of Views with a row for each frame, and for each box.
+_OF_FRAMES = ('rotations', 'translations', 'stamps_s', 'cameras', 'levers', 'viewpoints',
+              'weights', 'bounds')
+_OF_BOXES = ('frames', 'classes', 'edges', 'stiffness', 'is_open', 'depths', 'depth_stiffness',
+             'sizes')
 
 
 class Views(NamedTuple):
@@ -58,7 +64,7 @@ class Views(NamedTuple):
     depths: NDArray[np.float64]
     depth_stiffness: NDArray[np.float64]
     #: (n, 2): logarithm of half the longest extent [m] of objects of the box's class and its
-    #: inverse standard deviation, see cliploc_ros.offline.mapping.sizes; only with depth
+    #: inverse standard deviation, see triangulation.add_depths; only with depth
     sizes: NDArray[np.float64]
 
     @property
@@ -86,16 +92,15 @@ class Views(NamedTuple):
 
     def between(self, first: int, last: int) -> 'Views':
         """Return the frames from first up to last, last excluded; nothing is copied."""
-        frames = slice(first, last)
         boxes = slice(int(self.offsets[first]), int(self.offsets[last]))
-        return Views(
-            self.rotations[frames], self.translations[frames], self.stamps_s[frames],
-            self.cameras[frames], self.levers[frames], self.viewpoints[frames],
-            self.weights[frames],
-            self.offsets[first:last + 1] - boxes.start, self.frames[boxes] - first,
-            self.classes[boxes], self.edges[boxes], self.stiffness[boxes], self.is_open[boxes],
-            self.bounds[frames], self.depths[boxes], self.depth_stiffness[boxes],
-            self.sizes[boxes])
+        return self.select(slice(first, last), boxes)._replace(
+            offsets=self.offsets[first:last + 1] - boxes.start, frames=self.frames[boxes] - first)
+
+    def select(self, frames: slice | NDArray[np.int64], boxes: slice | NDArray[np.int64]
+               ) -> 'Views':
+        """Return the given frames and boxes; the caller renumbers offsets and frames."""
+        return self._replace(**{name: getattr(self, name)[rows] for names, rows in (
+            (_OF_FRAMES, frames), (_OF_BOXES, boxes)) for name in names})
 
 
 def make_views(detections: PosedDetections) -> Views:
@@ -169,14 +174,11 @@ def _inverses(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
     """Return a mask (F,) that keeps an even sample of at most `most` frames of each viewpoint."""
-    order = np.argsort(views.viewpoints, kind='stable')
-    _, starts, of_frames, counts = np.unique(
-        views.viewpoints[order], return_index=True, return_inverse=True, return_counts=True)
-    places = np.empty(len(order), dtype=np.int64)
-    places[order] = np.arange(len(order)) - starts[of_frames]
-    totals = np.empty_like(places)
-    totals[order] = np.maximum(counts[of_frames], most)
-    return np.asarray((places * most) // totals != ((places - 1) * most) // totals)
+    kept = np.zeros(len(views.viewpoints), dtype=np.bool_)
+    for frames in group_boxes(views.viewpoints, int(views.viewpoints.max(initial=-1)) + 1):
+        steps = np.arange(-1, len(frames)) * most // len(frames)
+        kept[frames] = steps[1:] != steps[:-1]
+    return kept
 
 
 def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.building import refit_map
-from cliploc_ros.offline.mapping.check.landmark_faults import Witness, hear_witness
+from cliploc_ros.offline.mapping.check.findings import Witness, hear_witness
 from cliploc_ros.offline.mapping.check.relocalization import (
     RecordedKeyframes,
     Trial,

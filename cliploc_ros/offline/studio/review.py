@@ -9,7 +9,7 @@ survive a restart.
 
 from collections.abc import Sequence
 
-from cliploc_ros.offline.mapping.check.landmark_faults import (
+from cliploc_ros.offline.mapping.check.findings import (
     LandmarkCheck,
     check_landmarks,
     find_map_overlaps,

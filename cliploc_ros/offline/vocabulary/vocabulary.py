@@ -1,13 +1,15 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The phrases of classes: those of COCO and Objects365 are shipped; a file can add more."""
+"""What is known of classes: phrases, which a file can add to, and sizes of their objects.
+
+The phrases of COCO and Objects365 and the sizes are shipped.
+"""
 
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,26 +94,12 @@ def _alternatives(name: str, rules: Rules, chosen: dict[str, str]) -> Sequence[s
     return rules[name]
 
 
-@dataclass(frozen=True)
-class Vocabulary:
-    """Phrases by class."""
-
-    added: Mapping[str, tuple[str, ...]]  #: Phrases of a user, in addition to the shipped phrases
-
-    def phrases(self, class_name: str) -> tuple[str, ...]:
-        """Return the distinct phrases of a class; those of the user come first.
-
-        A class that is not in the vocabulary gets the phrases of the general grammar.
-        """
-        return tuple(dict.fromkeys(self.added.get(class_name, ()) + shipped_phrases(class_name)))
-
-
-def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
-    """Load the shipped vocabulary, with the phrases of a file if one is given.
+def load_vocabulary(path: str | os.PathLike[str]) -> dict[str, tuple[str, ...]]:
+    """Load further phrases by class from a file.
 
     Parameters
     ----------
-    path : str or path, optional
+    path : str or path
         A YAML file that maps class names to a list of phrases, or to rules as in coco.yaml.
 
     Raises
@@ -119,23 +107,17 @@ def load_vocabulary(path: str | os.PathLike[str] | None = None) -> Vocabulary:
     CliplocError
         The file is invalid; the message names file, class and rule.
     """
-    if path is None:
-        return Vocabulary({})
     entries = read_parameter_file(path)
     if not entries:
         raise OptionsError(f'{path}: has no classes')
-    return Vocabulary({name: _phrases_of(name, entry, f"{path}: class '{name}'")
-                       for name, entry in entries.items()})
-
-
-def coco_classes() -> tuple[str, ...]:
-    """Return the classes of COCO, in the order of their indices."""
-    return tuple(_shipped('coco.yaml'))
+    return {name: _phrases_of(name, entry, f"{path}: class '{name}'")
+            for name, entry in entries.items()}
 
 
 def shipped_classes() -> tuple[str, ...]:
     """Return the class names in the shipped vocabulary, in lower case."""
-    return (*coco_classes(), *_shipped('objects365.yaml'), *_shipped('aliases.yaml'))
+    return tuple(chain.from_iterable(map(_shipped, (
+        'coco.yaml', 'objects365.yaml', 'aliases.yaml'))))
 
 
 def common_name(name: str) -> str:
@@ -145,10 +127,28 @@ def common_name(name: str) -> str:
 
 
 def shipped_phrases(name: str) -> tuple[str, ...]:
-    """Return the shipped phrases of a class, without those of the user."""
+    """Return the shipped phrases of a class; those of the general grammar if it has none."""
     common = common_name(name)
     entry = _shipped('coco.yaml').get(common, _shipped('objects365.yaml').get(common, {}))
     return _phrases_of(common if entry else name, entry, f"class '{name}'")
+
+
+class Size(NamedTuple):
+    """The longest extent of objects of a class [m], and the factor within which it lies."""
+
+    extent_m: float
+    factor: float
+
+    @property
+    def most_m(self) -> float:
+        """Return the extent that almost no object exceeds [m]."""
+        return self.extent_m * self.factor
+
+
+def size_of_class(name: str) -> Size | None:
+    """Return the size of objects of a class, ignoring the case of its name; None if unknown."""
+    values = _shipped('sizes.yaml').get(common_name(name))
+    return values and Size(*values)
 
 
 @cache

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The entry point of checking: a map and, if there is one, a recording in, a report out."""
+"""The entry point of checking: a map and, if there is one, a recording in, a report out.
+
+The report advises how to improve the map, the most urgent advice first. Causes come before their
+effects: a robot that is misled in a place that looks like another one needs no separate advice.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -8,31 +12,37 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.building import Progress
-from cliploc_ros.offline.mapping.check.advice import give_advice
-from cliploc_ros.offline.mapping.check.landmark_faults import (
+from cliploc_ros.offline.mapping.check.findings import (
+    RADIUS_M,
+    LookAlike,
     Witness,
     check_landmarks,
+    find_look_alikes,
     find_map_overlaps,
     hear_witness,
+    make_grid,
 )
-from cliploc_ros.offline.mapping.check.places import find_look_alikes, make_grid
 from cliploc_ros.offline.mapping.check.relocalization import (
     ImageOf,
     RecordedKeyframes,
-    Tell,
     Trial,
-    each_pose,
     make_folds,
     measure_detector,
+    refused_spans,
     sample_frames,
+    try_poses,
     try_recording,
 )
 from cliploc_ros.offline.mapping.check.report import (
+    SERIOUS,
+    Advice,
     CheckReport,
     GridCheck,
     RecordingCheck,
@@ -40,13 +50,12 @@ from cliploc_ros.offline.mapping.check.report import (
     find_measures,
 )
 from cliploc_ros.offline.mapping.evidence import BoxQuality, best_ious, explained_boxes
-from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
-from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.sizes import scale_by_sizes
+from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, Thresholds
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections, tilt_note
 from cliploc_ros.offline.mapping.systematic import find_corrections
-from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 from cliploc_ros.offline.simulation import DetectorModel, guess_detector
+from cliploc_ros.offline.vocabulary.vocabulary import size_of_class
 
 _NOTES = (
     'similarities of crops and labels are simulated: labels of equal text look equal, and labels '
@@ -58,6 +67,27 @@ _NO_RECORDING = (
     'images of 640 x 480 px with a focal length of 525 px')
 # Greatest difference in height between a robot's camera and those of the recording [m]. Chosen.
 _HEIGHT_MARGIN_M = 0.3
+# Least number of classes to estimate the scale of a map, and the least factor that is reported:
+# ellipsoids enclose objects loosely, or only parts of them. Chosen.
+_LEAST_CLASSES, _OFF = 3, 1.8
+_MOST_OF_A_KIND = 5
+# Shorter runs of refused frames, and smaller areas of the grid, get no advice.
+_MIN_SPAN = 2
+# Cosine of the angle between views of one side: 45 degrees, chosen.
+_ONE_SIDE = 0.7
+_FEW_LANDMARKS = 3
+# More views are needed if landmarks have fewer frames (median) and more than this share of the
+# boxes belongs to none. Chosen, between maps of fr3 from every 10th and from every 30th frame.
+_FEW_FRAMES, _MANY_UNEXPLAINED = 12, 0.12
+# Places nearer to each other are one place that looks the same from two sides [m]. Chosen.
+_SAME_PLACE_M = 1.0
+# The remedy for each cause of a systematic error of the boxes.
+_REMEDIES = {
+    'intrinsics': 'calibrate the camera and map again',
+    'mount': 'measure how the camera is mounted on the robot',
+    'stamps': 'check the clock and the delay of the images'}
+# Distance from which a camera sees a place: twice the radius of a place [m].
+_SIGHT_M = 2.0 * RADIUS_M
 
 
 def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
@@ -109,10 +139,11 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     tilt = '' if detections is None else tilt_note(detections.map_from_camera)
     notes.append(tilt or _where_cameras_can_be(recorded))  # a tilted map has no true heights
     overlaps = find_map_overlaps(landmark_map, witness, views)
-    places = make_grid(landmark_map, None if detections is None else detections.of_first_camera,
+    places = make_grid(landmark_map, None if recorded is None or detections is None else recorded[
+        detections.frame_cameras == 0],
                        options)
-    trials = _told(each_pose(model, landmark_map, places.poses, options), len(places.poses),
-                   partial(tell, 'relocalizing on the grid'))
+    trials = try_poses(model, landmark_map, places.poses, options,
+                       partial(tell, 'relocalizing on the grid'))
     verdicts = np.array([trial.verdict for trial in trials], dtype=np.str_)
     verdicts = verdicts.reshape(-1, options.headings)
     grid = GridCheck(
@@ -125,19 +156,10 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         grid=grid, recording=recording,
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
         keyframes=None if layer is None else check_keyframes(layer, grid, recorded),
-        scale=scale_by_sizes(landmark_map))
+        scale=_scale_by_sizes(landmark_map))
     tell('done', 1.0)
     return replace(report, to_do=tuple(give_advice(report)),
                    measures=tuple(find_measures(report, thresholds or Thresholds())))
-
-
-def _told(trials: Iterator[Trial], count: int, tell: Tell) -> list[Trial]:
-    """Collect `count` trials and report progress."""
-    done = []
-    for trial in trials:
-        done.append(trial)
-        tell(len(done) / count)
-    return done
 
 
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
@@ -156,8 +178,8 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
                            partial(tell, 'relocalizing recorded frames'), keyframes)
     sampled = sample_frames(detections, options.frames)
     own = [sampled[detections.frame_cameras[sampled] == number] for number in range(len(models))]
-    simulated = [trial for model, frames in zip(models, own, strict=True) for trial in _told(
-        each_pose(model, landmark_map, detections.map_from_camera[frames], options), len(frames),
+    simulated = [trial for model, frames in zip(models, own, strict=True) for trial in try_poses(
+        model, landmark_map, detections.map_from_camera[frames], options,
         partial(tell, 'relocalizing simulated frames'))]
     tell('looking for systematic errors', 0.0)
     return RecordingCheck(
@@ -195,6 +217,26 @@ def _notes_on(recording: RecordingCheck) -> list[str]:
     return notes
 
 
+def _scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
+    """Estimate from the sizes of its objects by what factor a map is too large.
+
+    The estimate is the median over classes of the median over their landmarks. Landmarks that were
+    seen from one side only are ignored: they are longer towards the camera than their objects.
+    None: too few classes have a size, or the sizes fit.
+    """
+    ratios: dict[str, list[float]] = {}
+    sides = [detail.baseline_deg for detail in landmark_map.details] or [None] * len(landmark_map)
+    for name, semi_axes, seen_deg in zip(landmark_map.class_ids, landmark_map.semi_axes, sides,
+                                         strict=True):
+        size = size_of_class(name)
+        if size is not None and (seen_deg is None or seen_deg >= MappingOptions.min_baseline_deg):
+            ratios.setdefault(name, []).append(2.0 * semi_axes.max() / size.extent_m)
+    if len(ratios) < _LEAST_CLASSES:
+        return None
+    scale = float(np.median([np.median(of_class) for of_class in ratios.values()]))
+    return scale if not 1.0 / _OFF <= scale <= _OFF else None
+
+
 def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:
     shared = set(landmark_map.class_ids) & set(detections.class_names)
     if not shared:
@@ -203,3 +245,158 @@ def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:
                 'the map was made with')
     return ('no box of the recording overlaps a landmark of its class: check that poses and map '
             'have the same coordinate frame, and that the poses are of the camera (z forward)')
+
+
+def give_advice(report: CheckReport) -> list[Advice]:
+    """Return pieces of advice, each of one or two sentences."""
+    recorded = report.recording.trials if report.recording else ()
+    misled = [trial for trial in (*recorded, *report.grid.trials)
+              if trial.verdict == 'misled']
+    advice = [] if report.scale is None else [Advice(
+        f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
+        f'{"large" if report.scale > 1.0 else "small"} by the sizes of its objects: '
+        'check the unit of the poses, then the intrinsics')]
+    advice += _some([_on_look_alike(pair, misled) for pair in report.look_alikes],
+                    'pairs of places that look alike')
+    advice += [*_on_landmarks(report), *_on_corrections(report), *_on_misled(report, misled),
+               *_on_spans(report, recorded), *_on_grid(report)]
+    return advice or [Advice('nothing to do: the map reaches all thresholds that were checked')]
+
+
+def _some(advice: Sequence[Advice], what: str) -> list[Advice]:
+    """Return the first pieces of advice, and how many more there are."""
+    more = len(advice) - _MOST_OF_A_KIND
+    return [*advice[:_MOST_OF_A_KIND], *[Advice(f'and {more} more {what}')] * (more > 0)]
+
+
+def _on_look_alike(pair: LookAlike, misled: Sequence[Trial]) -> Advice:
+    matched = len(pair.matched)
+    what_to_do = ('their labels are equal, so nothing tells them apart: map an object that '
+                  'only one of them has') if pair.same_labels == matched else (
+        f'{matched - pair.same_labels} labels differ: make sure that they are right')
+    mistaken = sum(_sees_double(trial.position, [pair]) for trial in misled)
+    alike = (f'the place around {_place(pair.first)} looks the same when turned by '
+             f'{abs(pair.turn_deg):.0f} degrees'
+             if np.hypot(*np.subtract(pair.first, pair.second)[:2]) < _SAME_PLACE_M else
+             f'the places around {_place(pair.first)} and {_place(pair.second)} look alike')
+    return Advice(f'{alike} ({matched} of {pair.landmarks} landmarks)'
+                  + (f', {mistaken} views near them are misled' if mistaken else '')
+                  + f': {what_to_do}', pair.matched[0] if pair.matched else ())
+
+
+def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
+    """Yield advice on duplicates, on too few views, and on faults of single landmarks."""
+    pairs = [(report.map_ids[overlap.first], report.map_ids[overlap.second])
+             for overlap in report.overlaps if overlap.is_duplicate]
+    yield from _some([Advice(f'{" and ".join(pair)} are the same object: delete one of them', pair)
+                      for pair in pairs], 'pairs of duplicates')
+    if report.recording is not None:
+        frames = float(np.median([landmark.support or 0 for landmark in report.landmarks]))
+        unexplained = 1.0 - report.recording.as_given.explained
+        if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
+            yield Advice(
+                f'record more views: of {report.recording.frames} frames, {frames:.0f} show a '
+                f'landmark (median), and {unexplained:.0%} of the boxes belong to none; pass '
+                f'all objects slowly, until {_FEW_FRAMES} frames or more show each of them')
+    yield from _some([
+        Advice(f'{one.landmark_id} {one.faults[0]}', (one.landmark_id,))
+        for one in report.landmarks
+        if one.severity >= SERIOUS and one.faults and 'same object as' not in one.faults[0]],
+        'landmarks with a serious fault: record the place again, and update the map')
+
+
+def _on_corrections(report: CheckReport) -> Iterator[Advice]:
+    found = [result for result in (report.recording.corrections if report.recording else ())
+             if result.is_significant]
+    if not found:
+        return
+    # only one cause of one camera: its error makes other causes look wrong, too
+    best = max(found, key=lambda result: result.explained)
+    changes = ', '.join(
+        f'{result.name} by {result.value:+.2f} {result.unit} (± {result.deviation:.2f})'
+        for result in sorted(found, key=lambda result: -result.effect_px)
+        if (result.cause, result.explained) == (best.cause, best.explained))
+    others = sorted({result.cause for result in found} - {best.cause})
+    then = f'; check again before you change the {" or the ".join(others)}' if others else ''
+    yield Advice(f'{_REMEDIES[best.cause]}: the boxes fit better if you change {changes}{then}')
+
+
+def _on_misled(report: CheckReport, misled: Sequence[Trial]) -> list[Advice]:
+    wrong = [trial for trial in misled if not _sees_double(trial.position, report.look_alikes)]
+    return _some([Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be '
+                         f'misled by {trial.error_m:.1f} m: raise the parameter min_confidence, '
+                         'or map more distinct objects there', view=trial)
+                  for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))],
+                 'views that mislead a robot')
+
+
+def _on_spans(report: CheckReport, trials: Sequence[Trial]) -> Iterator[Advice]:
+    """Yield advice on runs of refused frames, once for each side of a place."""
+    middles: list[Trial] = []
+    for run in refused_spans(trials):
+        middle, seen = run[len(run) // 2], int(np.median([trial.landmarks for trial in run]))
+        if len(run) < _MIN_SPAN or middle.stamp_s is None or any(
+                np.linalg.norm(middle.position - other.position) < RADIUS_M
+                and middle.forward @ other.forward > _ONE_SIDE for other in middles):
+            continue
+        middles.append(middle)
+        if len(middles) > _MOST_OF_A_KIND:
+            return
+        if seen <= _FEW_LANDMARKS or not _sees_double(middle.position, report.look_alikes):
+            what = 'record this side' if seen <= _FEW_LANDMARKS else (
+                'describe these objects better in their labels, or record this side again')
+            yield Advice(
+                f'{what}: {len(run)} frames at {middle.stamp_s - (trials[0].stamp_s or 0.0):.0f} '
+                f's, around {_place(middle.position)} looking {_heading(middle)}, show {seen} '
+                'landmarks and none is accepted', view=middle)
+
+
+def _on_grid(report: CheckReport) -> Iterator[Advice]:
+    """Yield advice on areas without an accepted heading, and on those without a keyframe."""
+    grid, keyframes = report.grid, report.keyframes
+    for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
+        if np.mean([_sees_double(position, report.look_alikes)
+                    for position in grid.positions[rows]]) <= 0.5:
+            reached = keyframes is not None and (keyframes.headings[rows] > 0).all()
+            yield Advice(
+                f'no heading is accepted by objects at {_area(grid, rows)}'
+                f'{", only keyframes reach them" if reached else ""}: a view from there shows '
+                f'{int(grid.visible[rows].max())} landmarks at most; map more objects that can '
+                'be seen from there',
+                view=grid.trials[int(rows[0] * grid.headings + grid.visible[rows[0]].argmax())])
+    if keyframes is not None:
+        yield from _some([
+            Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when you '
+                   'record again, or rely on the landmarks')
+            for rows in _areas(grid, keyframes.without)], 'areas that no keyframe reaches')
+
+
+def _sees_double(position: NDArray[np.float64], pairs: Sequence[LookAlike]) -> bool:
+    """Return whether a camera is near a place that looks like another one."""
+    return any(np.hypot(position[0] - place[0], position[1] - place[1]) < _SIGHT_M
+               for pair in pairs for place in (pair.first, pair.second))
+
+
+def _areas(grid: GridCheck, dead: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Group rows of a grid into areas of neighbours, the largest first."""
+    if not len(dead):
+        return []
+    tree = cKDTree(grid.positions[dead])
+    count, areas = connected_components(tree.sparse_distance_matrix(tree, 1.2 * grid.spacing_m))
+    found = [dead[areas == number] for number in range(count)]
+    return sorted((rows for rows in found if len(rows) >= _MIN_SPAN), key=len, reverse=True)
+
+
+def _area(grid: GridCheck, rows: NDArray[np.int64]) -> str:
+    low, high = grid.positions[rows].min(axis=0), grid.positions[rows].max(axis=0)
+    return (f'{len(rows)} positions near the recording, x {low[0]:.1f} to {high[0]:.1f}, y '
+            f'{low[1]:.1f} to {high[1]:.1f}')
+
+
+def _place(point: NDArray[np.float64] | tuple[float, ...]) -> str:
+    return f'x {point[0]:.1f}, y {point[1]:.1f}'
+
+
+def _heading(trial: Trial) -> str:
+    """Describe the heading of a camera as an angle from the map's x axis."""
+    return f'to {np.degrees(np.arctan2(trial.forward[1], trial.forward[0])):.0f} degrees'

@@ -24,7 +24,7 @@ from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
-from cliploc_ros.offline.mapping.check.landmark_faults import Witness
+from cliploc_ros.offline.mapping.check.findings import Witness
 from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, REACH, best_ious, is_expected
 from cliploc_ros.offline.mapping.fitting import fit_landmarks, linearize_boxes
 from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes
@@ -249,22 +249,25 @@ def sample_frames(detections: PosedDetections, limit: int) -> NDArray[np.int64]:
     return detections.every(step, min(step // 2, count - 1))
 
 
-def each_pose(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
-              options: CheckOptions) -> Iterator[Trial]:
-    """Relocalize a simulated frame for each pose; yield the trials.
+def try_poses(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
+              options: CheckOptions, tell: Tell) -> list[Trial]:
+    """Relocalize a simulated frame for each pose; return the trials.
 
     The model generates the detections, and the relocalizer knows the map; poses (k, 4, 4) are
-    the true map_from_camera.
+    the true map_from_camera. tell is called with the progress, 0 to 1.
     """
+    trials = []
     labels, relocalizer = LabelModel.of(landmark_map), make_relocalizer(landmark_map, options)
     for number, pose in enumerate(poses):
         rng = np.random.default_rng([options.random_seed, number])
         detections, shown = model.detect(pose, rng)
         similarities = labels.similarities(shown, detections.class_ids, detections.bboxes_xyxy,
                                            rng)
-        yield replace(try_view(Localizer(relocalizer), PosedQuery(
+        trials.append(replace(try_view(Localizer(relocalizer), PosedQuery(
             number, Observation(model.camera, detections, similarities), pose),
-            int((shown >= 0).sum()), options), stamp_s=None)
+            int((shown >= 0).sum()), options), stamp_s=None))
+        tell(len(trials) / len(poses))
+    return trials
 
 
 def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:

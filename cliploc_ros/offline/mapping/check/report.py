@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
-from cliploc_ros.offline.mapping.check.landmark_faults import LandmarkCheck, Overlap
-from cliploc_ros.offline.mapping.check.places import Grid, LookAlike
+from cliploc_ros.offline.mapping.check.findings import Grid, LandmarkCheck, LookAlike, Overlap
 from cliploc_ros.offline.mapping.check.relocalization import (
     LANDMARKS_FOR_A_POSE,
     Trial,
@@ -129,18 +128,8 @@ class KeyframeCheck:
     #: (F,): recorded frames within reach of a keyframe; empty without a recording
     recorded: NDArray[np.bool_]
     headings: NDArray[np.int64]  #: (P,): number of headings within reach, by grid position
-    grid: Grid
-
-    @property
-    def without(self) -> NDArray[np.int64]:
-        """Return the rows of the grid positions near the recording that no keyframe reaches."""
-        return np.nonzero(self.grid.is_near & (self.headings == 0))[0]
-
-    @property
-    def reached_positions(self) -> float:
-        """Return the share of the grid positions near the recording with a heading in reach."""
-        near = int(self.grid.is_near.sum())
-        return 1.0 - len(self.without) / near if near else 0.0
+    without: NDArray[np.int64]  #: Rows of the positions near the recording without such a heading
+    reached_positions: float  #: Share of the positions near the recording with such a heading
 
 
 @dataclass(frozen=True)
@@ -170,7 +159,9 @@ class CheckReport:
     @property
     def localized(self) -> tuple[str, ...]:
         """Return how many frames and positions localize a robot, by evidence, as sentences."""
-        found = [tell_positions(self.grid, self.keyframes)]
+        near, by_objects = self.grid.is_near, self.grid.accepted > 0
+        reached = by_objects if self.keyframes is None else self.keyframes.headings > 0
+        found = [_tell_localized('positions', by_objects[near], reached[near])]
         if self.recording is not None and (judged := self.recording.judged):
             found.insert(0, _tell_localized(
                 'recorded frames',
@@ -238,13 +229,6 @@ class CheckReport:
             landmark.weight for landmark in self.landmarks)
 
 
-def tell_positions(grid: GridCheck, keyframes: KeyframeCheck | None) -> str:
-    """Return how many grid positions near the recording localize a robot, by evidence."""
-    by_objects = grid.accepted > 0
-    reached = by_objects if keyframes is None else by_objects | (keyframes.headings > 0)
-    return _tell_localized('positions', by_objects[grid.is_near], reached[grid.is_near])
-
-
 def _tell_localized(what: str, by_objects: NDArray[np.bool_], by_any: NDArray[np.bool_]) -> str:
     by_any = by_any | by_objects
     return (f'{len(by_any)} {what}: {by_objects.sum()} localized by objects, '
@@ -302,9 +286,12 @@ def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
     poses = np.empty((0, 4, 4)) if recorded is None else recorded
     reached = in_reach(layer, np.array([trial.position for trial in grid.trials]),
                        np.array([trial.forward for trial in grid.trials]))
+    headings = reached.reshape(grid.visible.shape).sum(axis=1)
+    without = np.nonzero(grid.is_near & (headings == 0))[0]
+    near = int(grid.is_near.sum())
     return KeyframeCheck(
         len(layer), int(layer.offsets[-1]), in_reach(layer, poses[:, :3, 3], poses[:, :3, 2]),
-        reached.reshape(grid.visible.shape).sum(axis=1), grid)
+        headings, without, 1.0 - len(without) / near if near else 0.0)
 
 
 def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
@@ -314,9 +301,6 @@ def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
     Cameras are at positions (n, 3) [m] and look along unit vectors (n, 3).
     """
     places, axes = layer.map_from_camera[:, :3, 3], layer.map_from_camera[:, :3, 2]
-    found = np.zeros(len(positions), dtype=np.bool_)
-    for row, (position, axis) in enumerate(zip(positions, forward, strict=True)):
-        angles = np.degrees(np.arccos(np.clip(axes @ axis, -1.0, 1.0)))
-        costs = np.linalg.norm(places - position, axis=1) / NEAR_M + angles / NEAR_DEG
-        found[row] = bool((costs < 1.0).any())
-    return found
+    angles = np.degrees(np.arccos(np.clip(forward @ axes.T, -1.0, 1.0)))
+    distances = np.linalg.norm(positions[:, None] - places, axis=2)
+    return np.asarray((distances / NEAR_M + angles / NEAR_DEG < 1.0).any(axis=1))

@@ -21,10 +21,15 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.building import REFINEMENTS
 from cliploc_ros.offline.mapping.fitting import centre_covariance, fit_ellipsoid
-from cliploc_ros.offline.mapping.joint import Anchors, pose_changes, pose_errors, refine_jointly
+from cliploc_ros.offline.mapping.joint import (
+    Anchors,
+    pose_changes,
+    pose_errors,
+    refine_jointly,
+    significant_pose_errors,
+)
 from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
-from cliploc_ros.offline.mapping.pose_noise import significant_pose_errors
 from cliploc_ros.offline.mapping.views import Views
 
 # Least deviation of a position [m]: objects are not ellipsoids. Chosen.

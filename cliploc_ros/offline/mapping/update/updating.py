@@ -10,8 +10,7 @@ the new centre counts. An ellipsoid without position_sigma was made by hand, and
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +23,9 @@ from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.building import LeftOut, left_out_lines, rounded
 from cliploc_ros.offline.mapping.doubles import find_doubles
 from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, Evidence, Sight, gather_evidence
+from cliploc_ros.offline.mapping.joint import estimated_note
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map, unused_ids
 from cliploc_ros.offline.mapping.options import MappingOptions
-from cliploc_ros.offline.mapping.pose_noise import estimated_note
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.alignment import (
     MIN_CONFIRMED,
@@ -35,19 +34,17 @@ from cliploc_ros.offline.mapping.update.alignment import (
     align,
     known_landmarks,
 )
-from cliploc_ros.offline.mapping.update.identity import (
-    Fates,
-    compare_looks,
-    decide_fates,
-    renew_embeddings,
-    why_not_comparable,
-)
 from cliploc_ros.offline.mapping.update.judging import (
     LEAST_VIEWS,
+    Fates,
     Judgement,
     Shown,
+    compare_looks,
+    decide_fates,
     gather_objects,
     judge,
+    renew_embeddings,
+    why_not_comparable,
 )
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 
@@ -106,10 +103,6 @@ class UpdateReport:
     doubtful: tuple[UpdatedLandmark, ...]
     left_out: tuple[LeftOut, ...]  #: New objects that are not good enough for the map
     notes: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report as plain values, for JSON."""
-        return asdict(self)
 
     def lines(self) -> list[str]:
         """Return the report as text."""
