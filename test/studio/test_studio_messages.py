@@ -58,7 +58,7 @@ def page(tmp_path):
     ids=lambda value: '' if isinstance(value, list) else str(value)[:20])
 def test_hostile_messages_are_refused(page, caplog, action, hostile):
     """There is neither an internal error nor an impossible picture."""
-    from cliploc_ros.offline.studio.parts import parts_of
+    from cliploc_ros.offline.studio.page import parts_of
 
     desk, document = page.desk, page.desk.studio.document
     for values in hostile:

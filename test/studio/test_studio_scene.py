@@ -20,11 +20,10 @@ from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import viewpoint
-from cliploc_ros.offline.studio.cloud import find_cloud
-from cliploc_ros.offline.studio.landmark import map_of
-from cliploc_ros.offline.studio.layers import Layers, draw_answers
+from cliploc_ros.offline.studio.edits import map_of
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.studio.walls import OCCUPIED, UNKNOWN, Walls, draw_walls
+from cliploc_ros.offline.studio.room import OCCUPIED, UNKNOWN, Walls, draw_walls, find_cloud
+from cliploc_ros.offline.studio.scene import Layers, draw_answers
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 UPRIGHT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along x

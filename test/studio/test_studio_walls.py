@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.errors import MapError
-from cliploc_ros.offline.studio.walls import FREE, OCCUPIED, UNKNOWN, read_walls
+from cliploc_ros.offline.studio.room import FREE, OCCUPIED, UNKNOWN, read_walls
 
 # the last row is at the origin: y up
 CELLS = np.array([[UNKNOWN, FREE, FREE], [FREE, OCCUPIED, FREE]], dtype=np.uint8)

@@ -12,19 +12,20 @@ from pathlib import Path
 from threading import Event, RLock
 from typing import Any
 
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.storage import parse_json
-from cliploc_ros.offline.studio.edits import Change, EditError, change_from_json
-from cliploc_ros.offline.studio.landmark import KNOWN_FIELDS, Landmark, Landmarks, map_of
-from cliploc_ros.offline.studio.map_file import (
-    LookFile,
-    MapFile,
-    read_look_file,
-    read_map_file,
-    text_on_disk,
+from cliploc_ros.offline.studio.edits import (
+    Change,
+    EditError,
+    Landmark,
+    Landmarks,
+    change_from_json,
+    map_of,
 )
+from cliploc_ros.offline.studio.map_file import MapFile, read_map_file, text_on_disk
 
 _MAX_HISTORY = 10_000
 
@@ -49,7 +50,6 @@ class Document:
     def __init__(self, path: Path):
         self.lock = RLock()
         self.changed = Event()
-        self.notes: tuple[str, ...] = ()
         #: Whether another program changed the file, until the user decides
         self.has_conflict = False
         self.selection: tuple[str, ...] = ()
@@ -57,8 +57,8 @@ class Document:
         self._undone: list[Change] = []
         self._gesture: object = None
         self._file = read_map_file(path)
-        self._look_file = self._read_looks()
-        self.landmarks: Landmarks = self._landmarks_of_file()
+        self.notes = self._file.notes
+        self.landmarks: Landmarks = self._file.landmarks
         self._saved: Landmarks = self.landmarks
         # Edits that are not yet in the file. Before the map is written, the digest of its new
         # content is added to the journal, so that replay works with the old and the new file.
@@ -73,7 +73,6 @@ class Document:
         except BaseException:
             self._journal.close()
             raise
-        self._note_unknown_fields()
 
     # ---- content --------------------------------------------------------------------------------
 
@@ -90,13 +89,13 @@ class Document:
     @property
     def encoder_key(self) -> str:
         """The encoder of the landmarks' embeddings; '' without embeddings."""
-        return self._look_file.encoder_key
+        return self._file.encoder_key
 
     def take_encoder(self, encoder_key: str) -> None:
         """Set the encoder of the embeddings of a new, empty map; ignored for other maps."""
         with self.lock:
-            if not self._file.landmarks and not self._look_file.path.exists():
-                self._look_file = replace(self._look_file, encoder_key=encoder_key)
+            if not self._file.landmarks and not embeddings_path(self.path).exists():
+                self._file = replace(self._file, encoder_key=encoder_key)
 
     @property
     def selected(self) -> tuple[str, Landmark] | None:
@@ -233,9 +232,7 @@ class Document:
                                 'or delete the file')
             file = self._file.with_landmarks(self.landmarks)
             self._journal.append({'writing': file.digest})
-            # the map is written last: its new content marks a complete save
-            self._look_file = self._look_file.write(self.landmarks)
-            file.write()
+            file.write(self._file)
             self._take_file(file, self.landmarks)
             return f'saved {self.path.name}'
 
@@ -248,14 +245,12 @@ class Document:
             file = read_map_file(self.path)
             if not file.text:
                 raise MapError(f'{self.path}: no such file; saving writes it')
-            self._file = file
-            self._look_file = self._read_looks()
             before = self.landmarks
             found = {key: replace(before.get(key, one), fields=one.fields, look=one.look)
-                     for key, one in self._landmarks_of_file().items()}
+                     for key, one in file.landmarks.items()}
             self._take('edit', Change('reload the file', {**dict.fromkeys(before), **found}))
             self._take_file(file, found)
-            self._note_unknown_fields()
+            self.notes += file.notes
             return f'reloaded {self.path.name}; undo reverts this'
 
     def _take_file(self, file: MapFile, landmarks: Landmarks) -> None:
@@ -269,22 +264,6 @@ class Document:
         """Close the journal; remove it if the file contains all edits."""
         with self.lock:
             self._journal.remove() if self.is_saved else self._journal.close()
-
-    def _landmarks_of_file(self) -> dict[str, Landmark]:
-        return {key: replace(landmark, look=self._look_file.looks.get(key))
-                for key, landmark in self._file.landmarks.items()}
-
-    def _note_unknown_fields(self) -> None:
-        unknown = {name: key for key, landmark in self.landmarks.items()
-                   for name in landmark.fields if name not in KNOWN_FIELDS}
-        for name, landmark_id in list(unknown.items())[:5]:
-            self.notes += (f"field '{name}' (landmark '{landmark_id}') is kept, but the "
-                           'relocalizer refuses a map with unknown fields',)
-
-    def _read_looks(self) -> LookFile:
-        found, fault = read_look_file(self._file)
-        self.notes += (fault,) if fault else ()
-        return found
 
     def _replay(self, entries: list[dict[str, Any]]) -> None:
         """Repeat the edits of the journal that are not in the file."""

@@ -45,8 +45,7 @@ from cliploc_ros.offline.mapping.sightings import (
 from cliploc_ros.offline.mapping.views import Views, make_views
 from cliploc_ros.offline.simulation import LabelModel
 from cliploc_ros.offline.studio import edits
-from cliploc_ros.offline.studio.edits import Change, EditError
-from cliploc_ros.offline.studio.landmark import Landmarks, map_of
+from cliploc_ros.offline.studio.edits import Change, EditError, Landmarks, map_of
 
 #: Least number of boxes that determine an ellipsoid.
 LEAST_BOXES = 3

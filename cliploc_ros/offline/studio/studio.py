@@ -24,12 +24,11 @@ from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.sightings import Sighting
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
-from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.landmark import Landmark, Landmarks
+from cliploc_ros.offline.studio.edits import EditError, Landmark, Landmarks
 from cliploc_ros.offline.studio.new_landmark import NewLandmark
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.review import ReviewQueue
-from cliploc_ros.offline.studio.walls import Walls
+from cliploc_ros.offline.studio.room import Walls
 
 if TYPE_CHECKING:
     from cliploc_ros.offline.studio.live import LiveRelocalizer
