@@ -21,8 +21,13 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError, OptionsError
-from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
-from cliploc_ros.offline.evaluation.pages import CHECK, CHECK_DATA, write_check
+from cliploc_ros.offline.evaluation.check_page import (
+    CHECK,
+    CHECK_DATA,
+    ViewPainter,
+    draw_pictures,
+    write_check,
+)
 from cliploc_ros.offline.mapping.check.advice import give_advice
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.landmark_faults import check_landmarks, hear_witness

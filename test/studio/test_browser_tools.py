@@ -49,8 +49,8 @@ def test_layers_film_and_a_click_on_the_image(person, studio):
     wait_for(lambda: studio.view >= 3, 'the film')
     person.click('Stop')
     person.show_view(studio, 3)
-    outline = studio.recording.outlines(studio.document.landmarks, 3)[0]
-    page.mouse.click(*person.on_image(outline.ellipse[:2]))
+    outline = next(iter(studio.recording.outlines(studio.document.landmarks, 3).values()))
+    page.mouse.click(*person.on_image(outline[:2]))
     wait_for(lambda: studio.document.selection, 'the selection')
     page.mouse.click(*person.on_image((2, 2)))
     wait_for(lambda: not studio.document.selection, 'nothing there')

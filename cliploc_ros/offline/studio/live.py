@@ -95,16 +95,13 @@ class LiveRelocalizer:
         self.state = LiveState(False, {}, None)
         self._pose: LivePose | None = None
         self._turn, self._closed = threading.Lock(), threading.Event()
-        self._listeners: list[Callable[[], None]] = []
+        #: Called after each change of the state, in any thread
+        self.on_change: Callable[[], None] = lambda: None
         self._status = RelocalizerStatus(node, name)
         self._relocalize = node.create_client(Trigger, f'{name}/relocalize')
         self._reload = node.create_client(Trigger, f'{name}/reload_map')
         node.create_subscription(PoseWithCovarianceStamped, f'{name}/pose', self._on_pose,
                                  qos.POSE)
-
-    def subscribe(self, listener: Callable[[], None]) -> None:
-        """Register a function that is called after each change of the state, in any thread."""
-        self._listeners.append(listener)
 
     def update(self) -> None:
         """Update the state from the received messages."""
@@ -112,13 +109,7 @@ class LiveRelocalizer:
         is_heard = bool(values) and self._status.silent_s <= _SILENCE_S
         if self._pose is not self.state.pose or (is_heard, values) != self.state[:2]:
             self.state = LiveState(is_heard, values, self._pose)
-            for listener in self._listeners:
-                listener()
-
-    @property
-    def is_busy(self) -> bool:
-        """Return whether a request waits for its answer."""
-        return self._turn.locked()
+            self.on_change()
 
     def lines(self, document: Document) -> list[str]:
         """Return the state as lines for the page."""

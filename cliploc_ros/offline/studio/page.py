@@ -262,8 +262,7 @@ def _view_parts(studio: Studio) -> dict[str, Any]:
     new, recording, view = studio.new, studio.recording, studio.view
     assert recording is not None and new is not None
     selection, seen = studio.document.selection, recording.detections.detections_of(view)
-    shown = [outline for number, outline in enumerate(recording.outlines(studio.shown(), view))
-             if number < _MAX_OUTLINES or outline.landmark_id in selection]
+    outlines = enumerate(recording.outlines(studio.shown(), view).items())
     guess = {} if new.fit is None else {'': Landmark(shape_fields(new.fit.center, new.fit.basis))}
     return {
         'view': {
@@ -271,8 +270,9 @@ def _view_parts(studio: Studio) -> dict[str, Any]:
             'size': [studio.camera.width, studio.camera.height],
             'boxes': [[*box, name] for box, name in zip(
                 seen.bboxes_xyxy.round(1).tolist(), seen.class_ids, strict=True)],
-            'outlines': [[one.landmark_id, *_axes_of(one.ellipse)] for one in shown],
-            'guess': [_axes_of(outline.ellipse) for outline in recording.outlines(guess, view)],
+            'outlines': [[key, *_axes_of(ellipse)] for number, (key, ellipse) in outlines
+                         if number < _MAX_OUTLINES or key in selection],
+            'guess': [*map(_axes_of, recording.outlines(guess, view).values())],
             'guide': new.guide(view).round(1).tolist()},
         'new': {'boxes': sorted(new.boxes.items()), 'class_id': new.class_id, 'doubt': new.doubt}}
 
@@ -332,7 +332,7 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     if live is not None:
         studio.live = live
-        live.subscribe(studio.changed.set)
+        live.on_change = studio.changed.set
     pages.append(page := Page(studio, server))
     try:
         shown_host = f'[{host}]' if ':' in host else host

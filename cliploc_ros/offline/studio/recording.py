@@ -9,7 +9,6 @@ new images.
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -53,15 +52,6 @@ LEAST_BOXES = 3
 _MARGIN = 0.25
 
 
-class Outline(NamedTuple):
-    """The outline of a landmark in a view."""
-
-    landmark_id: str
-    ellipse: NDArray[np.float64]  #: cx, cy, exx, exy, eyy [px]
-    bbox_xyxy: NDArray[np.float64]  #: (4,) [px]
-    distance_m: float
-
-
 class Recording:
     """Boxes and poses of a recording of the mapped place, and optionally its images."""
 
@@ -85,10 +75,10 @@ class Recording:
             map_of(landmarks), self.detections.class_names))
         return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
 
-    def outlines(self, landmarks: Landmarks, view: int) -> list[Outline]:
-        """Return the outlines of landmarks in a view, nearest first."""
+    def outlines(self, landmarks: Landmarks, view: int) -> dict[str, NDArray[np.float64]]:
+        """Return the outlines cx, cy, exx, exy, eyy [px] of landmarks in a view, nearest first."""
         if not landmarks:
-            return []
+            return {}
         camera, centers = self.detections.camera_of(view), _array(landmarks, 'center')
         ellipses = outlines_in_view(self.detections, view, centers, shape_matrices(
             _array(landmarks, 'semi_axes'), _array(landmarks, 'quat_xyzw')))
@@ -97,10 +87,9 @@ class Recording:
         with np.errstate(invalid='ignore'):
             is_inside = (boxes[:, 2:] > 0.0).all(axis=1) & (
                 boxes[:, :2] < (camera.width, camera.height)).all(axis=1)
-        found = [Outline(*fields) for fields in zip(landmarks, ellipses, boxes,
-                                                    distances.tolist(), strict=True)]
-        return sorted((found[row] for row in np.nonzero(is_inside)[0]),
-                      key=lambda outline: outline.distance_m)
+        ids = list(landmarks)
+        return {ids[row]: ellipses[row] for row in np.argsort(distances, kind='stable')
+                if is_inside[row]}
 
     def sightings(self, landmarks: Landmarks, landmark_id: str, limit: int = 6) -> list[Sighting]:
         """Return the views that show a landmark best; CliplocError: an image cannot be read."""

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.offline.evaluation.pages import check_page
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts, sample_frames
 from cliploc_ros.offline.mapping.options import CheckOptions
@@ -205,26 +204,22 @@ class Studio:
 
     def lock(self, ids: Sequence[str] | None = None) -> str:
         """Lock landmarks, by default the selection; unlock them if all are locked."""
-        return self._toggle(ids, 'is_locked', ('lock', 'locked'), ('unlock', 'unlocked'))
+        return self._toggle(ids, 'is_locked', 'locked', 'unlocked')
 
     def hide(self, ids: Sequence[str] | None = None) -> str:
         """Hide landmarks, by default the selection; show them if all are hidden."""
-        return self._toggle(ids, 'is_hidden', ('hide', 'hid'), ('show', 'showed'))
+        return self._toggle(ids, 'is_hidden', 'hid', 'showed')
 
-    def _toggle(self, ids: Sequence[str] | None, name: str, on: tuple[str, str],
-                off: tuple[str, str]) -> str:
-        """Set a mark, or clear it if all landmarks have it.
-
-        `on` and `off` are the verbs for setting and clearing, and their past tenses for the log.
-        """
+    def _toggle(self, ids: Sequence[str] | None, name: str, on: str, off: str) -> str:
+        """Set a mark, or clear it if all landmarks have it. `on` and `off` say it in the log."""
         if ids is not None and not (isinstance(ids, list)
                                     and all(isinstance(key, str) for key in ids)):
-            raise EditError(f'{on[0]}: expected a list of ids, not {ids!r:.60}')
+            raise EditError(f'{name}: expected a list of ids, not {ids!r:.60}')
         ids, landmarks = ids or self.document.chosen(), self.document.landmarks
         have_it = all(getattr(landmarks[key], name) for key in ids if key in landmarks)
-        what, past = off if have_it else on
+        what = off if have_it else on
         self.document.edit(edits.mark, ids, what, **{name: not have_it})
-        return f'{past} {", ".join(ids)}'
+        return f'{what} {", ".join(ids)}'
 
     def split(self) -> str:
         """Split the selected landmark along its longest axis, and select both halves."""
@@ -293,7 +288,11 @@ class Studio:
         stop, call ``allow_check`` before the next check.
         """
         # imported late, since matplotlib takes a second
-        from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
+        from cliploc_ros.offline.evaluation.check_page import (
+            ViewPainter,
+            check_page,
+            draw_pictures,
+        )
 
         def tell(stage: str, share: float) -> None:
             if self._stopped.is_set():
