@@ -31,9 +31,9 @@ def walk(tmp_path_factory):
 
 
 def evaluate(folder, *names):
-    """Return the results of six images in some maps."""
+    """Return the results of three images in some maps."""
     out, maps = folder / '_'.join(names), [folder / f'{name}.yaml' for name in names]
-    assert main([str(word) for word in ('--tum', folder / 'sequence', '--every', 8, *NETWORKS,
+    assert main([str(word) for word in ('--tum', folder / 'sequence', '--every', 16, *NETWORKS,
                                         '--map', *maps, '--out', out)]) == 0
     return json.loads((out / 'results.json').read_text())
 
@@ -41,7 +41,7 @@ def evaluate(folder, *names):
 def test_the_right_floor_is_found_and_equal_floors_are_refused(walk):
     found = evaluate(walk, 'ground', 'other')
     accepted = [result for result in found if result['accepted']]
-    assert len(found) == 6 and len(accepted) >= 5
+    assert len(found) == 3 and len(accepted) >= 2
     assert all(result['map'] == 'ground' and result['error_m'] < 1.0 for result in accepted)
     alike = evaluate(walk, 'ground', 'alike')
     assert not any(answer['accepted'] for answer in alike)

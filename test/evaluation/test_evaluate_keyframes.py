@@ -29,6 +29,7 @@ def walk(tmp_path_factory):
     shutil.copytree(ASSETS / 'sequence', folder / 'sequence')
     shutil.copy(ASSETS / 'map.yaml', folder)
     images = read_folder(ASSETS / 'mapping', FolderOptions(layout='tum'))
+    images = images.select(range(0, images.count, 2))
     save_layer(layer_path(folder / 'map.yaml'), build_layer(
         images, LandmarkMap.from_file(folder / 'map.yaml'), LayerOptions(0.0, 0.0, 300)))
     (folder / 'objects.yaml').write_text('objects: {keyframes: false}\n')

@@ -120,10 +120,11 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
 
 
 def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
-    document = office.document
+    document, detections = office.document, office.recording.detections
+    office.recording = Recording(detections.select_frames(range(0, 33, 3)))
     before = office.relocalize_all()
     accepted = sum(answer.verdict == 'accepted' for answer in office.answers.values())
-    assert 'simulated' in before and '(was' not in before and accepted > 10
+    assert 'simulated' in before and '(was' not in before and accepted > 4
     accepted_view = next(view for view, one in office.answers.items()
                          if one.verdict == 'accepted')
     office.show_view(accepted_view)

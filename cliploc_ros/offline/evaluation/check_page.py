@@ -9,7 +9,7 @@ view of a landmark, or the nearest view.
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass
 from functools import cached_property
 from pathlib import Path
@@ -52,8 +52,6 @@ from cliploc_ros.offline.mapping.sightings import crop_around, find_sightings, o
 from cliploc_ros.offline.mapping.views import make_views
 
 CHECK, CHECK_DATA = 'check.html', 'check.json'
-#: Returns the JPEG and the caption of the image beside a piece of advice.
-ViewOf = Callable[[Advice], tuple[bytes, str] | None]
 # Words and colour of each grade of a landmark.
 _GRADES = {'faulty': ('serious fault', html.MISLED), 'minor': ('minor fault', html.REFUSED),
            'sound': ('sound', '#009E73')}
@@ -76,17 +74,16 @@ _WIDTH_PX = 480
 _BOX_RGB, _OUTLINE_RGB = (255, 255, 255), (230, 159, 0)
 
 
-def write_check(folder: Path, name: str, report: CheckReport,
-                pictures: Iterable[tuple[str, str, bytes]],
-                view_of: ViewOf | None = None) -> None:
+def write_check(folder: Path, name: str, landmark_map: LandmarkMap, report: CheckReport,
+                detections: PosedDetections | None = None, image_of: ImageOf | None = None
+                ) -> None:
     """Write the page and the JSON file of the check of a map, each atomically.
 
-    `pictures` have a name, a caption and a PNG. The first picture is on the first screen.
     OptionsError: a file cannot be written; the old file stays.
     """
     write_text(folder / CHECK_DATA, json.dumps(_plain({'map': name, **_data(report)}), indent=1,
                                                allow_nan=False))
-    write_text(folder / CHECK, check_page(name, report, pictures, view_of))
+    write_text(folder / CHECK, check_page(name, landmark_map, report, detections, image_of))
 
 
 def _data(report: CheckReport) -> dict[str, Any]:
@@ -141,9 +138,11 @@ def _grade(landmark: LandmarkCheck) -> str:
     return 'minor' if landmark.faults else 'sound'
 
 
-def check_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str, bytes]],
-               view_of: ViewOf | None = None) -> str:
-    """Return the page of the check of a map, see write_check."""
+def check_page(name: str, landmark_map: LandmarkMap, report: CheckReport,
+               detections: PosedDetections | None = None, image_of: ImageOf | None = None) -> str:
+    """Return the page of the check of a map; advice has pictures if there are images."""
+    painter = (None if detections is None or image_of is None
+               else _ViewPainter(landmark_map, detections, image_of))
     missed = len(report.failures)
     said = html.verdict('The map reaches all thresholds.' if report.passed else
                         'Keyframes only: the map misses the threshold for objects alone.'
@@ -151,8 +150,9 @@ def check_page(name: str, report: CheckReport, pictures: Iterable[tuple[str, str
                         f'The map misses {missed} of {len(report.measures)} thresholds.',
                         report.passed)
     said += html.items(report.localized)
-    first, *others = (html.figure(png, caption, picture) for picture, caption, png in pictures)
-    cards = [html.card(f'{number}. {advice.text}', *((view_of and view_of(advice)) or ()))
+    first, *others = (html.figure(png, caption, picture)
+                      for picture, caption, png in draw_pictures(landmark_map, report))
+    cards = [html.card(f'{number}. {advice.text}', *((painter and painter.of(advice)) or ()))
              for number, advice in enumerate(report.to_do, start=1)]
     parts = [html.first_screen(
         [said, html.bars(_bar(measure) for measure in report.measures),
@@ -369,7 +369,7 @@ def _draw_landmarks(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) 
 
 # ---- recorded views -----------------------------------------------------------------------------
 
-class ViewPainter:
+class _ViewPainter:
     """Draws views of a recording, with its boxes and the outlines of landmarks."""
 
     def __init__(self, landmark_map: LandmarkMap, detections: PosedDetections, image_of: ImageOf):

@@ -288,11 +288,7 @@ class Studio:
         stop, call ``allow_check`` before the next check.
         """
         # imported late, since matplotlib takes a second
-        from cliploc_ros.offline.evaluation.check_page import (
-            ViewPainter,
-            check_page,
-            draw_pictures,
-        )
+        from cliploc_ros.offline.evaluation.check_page import check_page
 
         def tell(stage: str, share: float) -> None:
             if self._stopped.is_set():
@@ -303,14 +299,12 @@ class Studio:
         tell('', 0.0)
         with self.document.lock:
             landmarks, landmark_map = self.document.landmarks, self.document.to_map()
-        detections, view_of = None, None
-        if self.recording is not None and self.review.has_boxes:
-            detections = self.recording.detections
-            view_of = ViewPainter(landmark_map, detections, self.recording.image).of
+        recording = self.recording if self.review.has_boxes else None
+        detections = recording and recording.detections
         report = check_map(landmark_map, detections, options=self.CHECK, progress=tell,
                            layer=self.layer)
-        self.check_page = check_page(self.document.path.name, report,
-                                     draw_pictures(landmark_map, report), view_of)
+        self.check_page = check_page(self.document.path.name, landmark_map, report, detections,
+                                     recording and recording.image)
         self._checked = landmarks
         return '; '.join([f'checked the map: {report.verdict}', *report.localized])
 
