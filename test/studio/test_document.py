@@ -32,23 +32,19 @@ def document(path):
     document.close()
 
 
-def changed_lines(path, text=TEXT):
+def changed_lines(path):
     """Return the lines that were removed and added, without indentation."""
-    old, new = text.splitlines(), path.read_text().splitlines()
+    old, new = TEXT.splitlines(), path.read_text().splitlines()
     return ([line.strip() for line in old if line not in new],
             [line.strip() for line in new if line not in old])
 
 
-def test_an_edit_changes_its_line_only(document, path):
+def test_edits_change_their_lines_only(document, path):
+    """A list over several lines, a folded text, a new field, a removed field, a new landmark."""
     document.edit(edits.set_fields, ['cup_1'], center=[1.25, 2, 0.5])
     document.save()
     assert changed_lines(path) == (['center: [1.0, 2.0, 0.5]   # from the plan'],
                                    ['center: [1.25, 2.0, 0.5]   # from the plan'])
-    assert LandmarkMap.from_file(path).centers[0].tolist() == [1.25, 2.0, 0.5]
-
-
-def test_all_kinds_of_lines(document, path):
-    """A list over several lines, a folded text, a new field, a removed field, a new landmark."""
     document.edit(edits.set_fields, ['book_1', 'plant_1'], label='yes: "no" # <b>')
     document.edit(edits.set_fields, ['book_1'], center=[0, 0, 1e-6])
     document.edit(edits.set_fields, ['book_1'], class_id='off')
@@ -58,7 +54,7 @@ def test_all_kinds_of_lines(document, path):
     assert found.landmark_ids == ('cup_1', 'book_1', 'plant_1', 'floor_lamp_1')
     assert found.labels[:3] == ('a red cup', 'yes: "no" # <b>', 'yes: "no" # <b>')
     assert found.class_ids == ('cup', 'off', 'plant', 'floor lamp')
-    assert found.centers[1].tolist() == [0.0, 0.0, 1e-6]
+    assert found.centers[:2].tolist() == [[1.25, 2.0, 0.5], [0.0, 0.0, 1e-6]]
     assert [detail.source for detail in found.details] == [None, None, None, 'studio']
     text = path.read_text()
     assert "map_file: ''  # the relocalizer's own" in text
@@ -110,10 +106,8 @@ def test_every_edit_is_undone_and_done_again(document):
 
 @pytest.mark.parametrize(('edit', 'message'), [
     (lambda all: edits.set_fields(all, ['cup_1'], center=[float('nan'), 0, 0]), 'not finite'),
-    (lambda all: edits.set_fields(all, ['cup_1'], center=[1e9, 0, 0]), 'beyond'),
     (lambda all: edits.set_fields(all, ['cup_1'], orientation=[0, 0, 0, 0]), 'no direction'),
     (lambda all: edits.set_fields(all, ['cup_1'], semi_axes=[0.1, 0.1, 0]), 'at least 0.001 m'),
-    (lambda all: edits.set_fields(all, ['cup_1'], label='x' * 100_000), 'longer than 1000'),
     (lambda all: edits.delete(all, ['sofa']), "no landmark 'sofa'")])
 def test_what_no_map_may_hold_is_refused(document, edit, message):
     with pytest.raises(CliplocError, match=message):
@@ -170,14 +164,8 @@ def test_a_file_that_is_gone_is_saved_but_not_reloaded(document, path):
     path.unlink()
     with pytest.raises(MapError, match='no such file; saving writes it'):
         document.reload()
-    assert document.landmarks
     document.save()
     assert LandmarkMap.from_file(path).landmark_ids == tuple(document.landmarks)
-
-
-def test_a_map_whose_name_is_too_long_is_refused(tmp_path):
-    with pytest.raises(DatasetError, match='too long'):
-        Document(tmp_path / ('x' * 300))
 
 
 def test_a_new_map_starts_empty(tmp_path):

@@ -104,7 +104,7 @@ def test_other_answers_take_the_place_of_the_first_ones(server, studio, recwarn)
 def test_up_is_found_where_the_map_is_in_a_cameras_frame():
     turns = Rotation.from_euler('z', np.linspace(0.0, 3.0, 20)[:, None]).as_matrix() @ UPRIGHT
     poses = np.array([make_transform(turn, np.zeros(3)) for turn in turns])
-    assert viewpoint.up_direction(poses).tolist() == [0.0, 0.0, 1.0]
+    assert viewpoint.extent_of([], poses).up.tolist() == [0.0, 0.0, 1.0]
     into_first = np.linalg.inv(poses[0]) @ poses
-    assert np.allclose(viewpoint.up_direction(into_first), [0.0, -1.0, 0.0], atol=1e-6)
-    assert viewpoint.up_direction(np.empty((0, 4, 4))).tolist() == [0.0, 0.0, 1.0]
+    assert np.allclose(viewpoint.extent_of([], into_first).up, [0.0, -1.0, 0.0], atol=1e-6)
+    assert viewpoint.extent_of([], None).up.tolist() == [0.0, 0.0, 1.0]

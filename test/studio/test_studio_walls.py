@@ -37,11 +37,10 @@ def test_a_file_of_map_server_is_read(tmp_path, suffix, negate):
 
 
 @pytest.mark.parametrize(('before', 'after', 'text'), [
-    ('image: walls', 'image: gone', 'gone.pgm'),
     ('image: walls.{suffix}', 'image: /dev/zero', 'not an image'), ('trinary', 'raw', 'mode raw'),
     ('resolution: 0.5\n', '', "'resolution' is miss"), ('0.5', '0.0', 'resolution 0.0'),
     ('[1.0, -2.0, {yaw}]', '[1.0, .inf, 0.0]', 'origin'), ('0.196', '0.9', 'free_thresh'),
-    (YAML, 'walls', 'not a YAML mapping'), ('negate: {negate}', 'negate: maybe', 'maybe')])
+    ('negate: {negate}', 'negate: maybe', 'maybe')])
 def test_a_damaged_file_is_refused_by_name(tmp_path, before, after, text):
     file = write(tmp_path, text=YAML.replace(before, after))
     with pytest.raises(MapError, match=str(file)) as caught:
@@ -50,11 +49,10 @@ def test_a_damaged_file_is_refused_by_name(tmp_path, before, after, text):
     assert '\n' not in str(caught.value)
 
 
-@pytest.mark.parametrize('suffix', ['pgm', 'png'])
-def test_an_image_that_is_cut_short_is_refused(tmp_path, suffix):
-    file = write(tmp_path, suffix)
-    data = (tmp_path / f'walls.{suffix}').read_bytes()
-    for length in (0, 2, 5, len(data) - 5):
-        (tmp_path / f'walls.{suffix}').write_bytes(data[:length])
+def test_an_image_that_is_cut_short_is_refused(tmp_path):
+    file, image = write(tmp_path), tmp_path / 'walls.pgm'
+    data = image.read_bytes()
+    for length in (0, 5, len(data) - 5):
+        image.write_bytes(data[:length])
         with pytest.raises(MapError, match=r'missing, damaged or not an image'):
             read_walls(file)

@@ -164,15 +164,6 @@ def check_page(name: str, landmark_map: LandmarkMap, report: CheckReport,
               html.fold('Pictures', *others),
               html.fold(f'Landmarks, worst first: {faulty} of {len(report.landmarks)} with a '
                         'serious fault', _landmarks(report.landmarks))]
-    if report.look_alikes:
-        parts.append(html.fold(
-            f'{len(report.look_alikes)} pairs of places that look alike', html.items(
-                f'{number}: around x {pair.first[0]:.1f}, y {pair.first[1]:.1f} and x '
-                f'{pair.second[0]:.1f}, y {pair.second[1]:.1f}, turned by {pair.turn_deg:.0f} '
-                f'degrees; {len(pair.matched)} of {pair.landmarks} landmarks match, '
-                f'{pair.same_labels} with equal labels: '
-                + ', '.join(f'{first} = {second}' for first, second in pair.matched)
-                for number, pair in enumerate(report.look_alikes, start=1))))
     return html.page(f'Check of {name}', *parts,
                      html.fold('How these figures were computed', html.items(report.notes)))
 
@@ -191,11 +182,8 @@ def summary_lines(report: CheckReport) -> list[str]:
 
 
 def _figures(report: CheckReport) -> list[tuple[str, str]]:
-    faulty = sum(_grade(landmark) == 'faulty' for landmark in report.landmarks)
     rows = [('landmarks', str(len(report.landmarks))),
-            ('with a serious fault', f'{faulty} ({report.faulty:.0%})'),
-            ('pairs of duplicates', str(report.duplicates)),
-            ('pairs of places that look alike', str(len(report.look_alikes)))]
+            *((measure.name, measure.show(measure.value)) for measure in report.measures)]
     if (recording := report.recording) is not None:
         rows += [
             ('recording', f'{recording.frames} frames, {recording.boxes} boxes, '
@@ -203,23 +191,13 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
             ('explained boxes, median IoU; map as given',
              f'{recording.as_given.explained:.1%}, {recording.as_given.median_iou:.3f} '
              '(optimistic if the map was built from this recording)'),
-            ('explained boxes, median IoU; held out',
-             f'{recording.held_out.explained:.1%}, {recording.held_out.median_iou:.3f}'),
-            (f'recorded frames, cross-validated, {report.evidence}',
-             _verdicts(recording.judged) + (
-                 '' if len(recording.judged) == len(recording.trials) else
-                 f'; of all frames {_verdicts(recording.trials)}: the objects of the other frames '
-                 'are in no other part of the recording')),
-            *([('accepted by objects alone', str(count_by_objects(recording.judged)['accepted']))]
-              if any(trial.by_objects for trial in recording.trials) else []),
+            (f'recorded frames, cross-validated, {report.evidence}', _verdicts(recording.judged)),
             ('the same poses with simulated boxes', _verdicts(recording.simulated)),
             ('noise of box edges', f'{recording.edge_scale:.2f} times that assumed by build_map')]
-    near = ' near the recording' if report.recording else ''
-    rows += [('grid views, by objects alone', _verdicts(report.grid.trials)),
-             (f'grid positions{near} with a heading accepted by objects alone',
-              f'{report.grid.accepted_positions:.0%} of {int(report.grid.is_near.sum())}')]
-    if report.accepted_positions != report.grid.accepted_positions:
-        rows.append((f'the same positions, {report.evidence}', f'{report.accepted_positions:.0%}'))
+        if len(recording.judged) < len(recording.trials):
+            rows.append(('also frames whose objects are in no other part of the recording',
+                         _verdicts(recording.trials)))
+    rows.append(('grid views, by objects alone', _verdicts(report.grid.trials)))
     if (layer := report.keyframes) is not None:
         rows.append(('keyframes', f'{layer.keyframes} with {layer.points} points'))
         if len(layer.recorded):
@@ -232,8 +210,7 @@ def _figures(report: CheckReport) -> list[tuple[str, str]]:
 
 def _verdicts(trials: Sequence[Trial]) -> str:
     counts = count_verdicts(trials)
-    accepted = share(trials, 'accepted')
-    return (f'{counts["accepted"]} of {len(trials)} accepted ({accepted:.0%}), '
+    return (f'{counts["accepted"]} of {len(trials)} accepted ({share(trials, "accepted"):.0%}), '
             f'{counts["refused"]} refused, {counts["misled"]} misled')
 
 

@@ -337,19 +337,15 @@ def with_vertical(queries: Sequence[PosedQuery], noise_deg: float = 0.0, seed: i
     for query in queries:
         rng = np.random.default_rng([seed, query.number])
         up = turned(query.map_from_camera[2, :3], np.radians(noise_deg) * rng.normal(), rng)
-        found.append(replace(
-            query, observation=replace(query.observation, up_in_camera=up), neighbours=tuple(
-                _same_vertical(seen, query.observation, up) for seen in query.neighbours)))
+        own = query.observation.odom_from_camera
+        # the other cameras of a robot know the same vertical
+        neighbours = tuple(
+            seen if own is None or seen.odom_from_camera is None else replace(
+                seen, up_in_camera=seen.odom_from_camera[:3, :3].T @ own[:3, :3] @ up)
+            for seen in query.neighbours)
+        found.append(replace(query, neighbours=neighbours, observation=replace(
+            query.observation, up_in_camera=up)))
     return tuple(found)
-
-
-def _same_vertical(seen: Observation, other: Observation, up_in_other: NDArray[np.float64]
-                   ) -> Observation:
-    """Return an observation with the vertical that another camera of the robot knows."""
-    if seen.odom_from_camera is None or other.odom_from_camera is None:
-        return seen
-    turn = seen.odom_from_camera[:3, :3].T @ other.odom_from_camera[:3, :3]
-    return replace(seen, up_in_camera=turn @ up_in_other)
 
 
 def with_neighbours(queries: Sequence[PosedQuery], groups: Sequence[int], noise_m: float = 0.0,

@@ -101,9 +101,8 @@ class Document:
     def selected(self) -> tuple[str, Landmark] | None:
         """Id and landmark of the selection; None unless it is exactly one landmark."""
         with self.lock:
-            if len(self.selection) != 1:
-                return None
-            return self.selection[0], self.landmarks[self.selection[0]]
+            one = self.selection[0] if len(self.selection) == 1 else None
+            return None if one is None else (one, self.landmarks[one])
 
     def chosen(self) -> tuple[str, ...]:
         """Return the selection; EditError: it is empty."""

@@ -18,6 +18,7 @@ from cliploc_ros.core.geometry.ellipsoid import box_ious
 from cliploc_ros.offline.mapping.evidence import widest_angle_deg
 from cliploc_ros.offline.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.triangulation import box_radii
 from cliploc_ros.offline.mapping.views import Views, make_views
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
@@ -233,5 +234,4 @@ def _meeting_point(views: Views, origins: NDArray[np.float64]
     if not depths.min() > 0.05:
         raise EditError('create: the boxes do not show one object: their rays meet behind a '
                         'camera; draw the same object in all views')
-    extents = views.edges[:, 2:] - views.edges[:, :2]
-    return point, float(np.median(0.5 * np.sqrt(extents.prod(axis=1)) * depths))
+    return point, float(np.median(box_radii(views, np.arange(len(depths))) * depths))

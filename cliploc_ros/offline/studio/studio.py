@@ -299,12 +299,13 @@ class Studio:
         tell('', 0.0)
         with self.document.lock:
             landmarks, landmark_map = self.document.landmarks, self.document.to_map()
-        recording = self.recording if self.review.has_boxes else None
-        detections = recording and recording.detections
+        detections, image_of = None, None
+        if self.recording is not None and self.review.has_boxes:
+            detections, image_of = self.recording.detections, self.recording.image
         report = check_map(landmark_map, detections, options=self.CHECK, progress=tell,
                            layer=self.layer)
         self.check_page = check_page(self.document.path.name, landmark_map, report, detections,
-                                     recording and recording.image)
+                                     image_of)
         self._checked = landmarks
         return '; '.join([f'checked the map: {report.verdict}', *report.localized])
 
