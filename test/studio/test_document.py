@@ -1,8 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The document of the map studio: edits, undo, saving and the journal; no browser."""
+"""The document of the map studio: edits, undo, saving, embeddings and journal; no browser."""
 
+import re
+import signal
+import subprocess
+import sys
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from studio_map import TEXT
 
+from cliploc_ros.core.map.landmark_embeddings import (
+    LandmarkEmbeddings,
+    embeddings_path,
+    load_embeddings_of_map,
+    load_landmark_embeddings,
+    save_landmark_embeddings,
+)
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
@@ -224,3 +236,177 @@ def test_any_session_ends_as_its_file_says(tmp_path_factory, session):
         tree = read_parameter_file(path)['/**']['ros__parameters']['map']['landmarks']
         assert tree == {key: dict(landmark.fields) for key, landmark in document.landmarks.items()}
     document.close()
+
+
+# ---- the image embeddings
+
+IDS = ('plant_1', 'gone_1', 'cup_1', 'book_1')  # not in the map's order, with one extra
+SIZE = 16
+
+
+def unit(rows):
+    return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float16)
+
+
+@pytest.fixture
+def rows(path):
+    """Write embeddings next to the map; return the original mean and medoids by landmark."""
+    path.write_text(TEXT.replace('position_sigma: 0.01', 'support: 3'))
+    rng = np.random.default_rng(0)
+    save_landmark_embeddings(embeddings_path(path), LandmarkEmbeddings(
+        'demo:key', IDS, unit(rng.normal(size=(4, SIZE))), unit(rng.normal(size=(16, SIZE))),
+        np.array([0, 5, 7, 12, 16])))
+    return rows_of(path)
+
+
+def rows_of(path):
+    found = load_landmark_embeddings(embeddings_path(path))
+    return {key: (found.means[row], found.medoids[slice(*found.medoid_offsets[row:row + 2])])
+            for row, key in enumerate(found.landmark_ids)}
+
+
+def is_equal(first, second):
+    return all(np.array_equal(one, other) for one, other in zip(first, second, strict=True))
+
+
+def change_all(document):
+    document.edit(edits.merge, ['cup_1', 'book_1'])
+    document.edit(edits.split, 'plant_1')
+    document.edit(edits.create, 'new', 'book', np.ones(3), np.eye(3))
+
+
+def check_all(path, rows):
+    """A merged landmark has the weighted mean, each half the original rows, a new one none."""
+    found = rows_of(path)
+    assert sorted(found) == ['book_1', 'cup_1', 'plant_1', 'plant_2']
+    mean = rows['cup_1'][0].astype(float) + 3.0 * rows['book_1'][0].astype(float)
+    np.testing.assert_allclose(found['cup_1'][0], mean / np.linalg.norm(mean), atol=2e-3)
+    both = np.concatenate([rows['cup_1'][1], rows['book_1'][1]])
+    assert len(found['cup_1'][1]) == 5
+    assert all((both == medoid).all(axis=1).any() for medoid in found['cup_1'][1])
+    assert is_equal(found['plant_1'], rows['plant_1'])
+    assert is_equal(found['plant_2'], rows['plant_1'])
+    assert not found['book_1'][0].any() and not len(found['book_1'][1]), 'not the old book'
+    known = load_embeddings_of_map(path, sorted(found)).is_known
+    assert known.tolist() == [False, True, True, True]
+
+
+def test_rows_follow_their_landmarks(path, rows):
+    document = Document(path)
+    change_all(document)
+    assert is_equal(rows_of(path)['cup_1'], rows['cup_1']), 'only saving writes'
+    document.save()
+    check_all(path, rows)
+    for _ in range(3):
+        document.undo()
+    document.save()
+    found = rows_of(path)
+    assert set(found) == {'cup_1', 'book_1', 'plant_1'}
+    assert all(is_equal(found[key], rows[key]) for key in found)
+    for _ in range(3):
+        document.redo()
+    document.save()
+    check_all(path, rows)
+    document.close()
+
+
+def test_an_unusable_file_stays(path):
+    embeddings_path(path).write_bytes(b'of another program')
+    document = Document(path)
+    assert any('npz file' in note for note in document.notes)
+    document.edit(edits.delete, ['book_1'])
+    document.save()
+    document.close()
+    assert embeddings_path(path).read_bytes() == b'of another program'
+
+
+# ---- the journal of a session that was killed
+
+EDITOR = """
+import sys, numpy as np
+from pathlib import Path
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
+document = Document(Path(sys.argv[1]))
+document.edit(edits.mark, ['book_1'], 'lock', is_locked=True)
+document.edit(edits.delete, ['plant_1'])
+document.save()
+document.edit(edits.set_fields, ['cup_1'], label='undone')
+document.undo()
+x = 0
+while True:
+    x += 1
+    document.edit(edits.set_fields, ['cup_1'], center=[x, 0, 0], gesture='drag')
+    print(x, flush=True)
+"""
+
+
+def test_a_killed_studio_loses_nothing(path):
+    editor = subprocess.Popen([sys.executable, '-c', EDITOR, path], stdout=subprocess.PIPE,
+                              text=True, cwd=Path(__file__).parents[2])
+    for line in editor.stdout:
+        if int(line) >= 100:
+            editor.send_signal(signal.SIGKILL)
+            break
+    last = int([line, *editor.stdout.readlines()][-1])
+    editor.wait()
+    document = Document(path)
+    assert document.landmarks['cup_1'].center[0] >= last
+    assert 'plant_1' not in document.landmarks
+    assert any('restored' in note for note in document.notes)
+    document.undo()
+    assert document.is_saved, 'the drag is one edit'
+    document.close()
+
+
+def journal_of(path):
+    return path.with_name(f'.{path.name}.studio')
+
+
+def test_replay_between_announcing_and_writing(path):
+    """The studio was killed while saving: either content has the correct edits."""
+    document = Document(path)
+    document.edit(edits.set_fields, ['cup_1'], label='first')
+    document._journal.append({'writing': document._file.with_landmarks(
+        document.landmarks).digest})
+    written = document._file.with_landmarks(document.landmarks).text
+    document._journal.close()
+    again = Document(path)
+    assert again.landmarks['cup_1'].label == 'first' and not again.is_saved
+    again._journal.close()
+    path.write_text(written)
+    again = Document(path)
+    assert again.landmarks['cup_1'].label == 'first' and again.is_saved
+    assert not journal_of(path).with_name(f'{journal_of(path).name}.1').exists(), 'set aside'
+
+
+def test_edits_of_another_content_are_set_aside(path):
+    document = Document(path)
+    document.edit(edits.set_fields, ['cup_1'], label='mine')
+    document.close()
+    path.write_text(TEXT.replace('a red cup', 'theirs'))
+    document = Document(path)
+    assert document.landmarks['cup_1'].label == 'theirs'
+    (note,) = document.notes
+    aside = path.with_name(re.search(r'kept in (\S+)', note)[1])
+    assert '"mine"' in aside.read_text()
+
+
+@pytest.mark.parametrize('tail', [
+    b'{"do": "edit", "what": "cu', b'\xff\xfe\n', b'{}\n',
+    b'{"do": "edit", "what": "x", "after": {"a": {"label": NaN}}}\n',
+    b'{"do": "edit", "what": "x", "after": {"cup_1": {"label": "a", "class_id": "a", '
+    b'"orientation": [0, 0, 0, 1], "semi_axes": [1, 1, 1], '
+    b'"center": [1' + b'0' * 400 + b', 0, 0]}}}\n'])
+def test_a_broken_journal_loses_its_end_only(path, tail):
+    document = Document(path)
+    document.edit(edits.set_fields, ['cup_1'], label='mine')
+    document.close()
+    with journal_of(path).open('ab') as file:
+        file.write(tail)
+    document = Document(path)
+    assert document.landmarks['cup_1'].label == 'mine'
+    assert set(document.landmarks) == {'cup_1', 'book_1', 'plant_1'}
+    document.edit(edits.set_fields, ['cup_1'], label='mine, too')
+    document.close()
+    assert Document(path).landmarks['cup_1'].label == 'mine, too'

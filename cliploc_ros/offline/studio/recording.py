@@ -69,11 +69,13 @@ class Recording:
 
     def boxes_of(self, landmarks: Landmarks) -> dict[str, NDArray[np.int64]]:
         """Return the boxes of each landmark; a box shows at most one landmark."""
-        if not landmarks:
-            return {}
-        shown = associate(self.views, landmarks_of_map(
+        return dict(zip(landmarks, group_boxes(self._shown(landmarks), len(landmarks)),
+                        strict=True)) if landmarks else {}
+
+    def _shown(self, landmarks: Landmarks) -> NDArray[np.int64]:
+        """Return the number of the landmark that each box (n,) shows, -1 for none."""
+        return associate(self.views, landmarks_of_map(
             map_of(landmarks), self.detections.class_names))
-        return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
 
     def outlines(self, landmarks: Landmarks, view: int) -> dict[str, NDArray[np.float64]]:
         """Return the outlines cx, cy, exx, exy, eyy [px] of landmarks in a view, nearest first."""
@@ -173,10 +175,7 @@ class Recording:
             layer, self.image)
         landmark_map, options, detections = map_of(landmarks), CheckOptions(), self.detections
         relocalizer, labels = make_relocalizer(landmark_map, options), LabelModel.of(landmark_map)
-        shown = np.full(len(detections.classes), -1, dtype=np.int64)
-        for landmark, rows in enumerate(self.boxes_of(landmarks).values()):
-            shown[rows] = landmark
-        answers = {}
+        shown, answers = self._shown(landmarks), {}
         for view in views:
             query = simulated(detections, view, shown, labels, options.random_seed)
             localizer = Localizer(relocalizer)
