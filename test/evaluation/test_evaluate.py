@@ -35,13 +35,10 @@ IMAGES = 8
 TIMEOUT_S = 900.0  # with networks, on a machine under load
 
 
-def command(*arguments):
-    return [sys.executable, '-m', 'cliploc_ros.cli.evaluate', *map(str, arguments)]
-
-
-def evaluate(*arguments, **options):
-    return subprocess.run(command(*arguments), cwd=PROJECT, text=True, capture_output=True,
-                          timeout=TIMEOUT_S, **options)
+def evaluate(*arguments):
+    return subprocess.run(
+        [sys.executable, '-m', 'cliploc_ros.cli.evaluate', *map(str, arguments)], cwd=PROJECT,
+        text=True, capture_output=True, timeout=TIMEOUT_S)
 
 
 @pytest.fixture
@@ -110,8 +107,10 @@ def test_the_papers_table_on_real_queries(shared_data, tmp_path):
 
 def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_here):
     """All frames have one pose. As on a robot at rest, the newest one replaces earlier ones."""
-    recorded = changed(files, tmp_path, query_group=np.arange(12) // 6,
-                       is_main=np.arange(12) % 6 == 1)
+    recorded = tmp_path / 'changed.npz'
+    with np.load(files / 'queries.npz') as content:
+        np.savez(recorded, **{**content, 'query_group': np.arange(12) // 6,
+                              'is_main': np.arange(12) % 6 == 1})
     given = ('--queries', recorded, '--map', files / 'map.yaml', '--methods', 'auto',
              '--no-figures', '--fuse')
     for name, more in (('exact', ('--frames', 'all')),
@@ -232,12 +231,7 @@ def test_networks_run_once_and_a_map_of_the_same_images_is_noted(walk, evaluated
         assert done.returncode == 0, done.stderr
         assert ('built from' in done.stdout) is is_noted
     assert str(cache) in caplog.text and cache.stat().st_mtime_ns == before
-
-
-def changed(files, tmp_path, **arrays):
-    """Return a copy of the query file with some arrays changed; None removes an array."""
-    with np.load(files / 'queries.npz') as content:
-        everything = dict(content) | arrays
-    path = tmp_path / 'changed.npz'
-    np.savez(path, **{name: array for name, array in everything.items() if array is not None})
-    return path
+    cache.write_bytes(b'rubbish')
+    done = evaluate_here('--bag', walk / 'bag', *given, '--out', walk / 'once_more')
+    assert done.returncode == 0 and 'recording again' in caplog.text
+    assert results_of(walk / 'once_more') == results_of(walk / 'on_tum')

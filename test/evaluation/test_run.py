@@ -198,7 +198,7 @@ def test_bad_files_are_named(tmp_path, text, named):
     assert named in str(caught.value)
 
 
-def make_summary(errors, method='auto', accepted=None, confidence=None, **more):
+def make_summary(errors, method='auto', accepted=None, confidence=None):
     """A summary whose errors [deg] are ten times those [m]."""
     errors = np.atleast_2d(np.array(errors, dtype=float))
     shape = errors.shape
@@ -206,7 +206,8 @@ def make_summary(errors, method='auto', accepted=None, confidence=None, **more):
         method, tuple(range(shape[1])), errors, 10.0 * errors,
         np.zeros(shape, bool) if accepted is None else np.atleast_2d(accepted),
         np.zeros(shape) if confidence is None else np.atleast_2d(confidence), np.full(shape, 2.0),
-        np.ones(shape), np.ones(shape, int), **more)
+        np.ones(shape), np.ones(shape, int), np.full(shape, 'objects'), np.zeros(shape, int),
+        np.zeros(shape), 1.0, {})
 
 
 def make_result(**changes):

@@ -7,7 +7,7 @@ import io
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import groupby, pairwise, zip_longest
 from textwrap import wrap
 from typing import Any, NamedTuple
@@ -55,24 +55,23 @@ class Summary:
     search_ms: NDArray[np.float64]  #: (t, q)
     coverage: NDArray[np.float64]  #: (t, q)
     best_iterations: NDArray[np.int64]  #: (t, q)
+    sources: NDArray[np.str_]  #: (t, q): source of each pose, see Result
+    keyframe_inliers: NDArray[np.int64]  #: (t, q)
+    keyframes_ms: NDArray[np.float64]  #: (t, q)
     #: Mean share of a query's crops that were compared with labels
-    crops_share: float = 1.0
+    crops_share: float
     #: Number of refusals by kind, the most frequent first
-    refusals: dict[str, int] = field(default_factory=dict)
-    #: (t, q): source of each pose, see Result
-    sources: NDArray[np.str_] = field(default_factory=lambda: np.empty((0, 0), dtype=str))
-    #: (t, q)
-    keyframe_inliers: NDArray[np.int64] = field(
-        default_factory=lambda: np.empty((0, 0), dtype=np.int64))
-    #: (t, q). These three arrays are empty if no query was compared with keyframes.
-    keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
-    #: Whether another program found the poses. Only the errors have a meaning then.
-    is_given: bool = False
+    refusals: Mapping[str, int]
 
     @property
     def has_keyframes(self) -> bool:
         """Return whether queries were compared with keyframes."""
-        return self.sources.size > 0
+        return bool((self.keyframes_ms > 0.0).any())
+
+    @property
+    def is_given(self) -> bool:
+        """Return whether another program found the poses: only the errors have a meaning then."""
+        return bool((self.sources == GIVEN).any())
 
     def success(self, limit_m: float) -> float:
         """Return the share of poses within a limit of the truth, accepted or not."""
@@ -154,15 +153,10 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
         return np.array(values).reshape(-1, len(queries))
 
     kinds = Counter(result.refusal_kind for result in results if result.refusal_kind)
-    keyframes = {}
-    if (column('keyframes_ms') > 0.0).any():
-        keyframes = {'sources': column('source'), 'keyframe_inliers': column('keyframe_inliers'),
-                     'keyframes_ms': column('keyframes_ms')}
-    return Summary(
-        method, queries, column('error_m'), column('error_deg'), column('accepted'),
-        column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
-        float(column('crops_share').mean()), dict(kinds.most_common()),
-        is_given=results[0].source == GIVEN, **keyframes)
+    return Summary(method, queries, *map(column, (
+        'error_m', 'error_deg', 'accepted', 'confidence', 'search_ms', 'coverage',
+        'best_iteration', 'source', 'keyframe_inliers', 'keyframes_ms')),
+        float(column('crops_share').mean()), dict(kinds.most_common()))
 
 
 class Difference(NamedTuple):

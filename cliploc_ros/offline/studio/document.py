@@ -55,10 +55,11 @@ class Document:
         self.selection: tuple[str, ...] = ()
         self._done: list[Change] = []
         self._undone: list[Change] = []
-        self._gesture: object = None
-        self._file = read_map_file(path)
-        self.notes = self._file.notes
-        self.landmarks: Landmarks = self._file.landmarks
+        #: The gesture of the last edit, such as a drag, if it may continue
+        self.gesture: object = None
+        self.file = read_map_file(path)
+        self.notes = self.file.notes
+        self.landmarks: Landmarks = self.file.landmarks
         self._saved: Landmarks = self.landmarks
         # Edits that are not yet in the file. Before the map is written, the digest of its new
         # content is added to the journal, so that replay works with the old and the new file.
@@ -79,23 +80,13 @@ class Document:
     @property
     def path(self) -> Path:
         """The map file."""
-        return self._file.path
-
-    @property
-    def frame_id(self) -> str:
-        """The coordinate frame of the map."""
-        return self._file.frame_id
-
-    @property
-    def encoder_key(self) -> str:
-        """The encoder of the landmarks' embeddings; '' without embeddings."""
-        return self._file.encoder_key
+        return self.file.path
 
     def take_encoder(self, encoder_key: str) -> None:
         """Set the encoder of the embeddings of a new, empty map; ignored for other maps."""
         with self.lock:
-            if not self._file.landmarks and not embeddings_path(self.path).exists():
-                self._file = replace(self._file, encoder_key=encoder_key)
+            if not self.file.landmarks and not embeddings_path(self.path).exists():
+                self.file = replace(self.file, encoder_key=encoder_key)
 
     @property
     def selected(self) -> tuple[str, Landmark] | None:
@@ -131,15 +122,10 @@ class Document:
         """The edit that the next redo repeats."""
         return self._undone[-1].what if self._undone else None
 
-    @property
-    def is_in_gesture(self) -> bool:
-        """Return whether the last edit may continue, such as a drag."""
-        return self._gesture is not None
-
     def to_map(self) -> LandmarkMap:
         """Return the map of the relocalizer; MapError: there are no landmarks."""
-        return replace(map_of(self.landmarks, self.frame_id, self.path.name),
-                       map_set=self._file.map_set)
+        return replace(map_of(self.landmarks, self.file.frame_id, self.path.name),
+                       map_set=self.file.map_set)
 
     # ---- edits ----------------------------------------------------------------------------------
 
@@ -151,9 +137,9 @@ class Document:
         with self.lock:
             if not change.after:
                 return
-            joins = gesture is not None and gesture == self._gesture and bool(self._done)
+            joins = gesture is not None and gesture == self.gesture and bool(self._done)
             self._do('join' if joins else 'edit', change)
-            self._gesture = gesture
+            self.gesture = gesture
 
     def edit(self, edit: Callable[..., Change], *arguments: Any, gesture: object = None,
              **values: Any) -> Change:
@@ -197,7 +183,7 @@ class Document:
     def _take(self, kind: str, change: Change) -> None:
         """Apply a change, and update the history."""
         back, self.landmarks = change.undoing(self.landmarks), change.apply(self.landmarks)
-        self._gesture = None
+        self.gesture = None
         if kind == 'undo':
             self._undone.append(back)
             del self._done[-1:]
@@ -217,7 +203,7 @@ class Document:
         written. The file is then unchanged.
         """
         with self.lock:
-            if text_on_disk(self.path) not in ('', self._file.text):
+            if text_on_disk(self.path) not in ('', self.file.text):
                 self.has_conflict = True
                 raise MapError(f'{self.path}: another program changed this file after the studio '
                                'read it; overwrite it, or reload it')
@@ -229,9 +215,9 @@ class Document:
             if not self.landmarks:
                 raise EditError(f'{self.path}: a map without landmarks is not saved; create one, '
                                 'or delete the file')
-            file = self._file.with_landmarks(self.landmarks)
+            file = self.file.with_landmarks(self.landmarks)
             self._journal.append({'writing': file.digest})
-            file.write(self._file)
+            file.write(self.file)
             self._take_file(file, self.landmarks)
             return f'saved {self.path.name}'
 
@@ -254,8 +240,8 @@ class Document:
 
     def _take_file(self, file: MapFile, landmarks: Landmarks) -> None:
         """Note that a file contains the landmarks, and begin a new journal."""
-        self._file, self._saved = file, landmarks
-        self._gesture, self.has_conflict = None, False
+        self.file, self._saved = file, landmarks
+        self.gesture, self.has_conflict = None, False
         self._journal.restart([{'base': file.digest}])
         self.changed.set()
 
@@ -266,7 +252,7 @@ class Document:
 
     def _replay(self, entries: list[dict[str, Any]]) -> None:
         """Repeat the edits of the journal that are not in the file."""
-        digest, done = self._file.digest, list[dict[str, Any]]()
+        digest, done = self.file.digest, list[dict[str, Any]]()
         starts = [row for row, entry in enumerate(entries)
                   if digest in (entry.get('base'), entry.get('writing'))]
         edits = [entry for entry in entries[starts[-1] + 1 if starts else 0:] if 'do' in entry]

@@ -126,9 +126,9 @@ class LiveRelocalizer:
         if pose is not None:
             lines.append(f'{"" if state.is_current else "earlier "}pose of '
                          f'{state.base_frame or "the camera"}, stamp {pose.stamp_s:.2f} s')
-            if pose.frame_id != document.frame_id:
-                lines.append(f'the pose is in {pose.frame_id}, the map in {document.frame_id}: '
-                             'the pose is not shown')
+            if pose.frame_id != (frame := document.file.frame_id):
+                lines.append(f'the pose is in {pose.frame_id}, the map in {frame}: the pose is '
+                             'not shown')
         return [line[:_MAX_TEXT] for line in lines if line]
 
     def relocalize(self) -> str:

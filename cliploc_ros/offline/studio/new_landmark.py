@@ -105,7 +105,7 @@ class NewLandmark:
         change = edits.create(document.landmarks, *of)
         (landmark_id,) = change.after
         rows = recording.boxes_of(change.apply(document.landmarks))[landmark_id]
-        document.edit(edits.create, *of, recording.look_of(rows, document.encoder_key))
+        document.edit(edits.create, *of, recording.look_of(rows, document.file.encoder_key))
         document.select([landmark_id])
         self.forget()
         hint = (f'{len(rows)} boxes of the recording show it: use Refit to fit it to them'

@@ -179,7 +179,7 @@ class Page:
             state = studio.live.state
             self._missing.show({key: document.landmarks[key] for key in state.missing
                                 if key in document.landmarks}, lambda class_id: _MISSING_RGB)
-            is_here = state.pose is not None and state.pose.frame_id == document.frame_id
+            is_here = state.pose is not None and state.pose.frame_id == document.file.frame_id
             show('Robot', state if is_here else None, draw_robot)
         # before the image of the scene, which takes time
         self.board.show({**parts_of(self.desk), 'people': self.board.people})
@@ -213,9 +213,9 @@ def parts_of(desk: Desk) -> dict[str, Any]:
     review = studio.review
     found = {
         'file': {
-            'name': document.path.name, 'frame': document.frame_id, 'is_saved': document.is_saved,
-            'notes': document.notes, 'undo': document.to_undo, 'redo': document.to_redo,
-            'conflict': document.has_conflict, 'views': studio.views,
+            'name': document.path.name, 'frame': document.file.frame_id,
+            'is_saved': document.is_saved, 'notes': document.notes, 'undo': document.to_undo,
+            'redo': document.to_redo, 'conflict': document.has_conflict, 'views': studio.views,
             'has_boxes': review.has_boxes, 'images': studio.recording is not None
             and studio.recording.images is not None,
             'classes': sorted({landmark.class_id for landmark in document.landmarks.values()})},

@@ -155,7 +155,7 @@ class Studio:
             self.changed.set()
 
         # during a drag, the views are not updated
-        is_dragged = self.document.is_in_gesture and self._wanted[0] == landmark_id
+        is_dragged = self.document.gesture is not None and self._wanted[0] == landmark_id
         if recording is not None and wanted != self._wanted and not is_dragged:
             if self._search is not None:
                 self._search.cancel()  # unless it has begun
