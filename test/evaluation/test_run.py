@@ -203,11 +203,11 @@ def make_summary(errors, method='auto', accepted=None, confidence=None):
     errors = np.atleast_2d(np.array(errors, dtype=float))
     shape = errors.shape
     return Summary(
-        method, tuple(range(shape[1])), errors, 10.0 * errors,
+        method, tuple(range(shape[1])), 1.0, {}, errors, 10.0 * errors,
         np.zeros(shape, bool) if accepted is None else np.atleast_2d(accepted),
         np.zeros(shape) if confidence is None else np.atleast_2d(confidence), np.full(shape, 2.0),
         np.ones(shape), np.ones(shape, int), np.full(shape, 'objects'), np.zeros(shape, int),
-        np.zeros(shape), 1.0, {})
+        np.zeros(shape))
 
 
 def make_result(**changes):

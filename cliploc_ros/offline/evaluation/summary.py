@@ -47,6 +47,8 @@ class Summary:
 
     method: str
     queries: tuple[int, ...]  #: Numbers of the queries
+    crops_share: float  #: Mean share of a query's crops that were compared with labels
+    refusals: Mapping[str, int]  #: Number of refusals by kind, the most frequent first
     #: (t, q): position and rotation error of the best pose; infinite if none was found
     errors_m: NDArray[np.float64]
     errors_deg: NDArray[np.float64]
@@ -58,10 +60,6 @@ class Summary:
     sources: NDArray[np.str_]  #: (t, q): source of each pose, see Result
     keyframe_inliers: NDArray[np.int64]  #: (t, q)
     keyframes_ms: NDArray[np.float64]  #: (t, q)
-    #: Mean share of a query's crops that were compared with labels
-    crops_share: float
-    #: Number of refusals by kind, the most frequent first
-    refusals: Mapping[str, int]
 
     @property
     def has_keyframes(self) -> bool:
@@ -153,10 +151,10 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
         return np.array(values).reshape(-1, len(queries))
 
     kinds = Counter(result.refusal_kind for result in results if result.refusal_kind)
-    return Summary(method, queries, *map(column, (
-        'error_m', 'error_deg', 'accepted', 'confidence', 'search_ms', 'coverage',
-        'best_iteration', 'source', 'keyframe_inliers', 'keyframes_ms')),
-        float(column('crops_share').mean()), dict(kinds.most_common()))
+    return Summary(
+        method, queries, float(column('crops_share').mean()), dict(kinds.most_common()),
+        *map(column, ('error_m', 'error_deg', 'accepted', 'confidence', 'search_ms', 'coverage',
+                      'best_iteration', 'source', 'keyframe_inliers', 'keyframes_ms')))
 
 
 class Difference(NamedTuple):
