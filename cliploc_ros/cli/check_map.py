@@ -104,7 +104,7 @@ def check(options: argparse.Namespace) -> int:
     # Imported late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.offline.evaluation.check_page import CHECK, summary_lines, write_check
+    from cliploc_ros.offline.evaluation.check_page import CHECK, figures_of, write_check
     from cliploc_ros.offline.mapping.check.checking import check_map
     from cliploc_ros.offline.mapping.tilt import tilt_note
 
@@ -134,7 +134,7 @@ def check(options: argparse.Namespace) -> int:
                            None if options.observations else image_of)
         write_check(out, options.map.name, landmark_map, report, detections, image_of)
     print('\n'.join([f'verdict: {report.verdict}', *report.localized,
-                     *summary_lines(report)]))
+                     *(f'{name}: {value}' for name, value in figures_of(report))]))
     print('what to do:')
     print('\n'.join(f'  {command.printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
     for failure in report.failures:

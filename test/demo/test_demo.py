@@ -91,6 +91,7 @@ def run_of_page(command):
     return [float(number) for number in re.findall(r'\d*\.?\d+', row)]
 
 
+@pytest.mark.full
 def test_a_disk_that_fills_up_is_named_in_one_line(tmp_path):
     code, _, errors = run('--out', tmp_path, '--wake-ups', 1, '--rate', 100, '--method',
                           'class_ransac', within=small_disk(tmp_path))

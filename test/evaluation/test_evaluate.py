@@ -29,7 +29,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.onnx', '--clip-pretrained', ASSETS / 'clip', '--map',
             ASSETS / 'map.yaml')
-FIGURES = ('success_over_threshold', 'success_over_iterations', 'best_iteration', 'top_view',
+FIGURES = ('success_over_threshold', 'success_over_iterations', 'top_view',
            'precision_over_recall')
 IMAGES = 8
 TIMEOUT_S = 900.0  # with networks, on a machine under load

@@ -206,7 +206,7 @@ def make_summary(errors, method='auto', accepted=None, confidence=None):
         method, tuple(range(shape[1])), 1.0, {}, errors, 10.0 * errors,
         np.zeros(shape, bool) if accepted is None else np.atleast_2d(accepted),
         np.zeros(shape) if confidence is None else np.atleast_2d(confidence), np.full(shape, 2.0),
-        np.ones(shape), np.ones(shape, int), np.full(shape, 'objects'), np.zeros(shape, int),
+        np.ones(shape), np.full(shape, 'objects'), np.zeros(shape, int),
         np.zeros(shape))
 
 

@@ -74,6 +74,16 @@ def test_edits_change_their_lines_only(document, path):
     assert read_parameter_file(path)['other_node'] == {'ros__parameters': {'rate': 5.0}}
 
 
+def test_a_map_in_braces_is_rewritten(path):
+    path.write_text('{/**: {ros__parameters: {map: {frame_id: map, landmarks: {cup_1: {label: cup,'
+                    ' class_id: cup, center: [0, 0, 0], semi_axes: [1, 1, 1],'
+                    ' orientation: [0, 0, 0, 1]}}}}}}')
+    document = Document(path)
+    document.edit(edits.create, 'a lamp', 'lamp', np.ones(3), np.eye(3))
+    document.save()
+    assert LandmarkMap.from_file(path).landmark_ids == ('cup_1', 'lamp_1')
+
+
 def test_unknown_fields_stay_and_the_relocalizer_refuses_them(path):
     text = TEXT.replace('class_id: cup', 'class_id: cup\n          colour: {name: red, rgb: [1]}')
     path.write_text(text)

@@ -160,7 +160,7 @@ def check_page(name: str, landmark_map: LandmarkMap, report: CheckReport,
     if later := cards[_FIRST_ADVICE:]:
         parts.append(html.fold(f'{len(later)} more recommendations', *later))
     faulty = sum(_grade(landmark) == 'faulty' for landmark in report.landmarks)
-    parts += [html.fold('All figures', html.table(('', ''), _figures(report))),
+    parts += [html.fold('All figures', html.table(('', ''), figures_of(report))),
               html.fold('Pictures', *others),
               html.fold(f'Landmarks, worst first: {faulty} of {len(report.landmarks)} with a '
                         'serious fault', _landmarks(report.landmarks))]
@@ -176,12 +176,8 @@ def _bar(measure: Measure) -> tuple[str, str, float, float, bool]:
             measure.value / scale, measure.limit / scale, not measure.is_missed)
 
 
-def summary_lines(report: CheckReport) -> list[str]:
-    """Return the figures as lines of text, for a terminal."""
-    return [f'{name}: {value}' for name, value in _figures(report)]
-
-
-def _figures(report: CheckReport) -> list[tuple[str, str]]:
+def figures_of(report: CheckReport) -> list[tuple[str, str]]:
+    """Return the names and values of the figures of a check."""
     rows = [('landmarks', str(len(report.landmarks))),
             *((measure.name, measure.show(measure.value)) for measure in report.measures)]
     if (recording := report.recording) is not None:

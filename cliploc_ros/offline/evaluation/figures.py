@@ -165,9 +165,6 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
                               [result for result in results if result.method == best.method],
                               best.method),
     }
-    if sampled := [summary for summary in searched if not summary.method.endswith('_bf')]:
-        figures['best_iteration'] = _drawn('iteration that found the best pose', '',
-                                           _best_iteration, sampled)
     if sweep:
         figures['success_over_iterations'] = _drawn('iterations', success,
                                                     _success_over_iterations, sweep)
@@ -255,17 +252,6 @@ def _success_over_iterations(axes: Axes, sweep: Mapping[str, Mapping[int, Summar
     axes.set_xticks(counts, [f'{count:,}' for count in counts])
     axes.set_xticks([], minor=True)
     axes.set_ylim(0, 1)
-
-
-def _best_iteration(axes: Axes, summaries: Sequence[Summary]) -> None:
-    found = [summary.best_iterations[np.isfinite(summary.errors_m)] for summary in summaries]
-    boxes = axes.boxplot(found, orientation='horizontal', widths=0.6, showfliers=False,
-                         patch_artist=True, medianprops={'color': 'black'})
-    for patch, summary in zip(boxes['boxes'], summaries, strict=True):
-        patch.set(facecolor=_style(summary.method)[0], alpha=0.6)
-    axes.set_yticks(range(1, len(summaries) + 1), [summary.method for summary in summaries])
-    axes.invert_yaxis()
-    axes.set_title('box: median and quartiles; whiskers: 1.5 interquartile ranges', fontsize=9)
 
 
 def _precision_over_recall(axes: Axes, summaries: Sequence[Summary]) -> None:

@@ -42,7 +42,6 @@ CAPTIONS = {
     _TOP_VIEW: 'Top view of the map. A line joins each estimate of this method to the true pose.',
     'success_over_threshold': 'Share of poses, accepted or not, within a distance of the truth.',
     'precision_over_recall': 'Precision and recall for all thresholds of the confidence.',
-    'best_iteration': 'Iteration that found the best pose.',
     'success_over_iterations': 'Success over the number of iterations.'}
 # Queries of a part, which one process runs, unless one localizer gets all queries of a trial.
 _QUERIES_A_PART = 8

@@ -56,7 +56,6 @@ class Summary:
     confidence: NDArray[np.float64]  #: (t, q)
     search_ms: NDArray[np.float64]  #: (t, q)
     coverage: NDArray[np.float64]  #: (t, q)
-    best_iterations: NDArray[np.int64]  #: (t, q)
     sources: NDArray[np.str_]  #: (t, q): source of each pose, see Result
     keyframe_inliers: NDArray[np.int64]  #: (t, q)
     keyframes_ms: NDArray[np.float64]  #: (t, q)
@@ -154,7 +153,7 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
     return Summary(
         method, queries, float(column('crops_share').mean()), dict(kinds.most_common()),
         *map(column, ('error_m', 'error_deg', 'accepted', 'confidence', 'search_ms', 'coverage',
-                      'best_iteration', 'source', 'keyframe_inliers', 'keyframes_ms')))
+                      'source', 'keyframe_inliers', 'keyframes_ms')))
 
 
 class Difference(NamedTuple):
