@@ -234,8 +234,8 @@ def test_success_errors_and_their_spread_over_trials():
 
 
 def test_precision_and_recall():
-    one = make_summary([0.1, 0.4, 2.0, np.inf], accepted=[True, False, True, False])
-    assert (one.false_accepts(), one.precision(), one.recall()) == (1, 0.5, 0.5)
+    one = make_summary([0.1, 0.2, 0.4, 2.0, np.inf], accepted=[True, True, False, True, False])
+    assert (one.false_accepts(), one.precision(), one.recall()) == pytest.approx((1, 2/3, 2/3))
     none = make_summary([np.inf, np.inf])
     assert (none.precision(), none.recall()) == (1.0, 1.0)
     assert none.precision_interval() == (0.0, 1.0)

@@ -20,7 +20,6 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rclpy.validate_full_topic_name import validate_full_topic_name
 from std_srvs.srv import Trigger
 
 from cliploc_ros.errors import CliplocError, OptionsError
@@ -28,7 +27,7 @@ from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_from_msg
 from cliploc_ros.ros.node.diagnostics import split_names
-from cliploc_ros.ros.running import RelocalizerStatus
+from cliploc_ros.ros.running import RelocalizerStatus, check_name
 
 # The relocalizer reports once a second, but may be late while it loads libraries. Not measured.
 _SILENCE_S = 10.0
@@ -213,16 +212,15 @@ def follow_relocalizer(name: str, ros_args: Sequence[str] = ()) -> Iterator[Live
 
     OptionsError: the name is invalid, or ROS does not start.
     """
-    name = '/' + name.strip('/')
-    context = Context()
+    name, context = '/' + name.strip('/'), Context()
+    check_name(name)
     try:
-        validate_full_topic_name(name)
         rclpy.init(args=list(ros_args), context=context,
                    signal_handler_options=SignalHandlerOptions.NO)
         node = Node('map_studio', context=context, enable_rosout=False,
                     start_parameter_services=False)
-    except Exception as error:  # rcl raises different types for names, arguments and folders
-        raise OptionsError(f'--ros {name}: ROS does not start: {error}') from error
+    except Exception as error:  # rcl raises different types for arguments and folders
+        raise OptionsError(f'--ros: ROS does not start: {error}') from error
     live = LiveRelocalizer(node, name)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
