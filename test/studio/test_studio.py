@@ -82,7 +82,9 @@ def test_moved_landmarks_come_back_by_refitting(office):
     office.refit_all()
     fitted = document.landmarks
     moved = [key for key in ('tv_1', 'keyboard_1', 'book_3') if key in fitted]
-    document.edit(edits.mark, ['book_1'], 'lock', is_locked=True)
+    assert [office.lock(['book_1']) for _ in range(3)] == [
+        'locked book_1', 'unlocked book_1', 'locked book_1']
+    assert document.landmarks['book_1'].is_locked
     for key in moved:
         one = document.landmarks[key]
         document.edit(edits.set_fields, [key], center=one.center + 0.3 * one.semi_axes)
