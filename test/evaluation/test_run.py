@@ -127,9 +127,10 @@ def test_what_a_robot_asks_about_a_frame(questions):
     instant, = replace(questions[5], neighbours=rig).in_order()
     assert (instant.frames, instant.run) == ((*rig, questions[5].observation), None)
     fused = with_neighbours(questions, [0] * len(questions))[5]
-    upright, = with_vertical([fused])
-    for frame in (upright.observation, *upright.neighbours):
-        np.testing.assert_allclose(frame.up_in_camera, fused.map_from_camera[2, :3], atol=1e-9)
+    upright, = with_vertical([with_neighbours(questions, [0] * len(questions), 0.0, 5.0)[5]])
+    own, *others = (frame.odom_from_camera[:3, :3] @ frame.up_in_camera
+                    for frame in (upright.observation, *upright.neighbours))
+    np.testing.assert_allclose(others, [own] * len(others))
     *earlier, last = replace(fused, image=lambda: np.zeros((1, 1, 3), np.uint8)).in_order()
     assert last.frames == (fused.observation,)
     assert len(last.images) == 1 and not any(query.images for query in earlier)

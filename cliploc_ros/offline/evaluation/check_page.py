@@ -11,7 +11,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -141,8 +140,12 @@ def _grade(landmark: LandmarkCheck) -> str:
 def check_page(name: str, landmark_map: LandmarkMap, report: CheckReport,
                detections: PosedDetections | None = None, image_of: ImageOf | None = None) -> str:
     """Return the page of the check of a map; advice has pictures if there are images."""
-    painter = (None if detections is None or image_of is None
-               else _ViewPainter(landmark_map, detections, image_of))
+    views: list[tuple[bytes, str] | None] = [None] * len(report.to_do)
+    if detections is not None and image_of is not None:
+        shown = group_boxes(associate(make_views(detections), landmarks_of_map(
+            landmark_map, detections.class_names)), len(landmark_map))
+        views = [_view_of(advice, landmark_map, detections, shown, image_of)
+                 for advice in report.to_do]
     missed = len(report.failures)
     said = html.verdict('The map reaches all thresholds.' if report.passed else
                         'Keyframes only: the map misses the threshold for objects alone.'
@@ -152,8 +155,8 @@ def check_page(name: str, landmark_map: LandmarkMap, report: CheckReport,
     said += html.items(report.localized)
     first, *others = (html.figure(png, caption, picture)
                       for picture, caption, png in draw_pictures(landmark_map, report))
-    cards = [html.card(f'{number}. {advice.text}', *((painter and painter.of(advice)) or ()))
-             for number, advice in enumerate(report.to_do, start=1)]
+    cards = [html.card(f'{number}. {text}', *(view or ()))
+             for number, (text, view) in enumerate(zip(report.advice, views, strict=True), 1)]
     parts = [html.first_screen(
         [said, html.bars(_bar(measure) for measure in report.measures),
          '<h2>What to do first</h2>', *cards[:_FIRST_ADVICE]], [first])]
@@ -342,57 +345,42 @@ def _draw_landmarks(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) 
 
 # ---- recorded views -----------------------------------------------------------------------------
 
-class _ViewPainter:
-    """Draws views of a recording, with its boxes and the outlines of landmarks."""
+def _view_of(advice: Advice, landmark_map: LandmarkMap, detections: PosedDetections,
+             shown: Sequence[NDArray[np.int64]], image_of: ImageOf) -> tuple[bytes, str] | None:
+    """Return a JPEG of the view that shows best what the advice is about, and its caption.
 
-    def __init__(self, landmark_map: LandmarkMap, detections: PosedDetections, image_of: ImageOf):
-        self._map, self._detections, self._image_of = landmark_map, detections, image_of
-
-    @cached_property
-    def _shown(self) -> list[NDArray[np.int64]]:
-        """Return the boxes that show each landmark."""
-        return group_boxes(associate(
-            make_views(self._detections),
-            landmarks_of_map(self._map, self._detections.class_names)), len(self._map))
-
-    def of(self, advice: Advice) -> tuple[bytes, str] | None:
-        """Return a JPEG of the view that shows best what the advice is about, and its caption.
-
-        That is the best view of a landmark, or the view nearest to that of the advice. None: no
-        image shows it.
-        """
-        detections, words = self._detections, 'the nearest recorded view'
-        rows = [self._map.landmark_ids.index(landmark) for landmark in advice.landmarks]
-        frames: list[int] = []
-        if rows:
-            words = 'outlined: ' + ' and '.join(advice.landmarks)
-            frames = [sighting.view for sighting in find_sightings(
-                detections, self._shown[rows[0]], self._map.centers[rows[0]],
-                self._map.shapes[rows[0]], len(detections))]
-        elif advice.view is not None:
-            poses = detections.map_from_camera
-            cosines = np.clip(poses[:, :3, 2] @ advice.view.forward, -1.0, 1.0)
-            different = (np.linalg.norm(poses[:, :3, 3] - advice.view.position, axis=1)
-                         + np.degrees(np.arccos(cosines)) / _DEGREES_PER_M)
-            frames = [frame for frame in np.argsort(different).tolist()
-                      if different[frame] < _MOST_DIFFERENT]
-        for frame in frames:
-            if (image := self._image_of(frame)) is not None:
-                seconds = detections.stamps_s[frame] - detections.stamps_s[0]
-                return self._draw(image, frame, rows), f'{words}; image at {seconds:.0f} s'
+    That is the best view of a landmark, with its outline and the boxes, or the view nearest to
+    that of the advice. ``shown`` are the boxes of each landmark. None: no image shows it.
+    """
+    rows = [landmark_map.landmark_ids.index(landmark) for landmark in advice.landmarks]
+    words, frames = 'the nearest recorded view', list[int]()
+    if rows:
+        words = 'outlined: ' + ' and '.join(advice.landmarks)
+        frames = [sighting.view for sighting in find_sightings(
+            detections, shown[rows[0]], landmark_map.centers[rows[0]],
+            landmark_map.shapes[rows[0]], len(detections))]
+    elif advice.view is not None:
+        poses = detections.map_from_camera
+        cosines = np.clip(poses[:, :3, 2] @ advice.view.forward, -1.0, 1.0)
+        different = (np.linalg.norm(poses[:, :3, 3] - advice.view.position, axis=1)
+                     + np.degrees(np.arccos(cosines)) / _DEGREES_PER_M)
+        frames = [frame for frame in np.argsort(different).tolist()
+                  if different[frame] < _MOST_DIFFERENT]
+    found = next(((frame, image) for frame in frames
+                  if (image := image_of(frame)) is not None), None)
+    if found is None:
         return None
-
-    def _draw(self, image: NDArray[np.uint8], frame: int, rows: Sequence[int]) -> bytes:
-        """Return the image of a frame as JPEG, around the first of the outlined landmarks."""
-        outlines = outlines_in_view(self._detections, frame, self._map.centers[rows],
-                                    self._map.shapes[rows])
-        drawn, thin = image.copy(), 1 + image.shape[1] // 640
-        boxes = self._detections.detections_of(frame).bboxes_xyxy.reshape(-1, 2, 2)
-        for first, second in np.rint(boxes).astype(int).tolist():
-            cv2.rectangle(drawn, first, second, _BOX_RGB, thin, cv2.LINE_AA)
-        for outline in outlines[np.isfinite(outlines).all(axis=1)]:
-            points = np.rint(outline_points(outline)).clip(-9999, 9999).astype(np.int32)
-            cv2.polylines(drawn, [points], True, _OUTLINE_RGB, 2 * thin, cv2.LINE_AA)
-        # a crop, so that a small landmark is visible
-        return html.jpeg_of(crop_around(drawn, ellipse_bboxes(outlines[:1])[0], _AROUND)
-                            if rows else drawn, _WIDTH_PX)
+    frame, image = found
+    outlines = outlines_in_view(detections, frame, landmark_map.centers[rows],
+                                landmark_map.shapes[rows])
+    drawn, thin = image.copy(), 1 + image.shape[1] // 640
+    boxes = detections.detections_of(frame).bboxes_xyxy.reshape(-1, 2, 2)
+    for first, second in np.rint(boxes).astype(int).tolist():
+        cv2.rectangle(drawn, first, second, _BOX_RGB, thin, cv2.LINE_AA)
+    for outline in outlines[np.isfinite(outlines).all(axis=1)]:
+        points = np.rint(outline_points(outline)).clip(-9999, 9999).astype(np.int32)
+        cv2.polylines(drawn, [points], True, _OUTLINE_RGB, 2 * thin, cv2.LINE_AA)
+    if rows:  # a crop, so that a small landmark is visible
+        drawn = crop_around(drawn, ellipse_bboxes(outlines[:1])[0], _AROUND)
+    seconds = detections.stamps_s[frame] - detections.stamps_s[0]
+    return html.jpeg_of(drawn, _WIDTH_PX), f'{words}; image at {seconds:.0f} s'
