@@ -184,7 +184,7 @@ def _success_rows(summaries: Mapping[str, Summary]) -> list[tuple[str, ...]]:
     return [('', *(f'within {limit:g} m' for limit in LIMITS_M), 'median error', 'accepted',
              'false accepts'),
             *((name, *(f'{summary.success(limit):.2f}' for limit in LIMITS_M),
-               f'{summary.median_error_m:.3f} m',
+               f'{np.median(summary.errors_m):.3f} m',
                f'{summary.accepted.sum()} of {summary.errors_m.size}',
                str(summary.false_accepts())) for name, summary in summaries.items())]
 

@@ -104,8 +104,7 @@ def check(options: argparse.Namespace) -> int:
     # Imported late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
-    from cliploc_ros.offline.evaluation import pages
-    from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
+    from cliploc_ros.offline.evaluation.check_page import CHECK, figures_of, write_check
     from cliploc_ros.offline.mapping.check.checking import check_map
     from cliploc_ros.offline.mapping.posed_detections import tilt_note
 
@@ -120,10 +119,9 @@ def check(options: argparse.Namespace) -> int:
     thresholds = Thresholds(**{field.name: getattr(options, field.name)
                                for field in fields(Thresholds)})
     detections, images = _read_recording(options) or (None, None)
-    image_of = painter = None
+    image_of = None
     if detections is not None and images is not None:
         image_of = partial(images.of, detections)
-        painter = ViewPainter(landmark_map, detections, image_of)
     if detections is not None and (note := tilt_note(detections.map_from_camera)):
         print(f'note: {note}', flush=True)
     layer = read_layer(options.map, landmark_map, options.keyframes)
@@ -134,15 +132,14 @@ def check(options: argparse.Namespace) -> int:
     with command.StageBar() as bar:
         report = check_map(landmark_map, detections, check_options, thresholds, bar.show, layer,
                            None if options.observations else image_of)
-        pages.write_check(out, options.map.name, report, draw_pictures(landmark_map, report),
-                          None if painter is None else painter.of)
+        write_check(out, options.map.name, landmark_map, report, detections, image_of)
     print('\n'.join([f'verdict: {report.verdict}', *report.localized,
-                     *pages.summary_lines(report)]))
+                     *(f'{name}: {value}' for name, value in figures_of(report))]))
     print('what to do:')
     print('\n'.join(f'  {command.printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
     for failure in report.failures:
         print(f'fails: {failure}')
-    print(f'wrote {out / pages.CHECK} in {time.monotonic() - begin:.1f} s: '
+    print(f'wrote {out / CHECK} in {time.monotonic() - begin:.1f} s: '
           f'{report.verdict}')
     return 0 if report.passed else 1
 

@@ -115,8 +115,8 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.studio.document import Document
     from cliploc_ros.offline.studio.recording import Recording
+    from cliploc_ros.offline.studio.room import read_walls
     from cliploc_ros.offline.studio.studio import Studio
-    from cliploc_ros.offline.studio.walls import read_walls
 
     images = detections = None
     is_folder = options.images is not None and find_layout(options.images) is not None

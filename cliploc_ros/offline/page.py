@@ -9,7 +9,6 @@ from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,17 +20,6 @@ LOOK_ALIKE, GOOD, BAD = '#CC79A7', ACCEPTED, MISLED
 _QUALITY = 85
 _COLORS = f':root {{ --accepted: {ACCEPTED}; --refused: {REFUSED}; --misled: {MISLED} }}'
 _TYPES = {b'\x89PNG': 'png', b'\xff\xd8\xff\xe0': 'jpeg'}
-
-
-class Bar(NamedTuple):
-    """A number and its threshold."""
-
-    name: str
-    shown: str  #: The value and its threshold, in words
-    #: Shares of the bar's length
-    value: float
-    limit: float
-    is_good: bool
 
 
 def page(title: str, *parts: str) -> str:
@@ -60,14 +48,18 @@ def tiles(numbers: Iterable[tuple[str, str, bool]]) -> str:
         for number, words, is_good in numbers) + '</div>'
 
 
-def bars(rows: Iterable[Bar]) -> str:
-    """Return a chart of bars, each with a mark at its threshold."""
+def bars(rows: Iterable[tuple[str, str, float, float, bool]]) -> str:
+    """Return a chart of bars, each with a mark at its threshold.
+
+    A row has a name, value and threshold in words, both as shares of the bar's length, and whether
+    the value is good.
+    """
     return '<div class="bars">' + ''.join(
-        f'<span>{escape(row.name)}</span><span class="bar">'
-        f'<i{"" if row.is_good else " class=over"} style="width:{_percent(row.value)}"></i>'
-        f'<u style="left:{_percent(row.limit)}"></u></span>'
-        f'<span>{"✓" if row.is_good else "✗"} {escape(row.shown)}</span>'
-        for row in rows) + '</div>'
+        f'<span>{escape(name)}</span><span class="bar">'
+        f'<i{"" if is_good else " class=over"} style="width:{_percent(value)}"></i>'
+        f'<u style="left:{_percent(limit)}"></u></span>'
+        f'<span>{"✓" if is_good else "✗"} {escape(shown)}</span>'
+        for name, shown, value, limit, is_good in rows) + '</div>'
 
 
 def _percent(share: float) -> str:

@@ -18,37 +18,18 @@ pytestmark = pytest.mark.full
 PROJECT = Path(__file__).resolve().parents[2]
 
 
-def compare(folder, *arguments):
-    return subprocess.run(
-        [sys.executable, '-m', 'demo.world.compare', '--out', str(folder), *arguments],
-        cwd=PROJECT, capture_output=True, text=True, timeout=900, check=False)
-
-
-@pytest.fixture(scope='module')
-def compared(tmp_path_factory):
-    """Run a comparison with a short time limit; return its folder and output."""
-    folder = tmp_path_factory.mktemp('compare')
-    done = compare(folder, '--budget', '0.05', '--trials', '1')
+def test_the_networks_know_a_walk_they_never_saw_and_labels_lead_where_classes_do_not(tmp_path):
+    limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['table']
+    done = subprocess.run(
+        [sys.executable, '-m', 'demo.world.compare', '--out', str(tmp_path), '--budget', '0.05',
+         '--trials', '1'], cwd=PROJECT, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr
     print('\n' + done.stdout)
-    return folder, done.stdout
-
-
-@pytest.fixture(scope='module')
-def limits():
-    return yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['table']
-
-
-def test_the_networks_know_a_walk_they_never_saw(compared, limits):
     map50, first, third = map(float, re.search(
-        r'mAP50 ([.0-9]+); CLIP: top-1 ([.0-9]+), top-3 ([.0-9]+)', compared[1]).groups())
+        r'mAP50 ([.0-9]+); CLIP: top-1 ([.0-9]+), top-3 ([.0-9]+)', done.stdout).groups())
     assert map50 >= limits['map50']
-    assert first >= limits['clip_top_1']
-    assert third >= limits['clip_top_3']
-
-
-def test_labels_lead_where_classes_do_not(compared, limits):
-    with (compared[0] / 'summary.csv').open() as file:
+    assert first >= limits['clip_top_1'] and third >= limits['clip_top_3']
+    with (tmp_path / 'summary.csv').open() as file:
         rows = {row['method']: row for row in csv.DictReader(file)}
     assert tuple(rows) == (*PAPER_METHODS, 'auto')
     success = {name: float(row['success_0.5m']) for name, row in rows.items()}

@@ -129,7 +129,7 @@ def test_a_thorough_search_that_time_cuts_short_changes_nothing(layer, kitchen, 
     assert not recognizer.begin_thorough(), 'no time remains'
 
 
-@pytest.mark.parametrize('name', ['dark and noisy', 'blurred', 'unevenly lit', 'half covered'])
+@pytest.mark.parametrize('name', ['dark and noisy', 'half covered'])
 def test_changed_images_are_found(layer, queries, name, answer):
     localizer, frame = KeyframeLocalizer(layer), queries[0]
     image = IMAGE_CHANGES[name](frame.image_rgb, frame.image_rgb, np.random.default_rng(0))
@@ -188,19 +188,6 @@ def test_a_search_that_time_cuts_short_gives_no_pose(twins, queries):
         assert len(seen.places) > 1 if seen.is_complete else not seen.places
     assert not found[0]
     assert len(localizer.localize_features(features, frame.camera).places) > 1
-
-
-def test_a_layer_covers_what_its_keyframes_saw_and_nothing_else(layer, queries):
-    localizer, frame = KeyframeLocalizer(layer), queries[0]
-    assert localizer.coverage(frame.map_from_camera, frame.camera) > 0.6
-    away, behind = frame.map_from_camera.copy(), frame.map_from_camera.copy()
-    away[2, 3] += 5.0
-    behind[:3, :3] = behind[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
-    for pose in (away, behind):
-        assert localizer.coverage(pose, frame.camera) == 0.0
-    edge = frame.map_from_camera.copy()
-    edge[:3, 3] += 1.5 * edge[:3, 0]
-    assert 0.0 < localizer.coverage(edge, frame.camera) < 0.6
 
 
 def test_the_office_is_triangulated_without_depth(office, room, answer):

@@ -99,7 +99,7 @@ def test_the_studio_finishes_what_a_killed_writer_left(path):
     others.rename(others.with_name(f'.{digest}.{others.name}'))
     document = Document(path)
     document.close()
-    assert others.exists() and document.encoder_key == 'key'
+    assert others.exists() and document.file.encoder_key == 'key'
 
 
 def test_an_update_keeps_the_keyframes_and_no_embeddings(path):

@@ -20,8 +20,7 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
-from cliploc_ros.offline.evaluation.pages import CHECK, CHECK_DATA, write_check
+from cliploc_ros.offline.evaluation.check_page import CHECK, CHECK_DATA, write_check
 from cliploc_ros.offline.mapping.check.checking import check_map, give_advice
 from cliploc_ros.offline.mapping.check.findings import (
     LookAlike,
@@ -91,7 +90,7 @@ def test_equal_seed_and_input_give_an_equal_report(report, detections, tmp_path)
     again = check_map(TABLE, detections, options=QUICK)
     written = []
     for one in (report, again):
-        write_check(tmp_path, 'map', one, [('', '', b'\x89PNG')])
+        write_check(tmp_path, 'map', TABLE, one)
         written.append((tmp_path / CHECK_DATA).read_text())
     assert written[0] == written[1]
 
@@ -349,8 +348,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
                     landmark_ids=(hostile, *doubled.landmark_ids[1:]))
     report = check_map(named, detections, options=QUICK)
     images = dict.fromkeys([0, 49], np.full((480, 640, 3), 128, np.uint8))
-    write_check(tmp_path, hostile, report, draw_pictures(named, report),
-                ViewPainter(named, detections, images.get).of)
+    write_check(tmp_path, hostile, named, report, detections, images.get)
     page = (tmp_path / CHECK).read_text()
     assert '<script' not in page and '&lt;script&gt;' in page and 'http' not in page
     kinds = Counter(re.findall(r' (?:src|href)="(.{15})', page))

@@ -48,7 +48,7 @@ def test_answers_one_request_at_a_time(live, own_relocalizer, tester):
     wait_for(lambda: '12 landmarks' in live.state.values.get('map', ''), 'diagnostics')
     assert live.state.is_heard and live.state.base_frame == ''
     with in_a_thread(live.relocalize) as outcome:
-        wait_for(lambda: live.is_busy, 'the request')
+        wait_for(lambda: live._turn.locked(), 'the request')
         with pytest.raises(LiveError, match='another request is waiting'):
             live.relocalize()
         tester.feed_until(lambda: outcome, make_frame(stamp_s=31.5))

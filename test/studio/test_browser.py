@@ -1,13 +1,18 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The studio in a real browser, used as a person would."""
-
+"""The studio in a real browser, used as a person would, also with a hostile map."""
 
 import numpy as np
 import pytest
-from browser import wait_for
+import yaml
+from browser import Person, wait_for
+from studio_map import ASSETS, person_at, write_two_rooms
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.mapping.options import CheckOptions
+from cliploc_ros.offline.studio import edits
+from cliploc_ros.offline.studio.document import Document
+from cliploc_ros.offline.studio.studio import Studio
 
 # Software rendering needs an idle machine.
 pytestmark = [pytest.mark.full, pytest.mark.clock,
@@ -64,3 +69,118 @@ def test_boxes_are_drawn_dragged_and_linked(person, studio):
     person.page.mouse.wheel(0, -600)
     wait_for(lambda: person.page.evaluate('$("image").viewBox.baseVal.width') < 0.7 * before,
              'the zoom')
+
+
+def test_a_hostile_map_is_shown_as_text(chromium, path):
+    """Ids, labels, classes, unknown fields and coordinate frame contain HTML and long texts."""
+    # an id contains no dots
+    attack = '<img src=x onerror="self[`hacked`]=1"><script>self[`hacked`]=1</script>'
+    tree = yaml.safe_load((ASSETS / 'map.yaml').read_text())
+    one = tree['/**']['ros__parameters']['map']
+    one['frame_id'] = f'map{attack}'
+    landmarks = one['landmarks']
+    landmarks[attack] = {**landmarks.pop('mug_1'), 'label': attack, 'class_id': attack}
+    landmarks['long'] = {**landmarks.pop('mug_2'), 'label': 'long ' * 199, 'class_id': 'c' * 999,
+                         attack: attack}
+    landmarks['i' * 100_000] = landmarks.pop('can_1')
+    path.write_text(yaml.safe_dump(tree))
+    studio = Studio(Document(path))
+    with person_at(chromium, studio) as (person, _):
+        for text in ('<img', 'long', 'iiiiiiii'):
+            person.find(text)
+            person.row(text).click()
+            wait_for(lambda text=text: studio.document.selection
+                     and studio.document.selection[0].startswith(text), text)
+        person.select(studio.document, 'long')
+        person.type('Label', 'x' * 100_000)
+        person.page.get_by_text('longer than 1000 characters').wait_for()
+        person.type('Label', 'short')
+        wait_for(lambda: studio.document.landmarks['long'].label == 'short', 'the label')
+        person.picture('hostile')
+        assert person.page.evaluate('window.hacked') is None
+        assert person.page.locator('img[src=x]').count() == 0
+
+
+def test_without_views_the_scene_has_the_page_and_ids_tell_equal_labels_apart(chromium, path):
+    """The labels of the two rooms' chairs are equal."""
+    write_two_rooms(path)
+    studio = Studio(Document(path))
+    with person_at(chromium, studio, has_scene=True) as (person, server):
+        page = person.page
+        widths = page.evaluate("['scene', 'frame'].map(one => $(one).clientWidth)")
+        assert widths == [page.evaluate("$('scene').parentElement.clientWidth"
+                                        " - document.querySelector('aside').offsetWidth")] * 2
+
+        for chair in ('chair_4', 'chair_9'):
+            person.select(studio.document, chair)
+            label = server.scene._handle_from_node_name['/labels/0']
+            wait_for(lambda label=label, chair=chair: label.text == f'{chair}: a chair', 'it')
+        person.picture('labels')
+
+
+def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, studio):
+    first = Person(chromium, studio.url)
+    first.page.get_by_text('pages share').wait_for(state='detached')
+    second = Person(chromium, studio.url)
+    for person in (first, second):
+        person.page.get_by_text('2 pages share the selection and the view').wait_for()
+    second.page.close()
+    first.page.wait_for_function("() => $('people').textContent === ''")
+    first.page.get_by_text('checked 60 landmarks').first.wait_for(state='attached')
+    first.select(studio.document, 'mug_2')
+    first.page.evaluate("send('lock', {ids: ['mug_2']})")
+    line = first.page.locator('footer div').first
+    first.page.wait_for_function("() => $('log').firstChild.textContent.endsWith('locked mug_2')")
+    first.select(studio.document, 'mug_3')
+    first.page.wait_for_function(
+        "() => $('log').firstChild.textContent === 'earlier: locked mug_2'")
+    assert line.get_attribute('class') == 'past'
+    first.page.close()
+
+
+def test_a_narrow_page_leaves_room_for_the_scene_where_boxes_are_drawn(person):
+    person.page.set_viewport_size({'width': 1100, 'height': 700})
+    person.mode('Create')
+    assert person.page.evaluate("$('scene').clientWidth") >= 360
+    assert person.page.evaluate("$('view').clientWidth") >= 480
+
+
+def test_the_check_becomes_outdated_by_an_edit_and_opens_as_a_page(chromium, path):
+    write_two_rooms(path)
+    document = Document(path)
+    studio = Studio(document)
+    studio.CHECK = CheckOptions(max_positions=9, headings=4)
+    with person_at(chromium, studio) as (person, _):
+        page = person.page
+        person.mode('Test')
+        person.click('Coverage and look-alikes')
+        person.row('cup_0').click()
+        wait_for(lambda: document.selection == ('cup_0',), 'the page stays responsive')
+        page.get_by_text('checked the map').first.wait_for()
+        with page.context.expect_page() as opened:
+            person.click('Open the check')
+        opened.value.get_by_text('places that look alike').first.wait_for()
+        person.picture('places')
+        with document.lock:
+            document.edit(edits.delete, ['cup_0'])
+        page.get_by_text('of the map before the last edits').wait_for()
+
+
+def test_layers_film_and_a_click_on_the_image(person, studio):
+    """The scene's panel switches layers and plays views; a click sets the outline there."""
+    page, handles = person.page, studio.server.scene._handle_from_node_name
+    page.get_by_text('Layers and viewpoints').click()
+    page.get_by_label('Cameras').click()
+    wait_for(lambda: not handles['/cameras'].visible, 'hidden cameras')
+    page.get_by_label('Follow the view').click()
+    page.get_by_label('Follow the view').click()
+    wait_for(lambda: handles['/cameras'].visible, 'cameras after following')
+    person.click('Play the recording')
+    wait_for(lambda: studio.view >= 3, 'the film')
+    person.click('Stop')
+    person.show_view(studio, 3)
+    outline = next(iter(studio.recording.outlines(studio.document.landmarks, 3).values()))
+    page.mouse.click(*person.on_image(outline[:2]))
+    wait_for(lambda: studio.document.selection, 'the selection')
+    page.mouse.click(*person.on_image((2, 2)))
+    wait_for(lambda: not studio.document.selection, 'nothing there')

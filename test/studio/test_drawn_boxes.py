@@ -14,7 +14,7 @@ from cliploc_ros.offline.mapping.views import make_views
 from cliploc_ros.offline.studio.edits import EditError
 from cliploc_ros.offline.studio.new_landmark import fit_boxes
 
-TRIALS_PER_LANDMARK = 6
+TRIALS_PER_LANDMARK = 2
 
 
 @pytest.fixture(scope='module')
@@ -66,7 +66,7 @@ def test_three_boxes_make_a_landmark_that_fits_other_views(office, name, min_iou
                                                fit.basis)))
     print(f'three boxes, {name}: {len(medians)} landmarks, median IoU in other views '
           f'{np.median(medians):.3f}, quartiles {np.quantile(medians, [.25, .75]).round(3)}')
-    assert len(medians) > 60
+    assert len(medians) > 30
     assert np.median(medians) >= least
 
 

@@ -13,6 +13,7 @@ from studio_map import ASSETS, demo_studio, open_page, write_two_rooms
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.offline.datasets.images import views_of_folder
@@ -21,7 +22,7 @@ from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
-from cliploc_ros.offline.studio.parts import picture_of
+from cliploc_ros.offline.studio.page import picture_of
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.web import Gate, once
@@ -51,9 +52,11 @@ def test_outlines_lie_in_the_image(studio):
     recording = studio.recording
     outlines = recording.outlines(studio.document.landmarks, 3)
     assert recording.image(3).shape == (480, 640, 3) and recording.image(-1) is None
-    assert [each.distance_m for each in outlines] == sorted(each.distance_m for each in outlines)
-    assert all((outline.bbox_xyxy[:2] < (640, 480)).all() and (outline.bbox_xyxy[2:] > 0).all()
-               for outline in outlines)
+    camera = recording.detections.map_from_camera[3, :3, 3]
+    far_m = [np.linalg.norm(studio.document.landmarks[key].center - camera) for key in outlines]
+    assert far_m == sorted(far_m) and 5 < len(far_m) < len(studio.document.landmarks)
+    boxes = ellipse_bboxes(np.array([*outlines.values()]))
+    assert (boxes[:, :2] < (640, 480)).all() and (boxes[:, 2:] > 0).all()
 
 
 def test_sightings_are_sharp_whole_and_from_several_sides(studio):
@@ -79,7 +82,9 @@ def test_moved_landmarks_come_back_by_refitting(office):
     office.refit_all()
     fitted = document.landmarks
     moved = [key for key in ('tv_1', 'keyboard_1', 'book_3') if key in fitted]
-    document.edit(edits.mark, ['book_1'], 'lock', is_locked=True)
+    assert [office.lock(['book_1']) for _ in range(3)] == [
+        'locked book_1', 'unlocked book_1', 'locked book_1']
+    assert document.landmarks['book_1'].is_locked
     for key in moved:
         one = document.landmarks[key]
         document.edit(edits.set_fields, [key], center=one.center + 0.3 * one.semi_axes)
@@ -117,10 +122,11 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
 
 
 def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
-    document = office.document
+    document, detections = office.document, office.recording.detections
+    office.recording = Recording(detections.select_frames(range(0, 33, 3)))
     before = office.relocalize_all()
     accepted = sum(answer.verdict == 'accepted' for answer in office.answers.values())
-    assert 'simulated' in before and '(was' not in before and accepted > 10
+    assert 'simulated' in before and '(was' not in before and accepted > 4
     accepted_view = next(view for view, one in office.answers.items()
                          if one.verdict == 'accepted')
     office.show_view(accepted_view)
@@ -179,7 +185,7 @@ def test_the_check_of_the_edited_map_is_stopped_and_grows_old(tmp_path):
     assert not studio.check_page and not studio.is_stale
     studio.allow_check()
     assert ' positions: ' in studio.check_map()
-    assert '1 pairs of places that look alike' in studio.check_page and not studio.is_stale
+    assert 'look alike (5 of 5 landmarks)' in studio.check_page and not studio.is_stale
     assert picture_of(studio, '/check').content.decode() == studio.check_page
     studio.document.edit(edits.mark, ['cup_0'], 'lock', is_locked=True)
     assert not studio.is_stale, 'a lock changes nothing'
@@ -243,6 +249,4 @@ def test_the_address_on_the_command_line_of_a_browser_opens_the_page_once(tmp_pa
 
 def test_an_address_beyond_ascii_is_refused():
     """As websockets reads it: an error here would be reported as a server error."""
-    gate = Gate('127.0.0.1')
-    assert gate.admit(Request('/\udcff\udcfe/', Headers({'Host': '127.0.0.1'}))) is None
-    assert gate.admit(Request(f'{gate.path}\udcff', Headers({'Host': '127.0.0.1'})))
+    assert Gate('127.0.0.1').admit(Request('/\udcff/', Headers({'Host': '127.0.0.1'}))) is None

@@ -5,7 +5,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scene import make_layer, make_room, write_bare_map, write_map
 
 from cliploc_ros.cli.studio import make_parser, open_studio
@@ -24,11 +23,9 @@ STEP_NS = 100_000_000
 COUNT = 20
 
 
-@pytest.fixture(params=['sqlite3', 'mcap'])
-def bag(request, tmp_path):
-    """Return images recorded 0.4 s after their stamps, the last two at once."""
-    path = tmp_path / 'bag'
-    with BagWriter(path, request.param) as writer:
+def test_each_view_gets_its_image_of_a_bag(tmp_path):
+    """The images are recorded 0.4 s after their stamps, the last two at once."""
+    with BagWriter(tmp_path / 'bag', 'mcap') as writer:
         writer.add_topic('/camera_info', bag_messages.CAMERA_INFO)
         writer.add_topic('/image', bag_messages.IMAGE)
         writer.write('/camera_info', START_NS, bag_messages.camera_info_message(
@@ -38,11 +35,7 @@ def bag(request, tmp_path):
             recorded_ns = START_NS + min(number, COUNT - 2) * STEP_NS + 4 * STEP_NS
             writer.write('/image', recorded_ns, bag_messages.image_message(
                 taken_ns, 'camera', np.full((48, 64, 3), number, dtype=np.uint8)))
-    return path
-
-
-def test_each_view_gets_its_image(bag):
-    images = open_images(bag, BagTopics())
+    images = open_images(tmp_path / 'bag', BagTopics())
     for number in (0, COUNT - 1, 7, COUNT - 2):
         image = images.near((START_NS + number * STEP_NS) / 1e9)
         assert image.shape == (48, 64, 3) and (image == number).all()

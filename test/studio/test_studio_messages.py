@@ -13,13 +13,13 @@ from studio_map import demo_studio
 NAN = float('nan')
 
 
-@pytest.fixture
-def page(tmp_path):
+@pytest.fixture(scope='module')
+def page(tmp_path_factory):
     import viser
 
     from cliploc_ros.offline.studio.page import Page
 
-    studio = demo_studio(tmp_path / 'map.yaml')
+    studio = demo_studio(tmp_path_factory.mktemp('messages') / 'map.yaml')
     with redirect_stdout(io.StringIO()):
         server = viser.ViserServer('127.0.0.1', 0, verbose=False)
     page = Page(studio, server)
@@ -58,7 +58,7 @@ def page(tmp_path):
     ids=lambda value: '' if isinstance(value, list) else str(value)[:20])
 def test_hostile_messages_are_refused(page, caplog, action, hostile):
     """There is neither an internal error nor an impossible picture."""
-    from cliploc_ros.offline.studio.parts import parts_of
+    from cliploc_ros.offline.studio.page import parts_of
 
     desk, document = page.desk, page.desk.studio.document
     for values in hostile:

@@ -6,6 +6,7 @@ import io
 from contextlib import redirect_stdout
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import viser
@@ -16,15 +17,23 @@ from studio_map import demo_studio
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth_image import DepthImage
 from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.errors import MapError
 from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import viewpoint
-from cliploc_ros.offline.studio.cloud import find_cloud
-from cliploc_ros.offline.studio.landmark import map_of
-from cliploc_ros.offline.studio.layers import Layers, draw_answers
+from cliploc_ros.offline.studio.edits import map_of
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.studio.walls import OCCUPIED, UNKNOWN, Walls, draw_walls
+from cliploc_ros.offline.studio.room import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    Walls,
+    draw_walls,
+    find_cloud,
+    read_walls,
+)
+from cliploc_ros.offline.studio.scene import Layers, draw_answers
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
 UPRIGHT = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along x
@@ -105,7 +114,58 @@ def test_other_answers_take_the_place_of_the_first_ones(server, studio, recwarn)
 def test_up_is_found_where_the_map_is_in_a_cameras_frame():
     turns = Rotation.from_euler('z', np.linspace(0.0, 3.0, 20)[:, None]).as_matrix() @ UPRIGHT
     poses = np.array([make_transform(turn, np.zeros(3)) for turn in turns])
-    assert viewpoint.up_direction(poses).tolist() == [0.0, 0.0, 1.0]
+    assert viewpoint.extent_of([], poses).up.tolist() == [0.0, 0.0, 1.0]
     into_first = np.linalg.inv(poses[0]) @ poses
-    assert np.allclose(viewpoint.up_direction(into_first), [0.0, -1.0, 0.0], atol=1e-6)
-    assert viewpoint.up_direction(np.empty((0, 4, 4))).tolist() == [0.0, 0.0, 1.0]
+    assert np.allclose(viewpoint.extent_of([], into_first).up, [0.0, -1.0, 0.0], atol=1e-6)
+    assert viewpoint.extent_of([], None).up.tolist() == [0.0, 0.0, 1.0]
+
+
+# ---- files of nav2_map_server
+
+# the last row is at the origin: y up
+CELLS = np.array([[UNKNOWN, FREE, FREE], [FREE, OCCUPIED, FREE]], dtype=np.uint8)
+YAML = """image: walls.{suffix}
+mode: trinary
+resolution: 0.5
+origin: [1.0, -2.0, {yaw}]
+negate: {negate}
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+
+
+def write(folder, suffix='pgm', negate=0, yaw=0.0, text=YAML):
+    """Write CELLS as nav2's map_saver does."""
+    image = np.choose(CELLS, [205, 254, 0]).astype(np.uint8)
+    cv2.imwrite(str(folder / f'walls.{suffix}'), 255 - image if negate else image)
+    (folder / 'walls.yaml').write_text(text.format(suffix=suffix, negate=negate, yaw=yaw))
+    return folder / 'walls.yaml'
+
+
+@pytest.mark.parametrize(('suffix', 'negate'), [('pgm', 0), ('png', 0), ('pgm', 1)])
+def test_a_file_of_map_server_is_read(tmp_path, suffix, negate):
+    grid = read_walls(write(tmp_path, suffix, negate))
+    np.testing.assert_array_equal(grid.cells[negate:], CELLS[negate:])
+    assert (grid.resolution_m, grid.origin) == (0.5, (1.0, -2.0, 0.0))
+
+
+@pytest.mark.parametrize(('before', 'after', 'text'), [
+    ('image: walls.{suffix}', 'image: /dev/zero', 'not an image'), ('trinary', 'raw', 'mode raw'),
+    ('resolution: 0.5\n', '', "'resolution' is miss"), ('0.5', '0.0', 'resolution 0.0'),
+    ('[1.0, -2.0, {yaw}]', '[1.0, .inf, 0.0]', 'origin'), ('0.196', '0.9', 'free_thresh'),
+    ('negate: {negate}', 'negate: maybe', 'maybe')])
+def test_a_damaged_file_is_refused_by_name(tmp_path, before, after, text):
+    file = write(tmp_path, text=YAML.replace(before, after))
+    with pytest.raises(MapError, match=str(file)) as caught:
+        read_walls(file)
+    assert text in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+def test_an_image_that_is_cut_short_is_refused(tmp_path):
+    file, image = write(tmp_path), tmp_path / 'walls.pgm'
+    data = image.read_bytes()
+    for length in (0, 5, len(data) - 5):
+        image.write_bytes(data[:length])
+        with pytest.raises(MapError, match=r'missing, damaged or not an image'):
+            read_walls(file)

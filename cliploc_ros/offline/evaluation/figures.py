@@ -24,7 +24,7 @@ from cliploc_ros.core.geometry.ellipsoid import outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.files.storage import write_file
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
-from cliploc_ros.offline.evaluation.summary import Summary, find_best
+from cliploc_ros.offline.evaluation.summary import SUCCESS_M, Summary, find_best
 from cliploc_ros.offline.evaluation.trials import Result
 from cliploc_ros.offline.posed_query import PosedQuery
 
@@ -126,7 +126,6 @@ _STYLES = {'bf': ('-', 'o'), 'ransac': ((0, (1, 1.2)), '^'), 'prosac': ((0, (5, 
            'b-prosac': ((0, (5, 1, 1, 1)), 'D')}
 _SIZE = (6.4, 4.0)
 _MAX_ERROR_M = 2.0
-_SUCCESS_M = 1.0
 # Margin around the points of a map from above [m], and its longer side [in].
 _MARGIN_M, _LARGEST_IN = 0.5, 7.0
 #: Colours of curves, for colour-blind readers.
@@ -154,21 +153,18 @@ def draw_all(folder: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQue
     """
     searched = [summary for summary in summaries if not summary.is_given]
     best = find_best(searched)
-    success = f'success (within {_SUCCESS_M:g} m)'
+    success = f'success (within {SUCCESS_M:g} m)'
     figures = {
         'success_over_threshold': _drawn('error threshold [m]', 'success',
                                          _success_over_threshold, summaries),
         'precision_over_recall': _drawn(
             'recall: accepted share of the correct poses',
-            f'precision: share of accepted poses within {_SUCCESS_M:g} m', _precision_over_recall,
+            f'precision: share of accepted poses within {SUCCESS_M:g} m', _precision_over_recall,
             searched),
         'top_view': _top_view(landmark_map, queries,
                               [result for result in results if result.method == best.method],
                               best.method),
     }
-    if sampled := [summary for summary in searched if not summary.method.endswith('_bf')]:
-        figures['best_iteration'] = _drawn('iteration that found the best pose', '',
-                                           _best_iteration, sampled)
     if sweep:
         figures['success_over_iterations'] = _drawn('iterations', success,
                                                     _success_over_iterations, sweep)
@@ -248,7 +244,7 @@ def _success_over_threshold(axes: Axes, summaries: Sequence[Summary]) -> None:
 def _success_over_iterations(axes: Axes, sweep: Mapping[str, Mapping[int, Summary]]) -> None:
     for method, by_count in sweep.items():
         color, line, marker = _style(method)
-        rates = [summary.success(_SUCCESS_M) for summary in by_count.values()]
+        rates = [summary.success(SUCCESS_M) for summary in by_count.values()]
         axes.plot([*by_count], rates, color=color, linestyle=line, marker=marker, markersize=4,
                   linewidth=1.2, label=method)
     counts = sorted({count for by_count in sweep.values() for count in by_count})
@@ -256,17 +252,6 @@ def _success_over_iterations(axes: Axes, sweep: Mapping[str, Mapping[int, Summar
     axes.set_xticks(counts, [f'{count:,}' for count in counts])
     axes.set_xticks([], minor=True)
     axes.set_ylim(0, 1)
-
-
-def _best_iteration(axes: Axes, summaries: Sequence[Summary]) -> None:
-    found = [summary.best_iterations[np.isfinite(summary.errors_m)] for summary in summaries]
-    boxes = axes.boxplot(found, orientation='horizontal', widths=0.6, showfliers=False,
-                         patch_artist=True, medianprops={'color': 'black'})
-    for patch, summary in zip(boxes['boxes'], summaries, strict=True):
-        patch.set(facecolor=_style(summary.method)[0], alpha=0.6)
-    axes.set_yticks(range(1, len(summaries) + 1), [summary.method for summary in summaries])
-    axes.invert_yaxis()
-    axes.set_title('box: median and quartiles; whiskers: 1.5 interquartile ranges', fontsize=9)
 
 
 def _precision_over_recall(axes: Axes, summaries: Sequence[Summary]) -> None:
@@ -284,14 +269,8 @@ def _precision_over_recall(axes: Axes, summaries: Sequence[Summary]) -> None:
     axes.set_title('lines: all thresholds; markers: the threshold of the run', fontsize=9)
 
 
-def precision_recall(summary: Summary, limit_m: float = _SUCCESS_M
-                     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def precision_recall(summary: Summary) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return recall and precision for each threshold of the confidence.
-
-    Parameters
-    ----------
-    limit_m : float
-        Limit of success.
 
     Returns
     -------
@@ -300,7 +279,7 @@ def precision_recall(summary: Summary, limit_m: float = _SUCCESS_M
     """
     solved = np.isfinite(summary.errors_m)
     order = np.argsort(-summary.confidence[solved], kind='stable')
-    right = (summary.errors_m[solved] < limit_m)[order]
+    right = (summary.errors_m[solved] < SUCCESS_M)[order]
     if not right.any():
         return np.empty(0), np.empty(0)
     accepted = np.cumsum(right)

@@ -26,14 +26,23 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.files.parallel import WorkersError, run_tasks
 from cliploc_ros.files.storage import make_folder, write_text
+from cliploc_ros.offline import page as html
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.methods import Method
-from cliploc_ros.offline.evaluation.pages import COMPARISON, write_comparison
 from cliploc_ros.offline.evaluation.trials import Result, given_results, run_trial
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
 
+COMPARISON = 'report.html'
+_TOP_VIEW = 'top_view'
+# Columns of the table on the first screen: method, success, accepted, false accepts.
+_BRIEF = (0, 1, 2, 5, 7)
+CAPTIONS = {
+    _TOP_VIEW: 'Top view of the map. A line joins each estimate of this method to the true pose.',
+    'success_over_threshold': 'Share of poses, accepted or not, within a distance of the truth.',
+    'precision_over_recall': 'Precision and recall for all thresholds of the confidence.',
+    'success_over_iterations': 'Success over the number of iterations.'}
 # Queries of a part, which one process runs, unless one localizer gets all queries of a trial.
 _QUERIES_A_PART = 8
 # Separates the name of a method from its number of iterations in a sweep.
@@ -185,7 +194,7 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         shown, {query.number: query.map_from_camera for query in queries})))
     pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
                      summaries, methods) if sweep is not None else []
-    write_comparison(out, summaries, rows, remarks, pictures, facts)
+    _write_comparison(out, summaries, rows, remarks, pictures, facts)
     print(f'results: {out.resolve() / COMPARISON}', flush=True)
     return summaries
 
@@ -217,6 +226,35 @@ def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         out, landmark_map, queries, [result for result in results if _AT not in result.method],
         summaries,
         {name: dict(sorted(counts.items())) for name, counts in sweep.items() if len(counts) > 1})
+
+
+def _write_comparison(folder: Path, summaries: Sequence[summary.Summary],
+                      rows: Sequence[Sequence[str]], remarks: Sequence[str],
+                      pictures: Sequence[Path], about: Sequence[tuple[str, str]]) -> None:
+    """Write the page of `evaluate`. It embeds the pictures, which are PNG files.
+
+    `rows` are those of the table, its header first; `about` names and values of input and options.
+    """
+    best = summary.find_best(summaries)
+    wrong, count = best.false_accepts(), best.errors_m.size
+    said = html.verdict(f'{best.method} is the best of {len(summaries)} methods on '
+                        f'{len(best.queries)} images' if len(summaries) > 1 else
+                        f'{best.method} on {len(best.queries)} images', not wrong)
+    numbers = [(f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True)]
+    if not best.is_given:
+        numbers += [
+            (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
+            (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)]
+    drawn = {picture.stem: html.figure(picture.read_bytes(), CAPTIONS[picture.stem], picture.stem)
+             for picture in pictures}
+    head, *brief = [[row[column] for column in _BRIEF] for row in rows]
+    top_view = drawn.pop(_TOP_VIEW, '')
+    write_text(folder / COMPARISON, html.page(
+        'Evaluation',
+        html.first_screen([said, html.tiles(numbers), html.table(head, brief)], [top_view]),
+        html.fold('Complete table', html.table(rows[0], rows[1:]), *map(html.note, remarks)),
+        html.fold('Input and options', html.table(('', ''), about)),
+        html.fold('Figures', html.side_by_side(drawn.values()), is_open=True)))
 
 
 def write_trajectories(folder: Path, queries: Sequence[PosedQuery], results: Sequence[Result]

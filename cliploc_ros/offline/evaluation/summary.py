@@ -6,11 +6,11 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby, pairwise, zip_longest
 from textwrap import wrap
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ from cliploc_ros.offline.evaluation.trials import GIVEN, GIVEN_TOLERANCE_MS, Res
 
 #: Limits of success [m]. The paper does not state its limit; 1 m reproduces its success rates.
 LIMITS_M = (0.25, 0.5, 1.0)
+#: Farther from the truth, a pose is wrong [m].
+SUCCESS_M = LIMITS_M[-1]
 _RESAMPLES = 10_000
 _HEADER = ('matching', 'algorithm', 'success within .25 / .5 / 1 m',
            'median error [m], [deg]; mean [m]', 'search [ms]', 'accepted', 'precision (95 %)',
@@ -45,6 +47,8 @@ class Summary:
 
     method: str
     queries: tuple[int, ...]  #: Numbers of the queries
+    crops_share: float  #: Mean share of a query's crops that were compared with labels
+    refusals: Mapping[str, int]  #: Number of refusals by kind, the most frequent first
     #: (t, q): position and rotation error of the best pose; infinite if none was found
     errors_m: NDArray[np.float64]
     errors_deg: NDArray[np.float64]
@@ -52,33 +56,23 @@ class Summary:
     confidence: NDArray[np.float64]  #: (t, q)
     search_ms: NDArray[np.float64]  #: (t, q)
     coverage: NDArray[np.float64]  #: (t, q)
-    best_iterations: NDArray[np.int64]  #: (t, q)
-    #: Mean share of a query's crops that were compared with labels
-    crops_share: float = 1.0
-    #: Number of refusals by kind, the most frequent first
-    refusals: dict[str, int] = field(default_factory=dict)
-    #: (t, q): source of each pose, see Result
-    sources: NDArray[np.str_] = field(default_factory=lambda: np.empty((0, 0), dtype=str))
-    #: (t, q)
-    keyframe_inliers: NDArray[np.int64] = field(
-        default_factory=lambda: np.empty((0, 0), dtype=np.int64))
-    #: (t, q). These three arrays are empty if no query was compared with keyframes.
-    keyframes_ms: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
-    #: Whether another program found the poses. Only the errors have a meaning then.
-    is_given: bool = False
+    sources: NDArray[np.str_]  #: (t, q): source of each pose, see Result
+    keyframe_inliers: NDArray[np.int64]  #: (t, q)
+    keyframes_ms: NDArray[np.float64]  #: (t, q)
 
     @property
     def has_keyframes(self) -> bool:
         """Return whether queries were compared with keyframes."""
-        return self.sources.size > 0
+        return bool((self.keyframes_ms > 0.0).any())
+
+    @property
+    def is_given(self) -> bool:
+        """Return whether another program found the poses: only the errors have a meaning then."""
+        return bool((self.sources == GIVEN).any())
 
     def success(self, limit_m: float) -> float:
         """Return the share of poses within a limit of the truth, accepted or not."""
         return float((self.errors_m < limit_m).mean())
-
-    def success_deviation(self, limit_m: float) -> float:
-        """Return the standard deviation of the success rate over trials."""
-        return float((self.errors_m < limit_m).mean(axis=1).std())
 
     @property
     def solved(self) -> float:
@@ -86,63 +80,46 @@ class Summary:
         return float(np.isfinite(self.errors_m).mean())
 
     @property
-    def median_error_m(self) -> float:
-        """Return the median position error [m]. Without a pose, the error is infinite."""
-        return float(np.median(self.errors_m))
+    def spreads(self) -> dict[str, tuple[float, float]]:
+        """Return success rates and errors [m] [deg], each with its deviation over trials.
 
-    @property
-    def median_error_deg(self) -> float:
-        """Return the median rotation error [deg]. Without a pose, the error is infinite."""
-        return float(np.median(self.errors_deg))
-
-    @property
-    def mean_error_m(self) -> float:
-        """Return the mean position error of the poses found [m]; NaN without any."""
-        found = self.errors_m[np.isfinite(self.errors_m)]
-        return float(found.mean()) if len(found) else float('nan')
-
-    @property
-    def error_deviations(self) -> tuple[float, float, float]:
-        """Return standard deviations over trials of the median [m], median [deg] and mean [m].
-
-        NaN where a trial has no finite value.
+        Without a pose, an error is infinite. The mean is that of the poses found; NaN without any.
+        A deviation is NaN where a trial has no finite value.
         """
+        def mean(errors: NDArray[np.float64]) -> float:
+            found = errors[np.isfinite(errors)]
+            return float(found.mean()) if len(found) else np.nan
+
+        figures: dict[str, tuple[Callable[[Any], Any], NDArray[np.float64]]] = {
+            f'success_{limit:g}m': (np.mean, np.asarray(self.errors_m < limit, np.float64))
+            for limit in LIMITS_M} | {
+                'median_error_m': (np.median, self.errors_m),
+                'median_error_deg': (np.median, self.errors_deg),
+                'mean_error_m': (mean, self.errors_m)}
         with np.errstate(invalid='ignore'):
-            means = [errors[np.isfinite(errors)].mean() if np.isfinite(errors).any() else np.nan
-                     for errors in self.errors_m]
-            return (float(np.std(np.median(self.errors_m, axis=1))),
-                    float(np.std(np.median(self.errors_deg, axis=1))), float(np.std(means)))
+            return {name: (float(of(values)), float(np.std([of(trial) for trial in values])))
+                    for name, (of, values) in figures.items()}
 
-    @property
-    def mean_search_ms(self) -> float:
-        """Return the mean time of a search [ms]."""
-        return float(self.search_ms.mean())
+    def false_accepts(self) -> int:
+        """Return the number of accepted poses that are wrong."""
+        return int((self.accepted & ~(self.errors_m < SUCCESS_M)).sum())
 
-    @property
-    def search_deviation_ms(self) -> float:
-        """Return the standard deviation of the time over queries and trials [ms]."""
-        return float(self.search_ms.std())
-
-    def false_accepts(self, limit_m: float = 1.0) -> int:
-        """Return the number of accepted poses that are farther from the truth than a limit."""
-        return int((self.accepted & ~(self.errors_m < limit_m)).sum())
-
-    def precision(self, limit_m: float = 1.0) -> float:
+    def precision(self) -> float:
         """Return the share of accepted poses that are correct; 1 if no pose is accepted."""
         accepted = int(self.accepted.sum())
-        return 1.0 - self.false_accepts(limit_m) / accepted if accepted else 1.0
+        return 1.0 - self.false_accepts() / accepted if accepted else 1.0
 
-    def precision_interval(self, limit_m: float = 1.0) -> tuple[float, float]:
+    def precision_interval(self) -> tuple[float, float]:
         """Return the 95 % interval of the precision (Wilson); 0 to 1 if no pose is accepted.
 
         The trials of a query are not independent, so they count as one sample.
         """
         count = self.accepted.sum() / len(self.accepted)
-        return wilson_interval(self.precision(limit_m) * count, count) if count else (0.0, 1.0)
+        return wilson_interval(self.precision() * count, count) if count else (0.0, 1.0)
 
-    def recall(self, limit_m: float = 1.0) -> float:
+    def recall(self) -> float:
         """Return the share of correct poses that are accepted; 1 if no pose is correct."""
-        correct = self.errors_m < limit_m
+        correct = self.errors_m < SUCCESS_M
         return float(self.accepted[correct].mean()) if correct.any() else 1.0
 
 
@@ -173,19 +150,13 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
         return np.array(values).reshape(-1, len(queries))
 
     kinds = Counter(result.refusal_kind for result in results if result.refusal_kind)
-    keyframes = {}
-    if (column('keyframes_ms') > 0.0).any():
-        keyframes = {'sources': column('source'), 'keyframe_inliers': column('keyframe_inliers'),
-                     'keyframes_ms': column('keyframes_ms')}
     return Summary(
-        method, queries, column('error_m'), column('error_deg'), column('accepted'),
-        column('confidence'), column('search_ms'), column('coverage'), column('best_iteration'),
-        float(column('crops_share').mean()), dict(kinds.most_common()),
-        is_given=results[0].source == GIVEN, **keyframes)
+        method, queries, float(column('crops_share').mean()), dict(kinds.most_common()),
+        *map(column, ('error_m', 'error_deg', 'accepted', 'confidence', 'search_ms', 'coverage',
+                      'source', 'keyframe_inliers', 'keyframes_ms')))
 
 
-@dataclass(frozen=True)
-class Difference:
+class Difference(NamedTuple):
     """Difference of the success rates of two methods, with its 95 % interval."""
 
     mean: float
@@ -198,30 +169,23 @@ class Difference:
         return self.low <= 0.0 <= self.high
 
 
-def compare(one: Summary, other: Summary, limit_m: float = 1.0, seed: int = 0) -> Difference:
-    """Compare two methods on the same queries.
+def compare(one: Summary, other: Summary) -> Difference:
+    """Compare two methods on the same queries; the success rate of `other` is subtracted.
 
     The interval is that of the paired bootstrap (Efron and Tibshirani 1993): queries are drawn
     with replacement, 10,000 times.
-
-    Parameters
-    ----------
-    one, other : Summary
-        Summaries of the same queries. The success rate of `other` is subtracted.
-    limit_m : float
-        Limit of success.
     """
     assert one.queries == other.queries
-    gains = ((one.errors_m < limit_m).mean(axis=0) - (other.errors_m < limit_m).mean(axis=0))
-    rng = np.random.default_rng(seed)
-    drawn = rng.integers(len(gains), size=(_RESAMPLES, len(gains)))
+    gains = (one.errors_m < SUCCESS_M).mean(axis=0) - (other.errors_m < SUCCESS_M).mean(axis=0)
+    drawn = np.random.default_rng(0).integers(len(gains), size=(_RESAMPLES, len(gains)))
     low, high = np.quantile(gains[drawn].mean(axis=1), (0.025, 0.975))
     return Difference(float(gains.mean()), float(low), float(high))
 
 
-def find_best(summaries: Sequence[Summary], limit_m: float = 1.0) -> Summary:
+def find_best(summaries: Sequence[Summary]) -> Summary:
     """Return the summary of highest success; of equal ones, that of least median error."""
-    return max(summaries, key=lambda each: (each.success(limit_m), -each.median_error_m))
+    return max(summaries, key=lambda each: (each.success(SUCCESS_M),
+                                            -float(np.median(each.errors_m))))
 
 
 # ---- the table ----------------------------------------------------------------------------------
@@ -250,25 +214,21 @@ def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
 def _row(summary: Summary, best: Summary) -> tuple[str, ...]:
     matching, algorithm = (summary.method.split('_', 1) if summary.method in PAPER_METHODS
                            else (summary.method, ''))
-    several = len(summary.errors_m) > 1
-    rates = ' / '.join(
-        _rate(summary.success(limit))
-        + (f'±{_rate(summary.success_deviation(limit))}' if several else '')
-        for limit in LIMITS_M)
+    several, spreads = len(summary.errors_m) > 1, list(summary.spreads.values())
+    rates = ' / '.join(_rate(value) + (f'±{_rate(off)}' if several else '')
+                       for value, off in spreads[:-3])
     if summary is not best and compare(summary, best).is_noise:
         rates += f' {_WITHIN_NOISE}'
     median_m, median_deg, mean_m = (
         f'{value:.{digits}f}' + (f'±{off:.{digits}f}' if several and np.isfinite(off) else '')
-        for value, off, digits in zip(
-            (summary.median_error_m, summary.median_error_deg, summary.mean_error_m),
-            summary.error_deviations, (3, 2, 2), strict=True))
+        for (value, off), digits in zip(spreads[-3:], (3, 2, 2), strict=True))
     errors = f'{median_m}, {median_deg}; {mean_m}'
     if summary.is_given:
         return (matching, algorithm, rates, errors, '', '', '', '')
     cut = '' if summary.coverage.min() == 1.0 else f' ({summary.coverage.mean():.0%} tried)'
     interval = ' to '.join(map(_rate, summary.precision_interval()))
     return (matching, algorithm, rates, errors,
-            f'{summary.mean_search_ms:.1f}±{summary.search_deviation_ms:.1f}{cut}',
+            f'{summary.search_ms.mean():.1f}±{summary.search_ms.std():.1f}{cut}',
             _rate(float(summary.accepted.mean())),
             f'{_rate(summary.precision())} ({interval})',
             f'{summary.false_accepts()} of {int(summary.accepted.sum())}')
@@ -361,19 +321,17 @@ def as_csv(summaries: Sequence[Summary],
     rows: list[dict[str, Any]] = []
     for summary in summaries:
         difference, (low, high) = compare(summary, best), summary.precision_interval()
+        spreads = summary.spreads
+        values = {name: value for name, (value, _) in spreads.items()}
+        values |= {f'{name}_std': deviation for name, (_, deviation) in spreads.items()}
+        rates = {name: values.pop(name) for name in [*values] if name.startswith('success')}
         rows.append({
             'method': summary.method, 'queries': len(summary.queries),
-            'trials': len(summary.errors_m),
-            **{f'success_{limit:g}m': summary.success(limit) for limit in LIMITS_M},
-            **{f'success_{limit:g}m_std': summary.success_deviation(limit)
-               for limit in LIMITS_M},
-            'solved': summary.solved, 'median_error_m': summary.median_error_m,
-            'median_error_deg': summary.median_error_deg, 'mean_error_m': summary.mean_error_m,
-            **dict(zip(('median_error_m_std', 'median_error_deg_std', 'mean_error_m_std'),
-                       summary.error_deviations, strict=True)),
+            'trials': len(summary.errors_m), **rates, 'solved': summary.solved, **values,
             **dict(zip(('relative_error_m', 'relative_error_deg'),
                        (relative or {}).get(summary.method, ('', '')), strict=True)),
-            'mean_search_ms': summary.mean_search_ms, 'search_ms_std': summary.search_deviation_ms,
+            'mean_search_ms': float(summary.search_ms.mean()),
+            'search_ms_std': float(summary.search_ms.std()),
             'coverage': float(summary.coverage.mean()),
             'accepted': float(summary.accepted.mean()), 'precision_1m': summary.precision(),
             'precision_1m_low': low, 'precision_1m_high': high, 'recall_1m': summary.recall(),

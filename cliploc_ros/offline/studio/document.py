@@ -12,19 +12,20 @@ from pathlib import Path
 from threading import Event, RLock
 from typing import Any
 
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.storage import parse_json
-from cliploc_ros.offline.studio.edits import Change, EditError, change_from_json
-from cliploc_ros.offline.studio.landmark import KNOWN_FIELDS, Landmark, Landmarks, map_of
-from cliploc_ros.offline.studio.map_file import (
-    LookFile,
-    MapFile,
-    read_look_file,
-    read_map_file,
-    text_on_disk,
+from cliploc_ros.offline.studio.edits import (
+    Change,
+    EditError,
+    Landmark,
+    Landmarks,
+    change_from_json,
+    map_of,
 )
+from cliploc_ros.offline.studio.map_file import MapFile, read_map_file, text_on_disk
 
 _MAX_HISTORY = 10_000
 
@@ -49,16 +50,16 @@ class Document:
     def __init__(self, path: Path):
         self.lock = RLock()
         self.changed = Event()
-        self.notes: tuple[str, ...] = ()
         #: Whether another program changed the file, until the user decides
         self.has_conflict = False
         self.selection: tuple[str, ...] = ()
         self._done: list[Change] = []
         self._undone: list[Change] = []
-        self._gesture: object = None
-        self._file = read_map_file(path)
-        self._look_file = self._read_looks()
-        self.landmarks: Landmarks = self._landmarks_of_file()
+        #: The gesture of the last edit, such as a drag, if it may continue
+        self.gesture: object = None
+        self.file = read_map_file(path)
+        self.notes = self.file.notes
+        self.landmarks: Landmarks = self.file.landmarks
         self._saved: Landmarks = self.landmarks
         # Edits that are not yet in the file. Before the map is written, the digest of its new
         # content is added to the journal, so that replay works with the old and the new file.
@@ -73,38 +74,26 @@ class Document:
         except BaseException:
             self._journal.close()
             raise
-        self._note_unknown_fields()
 
     # ---- content --------------------------------------------------------------------------------
 
     @property
     def path(self) -> Path:
         """The map file."""
-        return self._file.path
-
-    @property
-    def frame_id(self) -> str:
-        """The coordinate frame of the map."""
-        return self._file.frame_id
-
-    @property
-    def encoder_key(self) -> str:
-        """The encoder of the landmarks' embeddings; '' without embeddings."""
-        return self._look_file.encoder_key
+        return self.file.path
 
     def take_encoder(self, encoder_key: str) -> None:
         """Set the encoder of the embeddings of a new, empty map; ignored for other maps."""
         with self.lock:
-            if not self._file.landmarks and not self._look_file.path.exists():
-                self._look_file = replace(self._look_file, encoder_key=encoder_key)
+            if not self.file.landmarks and not embeddings_path(self.path).exists():
+                self.file = replace(self.file, encoder_key=encoder_key)
 
     @property
     def selected(self) -> tuple[str, Landmark] | None:
         """Id and landmark of the selection; None unless it is exactly one landmark."""
         with self.lock:
-            if len(self.selection) != 1:
-                return None
-            return self.selection[0], self.landmarks[self.selection[0]]
+            one = self.selection[0] if len(self.selection) == 1 else None
+            return None if one is None else (one, self.landmarks[one])
 
     def chosen(self) -> tuple[str, ...]:
         """Return the selection; EditError: it is empty."""
@@ -133,15 +122,10 @@ class Document:
         """The edit that the next redo repeats."""
         return self._undone[-1].what if self._undone else None
 
-    @property
-    def is_in_gesture(self) -> bool:
-        """Return whether the last edit may continue, such as a drag."""
-        return self._gesture is not None
-
     def to_map(self) -> LandmarkMap:
         """Return the map of the relocalizer; MapError: there are no landmarks."""
-        return replace(map_of(self.landmarks, self.frame_id, self.path.name),
-                       map_set=self._file.map_set)
+        return replace(map_of(self.landmarks, self.file.frame_id, self.path.name),
+                       map_set=self.file.map_set)
 
     # ---- edits ----------------------------------------------------------------------------------
 
@@ -153,9 +137,9 @@ class Document:
         with self.lock:
             if not change.after:
                 return
-            joins = gesture is not None and gesture == self._gesture and bool(self._done)
+            joins = gesture is not None and gesture == self.gesture and bool(self._done)
             self._do('join' if joins else 'edit', change)
-            self._gesture = gesture
+            self.gesture = gesture
 
     def edit(self, edit: Callable[..., Change], *arguments: Any, gesture: object = None,
              **values: Any) -> Change:
@@ -199,7 +183,7 @@ class Document:
     def _take(self, kind: str, change: Change) -> None:
         """Apply a change, and update the history."""
         back, self.landmarks = change.undoing(self.landmarks), change.apply(self.landmarks)
-        self._gesture = None
+        self.gesture = None
         if kind == 'undo':
             self._undone.append(back)
             del self._done[-1:]
@@ -219,7 +203,7 @@ class Document:
         written. The file is then unchanged.
         """
         with self.lock:
-            if text_on_disk(self.path) not in ('', self._file.text):
+            if text_on_disk(self.path) not in ('', self.file.text):
                 self.has_conflict = True
                 raise MapError(f'{self.path}: another program changed this file after the studio '
                                'read it; overwrite it, or reload it')
@@ -231,11 +215,9 @@ class Document:
             if not self.landmarks:
                 raise EditError(f'{self.path}: a map without landmarks is not saved; create one, '
                                 'or delete the file')
-            file = self._file.with_landmarks(self.landmarks)
+            file = self.file.with_landmarks(self.landmarks)
             self._journal.append({'writing': file.digest})
-            # the map is written last: its new content marks a complete save
-            self._look_file = self._look_file.write(self.landmarks)
-            file.write()
+            file.write(self.file)
             self._take_file(file, self.landmarks)
             return f'saved {self.path.name}'
 
@@ -248,20 +230,18 @@ class Document:
             file = read_map_file(self.path)
             if not file.text:
                 raise MapError(f'{self.path}: no such file; saving writes it')
-            self._file = file
-            self._look_file = self._read_looks()
             before = self.landmarks
             found = {key: replace(before.get(key, one), fields=one.fields, look=one.look)
-                     for key, one in self._landmarks_of_file().items()}
+                     for key, one in file.landmarks.items()}
             self._take('edit', Change('reload the file', {**dict.fromkeys(before), **found}))
             self._take_file(file, found)
-            self._note_unknown_fields()
+            self.notes += file.notes
             return f'reloaded {self.path.name}; undo reverts this'
 
     def _take_file(self, file: MapFile, landmarks: Landmarks) -> None:
         """Note that a file contains the landmarks, and begin a new journal."""
-        self._file, self._saved = file, landmarks
-        self._gesture, self.has_conflict = None, False
+        self.file, self._saved = file, landmarks
+        self.gesture, self.has_conflict = None, False
         self._journal.restart([{'base': file.digest}])
         self.changed.set()
 
@@ -270,25 +250,9 @@ class Document:
         with self.lock:
             self._journal.remove() if self.is_saved else self._journal.close()
 
-    def _landmarks_of_file(self) -> dict[str, Landmark]:
-        return {key: replace(landmark, look=self._look_file.looks.get(key))
-                for key, landmark in self._file.landmarks.items()}
-
-    def _note_unknown_fields(self) -> None:
-        unknown = {name: key for key, landmark in self.landmarks.items()
-                   for name in landmark.fields if name not in KNOWN_FIELDS}
-        for name, landmark_id in list(unknown.items())[:5]:
-            self.notes += (f"field '{name}' (landmark '{landmark_id}') is kept, but the "
-                           'relocalizer refuses a map with unknown fields',)
-
-    def _read_looks(self) -> LookFile:
-        found, fault = read_look_file(self._file)
-        self.notes += (fault,) if fault else ()
-        return found
-
     def _replay(self, entries: list[dict[str, Any]]) -> None:
         """Repeat the edits of the journal that are not in the file."""
-        digest, done = self._file.digest, list[dict[str, Any]]()
+        digest, done = self.file.digest, list[dict[str, Any]]()
         starts = [row for row, entry in enumerate(entries)
                   if digest in (entry.get('base'), entry.get('writing'))]
         edits = [entry for entry in entries[starts[-1] + 1 if starts else 0:] if 'do' in entry]

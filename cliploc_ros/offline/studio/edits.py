@@ -1,33 +1,44 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The edits of a map. Each edit returns a change and modifies nothing.
+"""The landmarks of an edited map, and the edits, which return a change and modify nothing.
+
+The relocalizer refuses a map with unknown fields, because a misspelled field would silently have
+no effect. The studio opens such a map, keeps the fields, and notes that they are refused.
+
+A look is the image embeddings of a landmark. It is a part of the landmark, so that merge, split,
+delete, undo and redo apply to it, too.
 
 A change contains the changed landmarks after the edit. The change that undoes it contains them
 before the edit.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.map.landmark_details import join_details
+from cliploc_ros.core.map.landmark_details import (
+    OPTIONAL_FIELDS,
+    LandmarkDetails,
+    join_details,
+    read_details,
+)
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.offline.mapping.labelling import choose_medoids
+from cliploc_ros.offline.mapping.landmarks import Landmarks as Ellipsoids
 from cliploc_ros.offline.mapping.landmarks import unused_ids
-from cliploc_ros.offline.studio.landmark import (
-    LEAST_SEMI_AXIS_M,
-    Landmark,
-    Landmarks,
-    map_of,
-    merge_looks,
-    rounded,
-    shape_fields,
-)
 
+KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation', *OPTIONAL_FIELDS)
+# Edited numbers are rounded to these decimals, so that the file has the numbers that are shown.
+_DECIMALS = 6
+# The least semi-axis that an edit may set [m]; the file format allows less.
+_LEAST_SEMI_AXIS_M = 1e-3
 # Fields measured from a recording. They are invalid for an ellipsoid that a person placed.
 _NO_EVIDENCE = {'position_sigma': None, 'support': None, 'seen_ratio': None, 'baseline_deg': None}
 _MEASURED = (*_NO_EVIDENCE, 'last_seen')
@@ -41,6 +52,95 @@ class EditError(CliplocError):
     """An edit that the map does not allow; the message says what to do."""
 
 
+@dataclass(frozen=True)
+class Landmark:
+    """A landmark of the edited map. It equals one of equal fields; no file stores the marks."""
+
+    fields: Mapping[str, Any]  #: As in the map file, below the landmark's id
+    #: From the file next to the map: the embeddings of this landmark alone
+    look: LandmarkEmbeddings | None = field(default=None, compare=False)
+    #: Edits are refused
+    is_locked: bool = field(default=False, compare=False)
+    #: The landmark is not shown in the scene and the views
+    is_hidden: bool = field(default=False, compare=False)
+    #: Decision in the review: accepted, fixed; '' without a decision
+    decision: str = field(default='', compare=False)
+
+    @cached_property
+    def details(self) -> LandmarkDetails:
+        """The optional fields."""
+        return read_details(self.fields, 'landmark')
+
+    @property
+    def label(self) -> str:
+        """The label, or the label with the greatest weight."""
+        if 'label' in self.fields:
+            return str(self.fields['label'])
+        return max(self.details.labels or (('', 0.0),), key=lambda pair: pair[1])[0]
+
+    @property
+    def class_id(self) -> str:
+        """The detector class."""
+        return str(self.fields['class_id'])
+
+    @cached_property
+    def center(self) -> NDArray[np.float64]:
+        """The centre (3,) [m]."""
+        return np.array(self.fields['center'], dtype=np.float64)
+
+    @cached_property
+    def semi_axes(self) -> NDArray[np.float64]:
+        """The semi-axes (3,) [m]."""
+        return np.array(self.fields['semi_axes'], dtype=np.float64)
+
+    @cached_property
+    def quat_xyzw(self) -> NDArray[np.float64]:
+        """The unit quaternion (4,) from landmark axes to map axes."""
+        quat_xyzw = np.array(self.fields['orientation'], dtype=np.float64)
+        return np.asarray(quat_xyzw / np.linalg.norm(quat_xyzw))
+
+    @property
+    def basis(self) -> NDArray[np.float64]:
+        """The basis (3, 3), whose columns are the semi-axes in the map [m]."""
+        return np.asarray(Rotation.from_quat(self.quat_xyzw).as_matrix() * self.semi_axes)
+
+    def changed(self, **fields: Any) -> 'Landmark':
+        """Return the landmark with changed fields; None removes a field."""
+        together = {**self.fields, **fields}
+        return replace(self, fields={name: value for name, value in together.items()
+                                     if value is not None or name not in fields})
+
+
+Landmarks = Mapping[str, Landmark]
+
+
+def map_of(landmarks: Landmarks, frame_id: Any = 'map', source: str = 'studio') -> LandmarkMap:
+    """Return landmarks as a map of the relocalizer, without unknown fields.
+
+    MapError: there are no landmarks, or one is invalid; the message names the source, the
+    landmark and the field.
+    """
+    known = {landmark_id: {name: value for name, value in landmark.fields.items()
+                           if name in KNOWN_FIELDS} for landmark_id, landmark in landmarks.items()}
+    return LandmarkMap.from_mapping({'frame_id': frame_id, 'landmarks': known}, source)
+
+
+def rounded(values: Iterable[float]) -> list[float]:
+    """Round numbers as edits write them."""
+    return [round(float(value), _DECIMALS) + 0.0 for value in values]
+
+
+def shape_fields(center: NDArray[np.float64], basis: NDArray[np.float64]) -> dict[str, Any]:
+    """Return the fields of an ellipsoid with a centre (3,) and a basis (3, 3) in the map.
+
+    The basis' columns are orthogonal semi-axes [m].
+    """
+    (lengths,), (quat_xyzw,) = Ellipsoids.none()._replace(bases=basis[None]).axes_and_quats()
+    return {'center': rounded(center),
+            'semi_axes': rounded(np.maximum(lengths, _LEAST_SEMI_AXIS_M)),
+            'orientation': rounded(quat_xyzw)}
+
+
 class Change(NamedTuple):
     """The effect of an edit."""
 
@@ -49,10 +149,8 @@ class Change(NamedTuple):
 
     def apply(self, landmarks: Landmarks) -> dict[str, Landmark]:
         """Return the landmarks after the change."""
-        return {**{key: landmark for key, landmark in landmarks.items()
-                   if self.after.get(key, landmark) is not None},
-                **{key: landmark for key, landmark in self.after.items()
-                   if landmark is not None}}
+        return {key: landmark for key, landmark in {**landmarks, **self.after}.items()
+                if landmark is not None}
 
     def undoing(self, landmarks: Landmarks) -> 'Change':
         """Return the change that undoes this change of the landmarks."""
@@ -121,9 +219,9 @@ def set_fields(landmarks: Landmarks, landmark_ids: Iterable[str], **fields: Any)
         fields['orientation'] = np.divide(quat_xyzw, norm)
     fields = {name: ' '.join(value.split()) if isinstance(value, str) else rounded(value)
               for name, value in fields.items()}
-    if not min(fields.get('semi_axes', [np.inf])) >= LEAST_SEMI_AXIS_M:
+    if not min(fields.get('semi_axes', [np.inf])) >= _LEAST_SEMI_AXIS_M:
         raise EditError(f'resize {", ".join(ids)}: semi-axes {fields["semi_axes"]} must each be '
-                        f'at least {LEAST_SEMI_AXIS_M:g} m')
+                        f'at least {_LEAST_SEMI_AXIS_M:g} m')
     untrue = {_FIELDS[name][1]: None for name in fields}
     names = ' and '.join(_FIELDS[name][0] for name in fields)
     texts = [f"'{value[:40]}'" for value in fields.values() if isinstance(value, str)]
@@ -186,7 +284,7 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
     merged = replace(
         parts[0].changed(**shape_fields(*fit), **_NO_EVIDENCE,
                          class_weights=None if classes is None else dict(classes)),
-        look=merge_looks([part.look for part in parts],
+        look=_merge_looks([part.look for part in parts],
                          [part.details.support or 1 for part in parts]))
     return _change_of(f'merge {", ".join(ids)}', landmarks,
                       {ids[0]: merged, **dict.fromkeys(ids[1:])})
@@ -198,7 +296,7 @@ def split(landmarks: Landmarks, landmark_id: str) -> Change:
     axes = old.semi_axes.copy()
     longest = int(np.argmax(axes))
     half_way = 0.5 * old.basis[:, longest]
-    axes[longest] = max(0.5 * axes[longest], LEAST_SEMI_AXIS_M)
+    axes[longest] = max(0.5 * axes[longest], _LEAST_SEMI_AXIS_M)
     first, second = (old.changed(center=rounded(old.center + sign * half_way),
                                  semi_axes=rounded(axes), **_NO_EVIDENCE) for sign in (-1, 1))
     return _change_of(f'split {landmark_id}', landmarks,
@@ -218,6 +316,25 @@ def take_fits(landmarks: Landmarks, landmark_ids: Iterable[str], fitted: Landmar
             center=rounded(fitted.centers[row]), semi_axes=rounded(fitted.semi_axes[row]),
             orientation=rounded(fitted.quats_xyzw[row]), **known)
     return _change_of(f'refit {len(after)} landmarks', landmarks, after)
+
+
+def _merge_looks(looks: Sequence[LandmarkEmbeddings | None], weights: Sequence[float]
+                ) -> LandmarkEmbeddings | None:
+    """Merge the looks of several landmarks, of one encoder; None if no look is known.
+
+    The weights are, for example, the numbers of boxes.
+    """
+    known = [(look, weight) for look, weight in zip(looks, weights, strict=True)
+             if look is not None]
+    if len(known) < 2:
+        return known[0][0] if known else None
+    mean = np.sum([weight * look.means.astype(np.float32) for look, weight in known], axis=0)
+    crops = np.concatenate([look.medoids for look, _ in known]).astype(np.float32)
+    shares = np.concatenate([np.full(len(look.medoids), weight / max(1, len(look.medoids)))
+                             for look, weight in known])
+    chosen = crops[choose_medoids(crops, shares)].astype(np.float16)
+    return replace(known[0][0], medoids=chosen, medoid_offsets=np.array([0, len(chosen)]), means=(
+        mean / max(float(np.linalg.norm(mean)), 1e-9)).astype(np.float16))
 
 
 def _get(landmarks: Landmarks, landmark_id: str) -> Landmark:

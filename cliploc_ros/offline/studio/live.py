@@ -20,7 +20,6 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from rclpy.validate_full_topic_name import validate_full_topic_name
 from std_srvs.srv import Trigger
 
 from cliploc_ros.errors import CliplocError, OptionsError
@@ -28,7 +27,7 @@ from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_from_msg
 from cliploc_ros.ros.node.diagnostics import split_names
-from cliploc_ros.ros.running import RelocalizerStatus
+from cliploc_ros.ros.running import RelocalizerStatus, check_name
 
 # The relocalizer reports once a second, but may be late while it loads libraries. Not measured.
 _SILENCE_S = 10.0
@@ -95,16 +94,13 @@ class LiveRelocalizer:
         self.state = LiveState(False, {}, None)
         self._pose: LivePose | None = None
         self._turn, self._closed = threading.Lock(), threading.Event()
-        self._listeners: list[Callable[[], None]] = []
+        #: Called after each change of the state, in any thread
+        self.on_change: Callable[[], None] = lambda: None
         self._status = RelocalizerStatus(node, name)
         self._relocalize = node.create_client(Trigger, f'{name}/relocalize')
         self._reload = node.create_client(Trigger, f'{name}/reload_map')
         node.create_subscription(PoseWithCovarianceStamped, f'{name}/pose', self._on_pose,
                                  qos.POSE)
-
-    def subscribe(self, listener: Callable[[], None]) -> None:
-        """Register a function that is called after each change of the state, in any thread."""
-        self._listeners.append(listener)
 
     def update(self) -> None:
         """Update the state from the received messages."""
@@ -112,13 +108,7 @@ class LiveRelocalizer:
         is_heard = bool(values) and self._status.silent_s <= _SILENCE_S
         if self._pose is not self.state.pose or (is_heard, values) != self.state[:2]:
             self.state = LiveState(is_heard, values, self._pose)
-            for listener in self._listeners:
-                listener()
-
-    @property
-    def is_busy(self) -> bool:
-        """Return whether a request waits for its answer."""
-        return self._turn.locked()
+            self.on_change()
 
     def lines(self, document: Document) -> list[str]:
         """Return the state as lines for the page."""
@@ -135,9 +125,9 @@ class LiveRelocalizer:
         if pose is not None:
             lines.append(f'{"" if state.is_current else "earlier "}pose of '
                          f'{state.base_frame or "the camera"}, stamp {pose.stamp_s:.2f} s')
-            if pose.frame_id != document.frame_id:
-                lines.append(f'the pose is in {pose.frame_id}, the map in {document.frame_id}: '
-                             'the pose is not shown')
+            if pose.frame_id != (frame := document.file.frame_id):
+                lines.append(f'the pose is in {pose.frame_id}, the map in {frame}: the pose is '
+                             'not shown')
         return [line[:_MAX_TEXT] for line in lines if line]
 
     def relocalize(self) -> str:
@@ -222,16 +212,15 @@ def follow_relocalizer(name: str, ros_args: Sequence[str] = ()) -> Iterator[Live
 
     OptionsError: the name is invalid, or ROS does not start.
     """
-    name = '/' + name.strip('/')
-    context = Context()
+    name, context = '/' + name.strip('/'), Context()
+    check_name(name)
     try:
-        validate_full_topic_name(name)
         rclpy.init(args=list(ros_args), context=context,
                    signal_handler_options=SignalHandlerOptions.NO)
         node = Node('map_studio', context=context, enable_rosout=False,
                     start_parameter_services=False)
-    except Exception as error:  # rcl raises different types for names, arguments and folders
-        raise OptionsError(f'--ros {name}: ROS does not start: {error}') from error
+    except Exception as error:  # rcl raises different types for arguments and folders
+        raise OptionsError(f'--ros: ROS does not start: {error}') from error
     live = LiveRelocalizer(node, name)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)

@@ -10,12 +10,14 @@ this module reads and saves in 1.4 s.
 """
 
 import hashlib
+import json
 import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -39,7 +41,7 @@ from cliploc_ros.core.map.parameter_file import (
 )
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import finish_set, write_file
-from cliploc_ros.offline.studio.landmark import KNOWN_FIELDS, Landmark, Landmarks, map_of
+from cliploc_ros.offline.studio.edits import KNOWN_FIELDS, Landmark, Landmarks, map_of
 
 _PARAMETERS = 'ros__parameters'
 _GEOMETRY = ('center', 'semi_axes', 'orientation')
@@ -49,15 +51,19 @@ _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 @dataclass(frozen=True)
 class MapFile:
-    """A map file: its text, '' for a file that does not exist, and the parsed tree.
+    """A map file: its text, '' for a file that does not exist, the parsed tree, and the looks.
 
-    ``node`` is the key of the node whose parameters contain the map.
+    ``node`` is the key of the node whose parameters contain the map. ``encoder_key`` is '' if the
+    file of image embeddings is missing or unusable. ``notes`` are remarks for the user.
     """
 
     path: Path
     text: str
     node: str
     tree: Mapping[str, Any]
+    encoder_key: str = ''
+    looks: Mapping[str, LandmarkEmbeddings] = MappingProxyType({})  #: By landmark id
+    notes: tuple[str, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -77,14 +83,15 @@ class MapFile:
     @property
     def landmarks(self) -> dict[str, Landmark]:
         """The landmarks by id."""
-        return {key: Landmark(fields) for key, fields in self._map['landmarks'].items()}
+        return {key: Landmark(fields, self.looks.get(key))
+                for key, fields in self._map['landmarks'].items()}
 
     @property
     def _map(self) -> Mapping[str, Any]:
         found: Mapping[str, Any] = self.tree[self.node][_PARAMETERS]['map']
         return found
 
-    def with_landmarks(self, landmarks: Mapping[str, Landmark]) -> 'MapFile':
+    def with_landmarks(self, landmarks: Landmarks) -> 'MapFile':
         """Return the file with other landmarks. It is not written.
 
         MapError: the file has fields that cannot be rewritten.
@@ -102,13 +109,30 @@ class MapFile:
                 texts.append(patched(self.text, self.tree, tree))
         texts.append(''.join(f'{line}\n' for line in _emit(tree, 0)))
         for text in texts:
-            if _says(text, tree):
-                return MapFile(self.path, text, self.node, tree)
+            with suppress(MapError):
+                if _normalized(parse_parameters(text, 'map')) == _normalized(tree):
+                    return replace(self, text=text, tree=tree, looks={
+                        key: landmark.look for key, landmark in landmarks.items()
+                        if landmark.look is not None})
         raise MapError(f'{self.path}: has fields that cannot be rewritten; the file was not '
                        'changed')
 
-    def write(self) -> None:
-        """Write the file atomically; OptionsError: it cannot be written and is unchanged."""
+    def write(self, before: 'MapFile') -> None:
+        """Write the file in place of the one before atomically, and the looks if they changed.
+
+        The map is written last: its new content marks a complete save. CliplocError: a file
+        cannot be written. The map is then unchanged.
+        """
+        is_same = self.looks.keys() == before.looks.keys() and all(
+            self.looks[key] is before.looks[key] for key in self.looks)
+        if self.encoder_key and not is_same:
+            ids = list(self._map['landmarks'])
+            size = next(iter((*before.looks.values(), *self.looks.values()))).means.shape[1]
+            nothing = LandmarkEmbeddings(self.encoder_key, ('',), np.zeros((1, size), np.float16),
+                                         np.empty((0, size), np.float16), np.zeros(2, np.int64))
+            save_landmark_embeddings(embeddings_path(self.path), replace(concatenated(
+                [self.looks.get(key, nothing) for key in ids], ids),
+                set_digest=before.map_set.digest))
         write_file(self.path, lambda partial: partial.write_bytes(self.text.encode()))
 
 
@@ -118,15 +142,15 @@ def text_on_disk(path: Path) -> str:
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Read a map file; return an empty map if it does not exist.
+    """Read a map file and the looks next to it; return an empty map if it does not exist.
 
-    MapError: the file is not a map, or a landmark is invalid. Unknown fields of landmarks are
-    accepted.
+    MapError: the file is not a map, or a landmark is invalid. Unknown fields of landmarks and
+    invalid looks are noted.
     """
     path = path.resolve()
     if not (text := text_on_disk(path)):
-        return MapFile(path, '', '/**', {'/**': {_PARAMETERS: {'map': {
-            'frame_id': 'map', 'landmarks': {}}}}})
+        return _with_looks(MapFile(path, '', '/**', {'/**': {_PARAMETERS: {'map': {
+            'frame_id': 'map', 'landmarks': {}}}}}))
     finish_set(path, set_of(text).digest)
     tree = parse_parameters(text, path)
     node = find_map_node(tree, path)
@@ -139,24 +163,35 @@ def read_map_file(path: Path) -> MapFile:
                            [:200])
     file = MapFile(path, text, node, tree)
     map_of(file.landmarks, found.get('frame_id') or '', str(path))
-    return file
+    unknown = {name: key for key, fields in found['landmarks'].items()
+               for name in fields if name not in KNOWN_FIELDS}
+    return _with_looks(replace(file, notes=tuple(
+        f"field '{name}' (landmark '{key}') is kept, but the relocalizer refuses a map with "
+        'unknown fields' for name, key in list(unknown.items())[:5])))
 
 
-def _says(text: str, tree: Mapping[str, Any]) -> bool:
-    """Return whether a text parses to a tree; NaN is equal to NaN."""
+def _with_looks(file: MapFile) -> MapFile:
+    """Return a map file with the image embeddings next to it, or with a note on their fault."""
+    path = embeddings_path(file.path)
+    if not os.path.exists(path):  # noqa: PTH110 - never raises
+        return file
     try:
-        return repr(_sorted(parse_parameters(text, 'map'))) == repr(_sorted(tree))
-    except MapError:
-        return False
+        found = load_landmark_embeddings(path)
+        check_set(found.set_digest, file.map_set.digest)
+    except (MapError, ValueError) as error:
+        text = str(error).removeprefix(f'{path}: ')
+        return replace(file, notes=(
+            f'{path}: {text}. The studio does not change this file', *file.notes))
+    offsets = found.medoid_offsets
+    return replace(file, encoder_key=found.encoder_key, looks={key: LandmarkEmbeddings(
+        found.encoder_key, (key,), found.means[row:row + 1],
+        found.medoids[offsets[row]:offsets[row + 1]], offsets[row:row + 2] - offsets[row])
+        for row, key in enumerate(found.landmark_ids) if found.is_known[row]})
 
 
-def _sorted(tree: Any) -> Any:
-    """Normalize a tree for comparison: sorted keys, tuples as lists, integers as floats."""
-    if isinstance(tree, Mapping):
-        return {key: _sorted(tree[key]) for key in sorted(tree)}
-    if isinstance(tree, list | tuple):
-        return [_sorted(item) for item in tree]
-    return float(tree) if isinstance(tree, int) and not isinstance(tree, bool) else tree
+def _normalized(tree: Any) -> Any:
+    """Normalize a tree for comparison: lists for tuples, floats for integers, text for NaN."""
+    return json.loads(json.dumps(tree), parse_int=float, parse_constant=str)
 
 
 # ---- the text -----------------------------------------------------------------------------------
@@ -245,56 +280,3 @@ def _flow(name: str, value: Any) -> str:
     if name in _GEOMETRY or (isinstance(value, float) and math.isfinite(value)):
         return np.format_float_positional(value, trim='0')
     return str(yaml.safe_dump(value)).partition('\n')[0]
-
-
-# ---- the image embeddings -----------------------------------------------------------------------
-
-@dataclass(frozen=True)
-class LookFile:
-    """The file of image embeddings next to a map, with the looks by landmark id.
-
-    ``encoder_key`` is '' if the file is missing or unusable.
-    """
-
-    path: Path
-    encoder_key: str
-    looks: Mapping[str, LandmarkEmbeddings]
-    set_digest: str = ''  #: The digest in the head of the map, which edits keep
-
-    def write(self, landmarks: Landmarks) -> 'LookFile':
-        """Write the looks of all landmarks of the map atomically, if they changed.
-
-        Return the new file; MapError: it cannot be written.
-        """
-        known = {key: landmark.look for key, landmark in landmarks.items()
-                 if landmark.look is not None}
-        is_same = known.keys() == self.looks.keys() and all(
-            known[key] is self.looks[key] for key in known)
-        if not self.encoder_key or is_same:
-            return self
-        size = next(iter((*self.looks.values(), *known.values()))).means.shape[1]
-        nothing = LandmarkEmbeddings(self.encoder_key, ('',), np.zeros((1, size), np.float16),
-                                     np.empty((0, size), np.float16), np.zeros(2, np.int64))
-        save_landmark_embeddings(self.path, replace(concatenated(
-            [known.get(key, nothing) for key in landmarks], list(landmarks)),
-            set_digest=self.set_digest))
-        return replace(self, looks=known)
-
-
-def read_look_file(file: MapFile) -> tuple[LookFile, str]:
-    """Read the image embeddings next to a map; return also their fault, '' if they are valid."""
-    path = embeddings_path(file.path)
-    if not os.path.exists(path):  # noqa: PTH110 - never raises
-        return LookFile(path, '', {}), ''
-    try:
-        found = load_landmark_embeddings(path)
-        check_set(found.set_digest, file.map_set.digest)
-    except (MapError, ValueError) as error:
-        text = str(error).removeprefix(f'{path}: ')
-        return LookFile(path, '', {}), f'{path}: {text}. The studio does not change this file'
-    offsets = found.medoid_offsets
-    looks = {key: LandmarkEmbeddings(
-        found.encoder_key, (key,), found.means[row:row + 1],
-        found.medoids[offsets[row]:offsets[row + 1]], offsets[row:row + 2] - offsets[row])
-        for row, key in enumerate(found.landmark_ids) if found.is_known[row]}
-    return LookFile(path, found.encoder_key, looks, found.set_digest), ''

@@ -18,6 +18,7 @@ from cliploc_ros.core.geometry.ellipsoid import box_ious
 from cliploc_ros.offline.mapping.evidence import widest_angle_deg
 from cliploc_ros.offline.mapping.fitting import Fit, fit_ellipsoid
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.triangulation import box_radii
 from cliploc_ros.offline.mapping.views import Views, make_views
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
@@ -104,7 +105,7 @@ class NewLandmark:
         change = edits.create(document.landmarks, *of)
         (landmark_id,) = change.after
         rows = recording.boxes_of(change.apply(document.landmarks))[landmark_id]
-        document.edit(edits.create, *of, recording.look_of(rows, document.encoder_key))
+        document.edit(edits.create, *of, recording.look_of(rows, document.file.encoder_key))
         document.select([landmark_id])
         self.forget()
         hint = (f'{len(rows)} boxes of the recording show it: use Refit to fit it to them'
@@ -233,5 +234,4 @@ def _meeting_point(views: Views, origins: NDArray[np.float64]
     if not depths.min() > 0.05:
         raise EditError('create: the boxes do not show one object: their rays meet behind a '
                         'camera; draw the same object in all views')
-    extents = views.edges[:, 2:] - views.edges[:, :2]
-    return point, float(np.median(0.5 * np.sqrt(extents.prod(axis=1)) * depths))
+    return point, float(np.median(box_radii(views, np.arange(len(depths))) * depths))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page: the 3D scene, and the loop that redraws the scene and the other parts.
+"""The page: the 3D scene, the other parts as JSON, its pictures, and the loop that redraws them.
 
 viser shows the scene in a frame of our page: its widgets have no image for zooming and drawing, no
 rows with buttons, and only a single column. Data flows in one direction: pages send messages,
@@ -19,22 +19,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.offline import page as html
 from cliploc_ros.offline.studio import edits, viewpoint
-from cliploc_ros.offline.studio.cloud import Cloud, draw_cloud, find_cloud
 from cliploc_ros.offline.studio.desk import Desk
-from cliploc_ros.offline.studio.layers import (
+from cliploc_ros.offline.studio.edits import Landmark, shape_fields
+from cliploc_ros.offline.studio.room import Cloud, draw_cloud, draw_walls, find_cloud
+from cliploc_ros.offline.studio.scene import (
+    Ellipsoids,
+    Gizmo,
+    Labels,
     Layers,
     draw_answers,
     draw_cameras,
+    draw_floor,
+    draw_image,
     draw_keyframes,
     draw_robot,
 )
-from cliploc_ros.offline.studio.parts import parts_of, picture_of
-from cliploc_ros.offline.studio.scene import Ellipsoids, Gizmo, Labels, draw_floor, draw_image
 from cliploc_ros.offline.studio.studio import Rgb, Studio
-from cliploc_ros.offline.studio.walls import draw_walls
 from cliploc_ros.offline.studio.web import Board, Content, Gate
 
 if TYPE_CHECKING:
@@ -49,6 +55,11 @@ _MISSING_RGB: Rgb = (220, 0, 0)
 _MISSING_SCALE = 1.3
 # Greatest time between the clicks of a double click [s].
 _DOUBLE_CLICK_S = 0.6
+# Greatest number of outlines: more hide the image and delay a drag.
+_MAX_OUTLINES = 200
+_CROP_PX = 160
+# Greatest number of answers in the list after a run over the recording.
+_MAX_ANSWERS = 100
 
 logger = logging.getLogger(__name__)
 
@@ -168,7 +179,7 @@ class Page:
             state = studio.live.state
             self._missing.show({key: document.landmarks[key] for key in state.missing
                                 if key in document.landmarks}, lambda class_id: _MISSING_RGB)
-            is_here = state.pose is not None and state.pose.frame_id == document.frame_id
+            is_here = state.pose is not None and state.pose.frame_id == document.file.frame_id
             show('Robot', state if is_here else None, draw_robot)
         # before the image of the scene, which takes time
         self.board.show({**parts_of(self.desk), 'people': self.board.people})
@@ -192,6 +203,108 @@ class Page:
         except CliplocError as error:
             self.desk.log('refused', str(error))
             return None
+
+
+# ---- the content, part by part -----------------------------------------------------------------
+
+def parts_of(desk: Desk) -> dict[str, Any]:
+    """Return the parts of the page by name."""
+    studio, document = desk.studio, desk.studio.document
+    review = studio.review
+    found = {
+        'file': {
+            'name': document.path.name, 'frame': document.file.frame_id,
+            'is_saved': document.is_saved, 'notes': document.notes, 'undo': document.to_undo,
+            'redo': document.to_redo, 'conflict': document.has_conflict, 'views': studio.views,
+            'has_boxes': review.has_boxes, 'images': studio.recording is not None
+            and studio.recording.images is not None,
+            'classes': sorted({landmark.class_id for landmark in document.landmarks.values()})},
+        'rows': [[key, one.label, one.class_id, one.is_locked, one.is_hidden,
+                  review.severity(key), one.decision,
+                  '#{:02x}{:02x}{:02x}'.format(*studio.color_of(one.class_id))]
+                 for key in review.order if (one := document.landmarks.get(key))],
+        'selection': {'ids': document.selection, 'one': _selected_part(studio)},
+        'review': {**review.counts(), 'running': list(desk.running)},
+        'log': {'lines': desk.lines, 'is_old': desk.is_old},
+        'layers': desk.layers,
+        'test': {
+            'share': round(studio.share, 2), 'running': list(desk.running),
+            'is_stale': studio.is_stale, 'has_page': bool(studio.check_page),
+            'answers': [[view, one.verdict, None if one.error_m is None else round(one.error_m, 2),
+                         one.reason] for view, one in list(studio.answers.items())[:_MAX_ANSWERS]],
+            'robot': None if studio.live is None else studio.live.lines(document)}}
+    if studio.recording is not None:
+        found |= _view_parts(studio)
+    return found
+
+
+def _selected_part(studio: Studio) -> dict[str, Any] | None:
+    if studio.document.selected is None:
+        return None
+    key, one = studio.document.selected
+    check, sightings = studio.review.check_of(key), studio.sightings(key)
+    return {
+        'id': key, 'label': one.label, 'class_id': one.class_id,
+        'is_locked': one.is_locked, 'decision': one.decision,
+        'center': one.center.tolist(), 'semi_axes': one.semi_axes.tolist(),
+        'angles': [round(float(angle), 3) + 0.0 for angle in Rotation.from_quat(
+            one.quat_xyzw).as_euler('xyz', degrees=True)],
+        'phrases': studio.phrases(key), 'is_checked': check is not None,
+        'faults': () if check is None else check.faults,
+        'support': None if check is None else check.support,
+        'ratio': None if check is None else check.seen_ratio,
+        'sightings': sightings and [
+            [one.view, *one.bbox_xyxy.round(1).tolist(), one.is_detected] for one in sightings]}
+
+
+def _view_parts(studio: Studio) -> dict[str, Any]:
+    """Return the parts of the selected view and of the new landmark."""
+    new, recording, view = studio.new, studio.recording, studio.view
+    assert recording is not None and new is not None
+    selection, seen = studio.document.selection, recording.detections.detections_of(view)
+    outlines = enumerate(recording.outlines(studio.shown(), view).items())
+    guess = {} if new.fit is None else {'': Landmark(shape_fields(new.fit.center, new.fit.basis))}
+    return {
+        'view': {
+            'view': view, 'camera': recording.detections.name_of(view),
+            'size': [studio.camera.width, studio.camera.height],
+            'boxes': [[*box, name] for box, name in zip(
+                seen.bboxes_xyxy.round(1).tolist(), seen.class_ids, strict=True)],
+            'outlines': [[key, *_axes_of(ellipse)] for number, (key, ellipse) in outlines
+                         if number < _MAX_OUTLINES or key in selection],
+            'guess': [*map(_axes_of, recording.outlines(guess, view).values())],
+            'guide': new.guide(view).round(1).tolist()},
+        'new': {'boxes': sorted(new.boxes.items()), 'class_id': new.class_id, 'doubt': new.doubt}}
+
+
+def _axes_of(ellipse: NDArray[np.float64]) -> list[float]:
+    """Return an outline's centre and semi-axes [px], and the angle of the first axis [deg]."""
+    cx, cy, exx, exy, eyy = ellipse
+    mean, apart = 0.5 * (exx + eyy), np.hypot(0.5 * (exx - eyy), exy)
+    axes = np.sqrt(np.maximum([mean + apart, mean - apart], 0.0))
+    return [round(float(value), 1) for value in (
+        cx, cy, *axes, np.degrees(0.5 * np.arctan2(2.0 * exy, exx - eyy)))]
+
+
+def picture_of(studio: Studio, path: str) -> Content | None:
+    """Return an image, a crop or the last check: /image/ANY/VIEW, /crop/ANY/VIEW/X,Y,X,Y, /check.
+
+    CliplocError: an image cannot be read.
+    """
+    kind, *words = path.strip('/').split('/')
+    if kind == 'check' and studio.check_page:
+        return Content(studio.check_page.encode(), '.html', False)
+    if studio.recording is None or kind not in ('image', 'crop'):
+        return None
+    try:
+        view = int(words[1])
+        image = studio.recording.image(view) if kind == 'image' else studio.recording.crop(
+            view, np.array([float(word) for word in words[2].split(',')]).reshape(4))
+    except (ValueError, IndexError):
+        return None
+    if image is None:
+        return None
+    return Content(html.jpeg_of(image, _CROP_PX if kind == 'crop' else None), '.jpg', True)
 
 
 @contextmanager
@@ -219,7 +332,7 @@ def serve_studio(studio: Studio, host: str, port: int, live: 'LiveRelocalizer | 
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     if live is not None:
         studio.live = live
-        live.subscribe(studio.changed.set)
+        live.on_change = studio.changed.set
     pages.append(page := Page(studio, server))
     try:
         shown_host = f'[{host}]' if ':' in host else host

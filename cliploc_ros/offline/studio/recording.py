@@ -9,7 +9,6 @@ new images.
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -45,22 +44,12 @@ from cliploc_ros.offline.mapping.sightings import (
 from cliploc_ros.offline.mapping.views import Views, make_views
 from cliploc_ros.offline.simulation import LabelModel
 from cliploc_ros.offline.studio import edits
-from cliploc_ros.offline.studio.edits import Change, EditError
-from cliploc_ros.offline.studio.landmark import Landmarks, map_of
+from cliploc_ros.offline.studio.edits import Change, EditError, Landmarks, map_of
 
 #: Least number of boxes that determine an ellipsoid.
 LEAST_BOXES = 3
 # Margin of a crop around a box, as a share of its size.
 _MARGIN = 0.25
-
-
-class Outline(NamedTuple):
-    """The outline of a landmark in a view."""
-
-    landmark_id: str
-    ellipse: NDArray[np.float64]  #: cx, cy, exx, exy, eyy [px]
-    bbox_xyxy: NDArray[np.float64]  #: (4,) [px]
-    distance_m: float
 
 
 class Recording:
@@ -80,16 +69,18 @@ class Recording:
 
     def boxes_of(self, landmarks: Landmarks) -> dict[str, NDArray[np.int64]]:
         """Return the boxes of each landmark; a box shows at most one landmark."""
+        return dict(zip(landmarks, group_boxes(self._shown(landmarks), len(landmarks)),
+                        strict=True)) if landmarks else {}
+
+    def _shown(self, landmarks: Landmarks) -> NDArray[np.int64]:
+        """Return the number of the landmark that each box (n,) shows, -1 for none."""
+        return associate(self.views, landmarks_of_map(
+            map_of(landmarks), self.detections.class_names))
+
+    def outlines(self, landmarks: Landmarks, view: int) -> dict[str, NDArray[np.float64]]:
+        """Return the outlines cx, cy, exx, exy, eyy [px] of landmarks in a view, nearest first."""
         if not landmarks:
             return {}
-        shown = associate(self.views, landmarks_of_map(
-            map_of(landmarks), self.detections.class_names))
-        return dict(zip(landmarks, group_boxes(shown, len(landmarks)), strict=True))
-
-    def outlines(self, landmarks: Landmarks, view: int) -> list[Outline]:
-        """Return the outlines of landmarks in a view, nearest first."""
-        if not landmarks:
-            return []
         camera, centers = self.detections.camera_of(view), _array(landmarks, 'center')
         ellipses = outlines_in_view(self.detections, view, centers, shape_matrices(
             _array(landmarks, 'semi_axes'), _array(landmarks, 'quat_xyzw')))
@@ -98,10 +89,9 @@ class Recording:
         with np.errstate(invalid='ignore'):
             is_inside = (boxes[:, 2:] > 0.0).all(axis=1) & (
                 boxes[:, :2] < (camera.width, camera.height)).all(axis=1)
-        found = [Outline(*fields) for fields in zip(landmarks, ellipses, boxes,
-                                                    distances.tolist(), strict=True)]
-        return sorted((found[row] for row in np.nonzero(is_inside)[0]),
-                      key=lambda outline: outline.distance_m)
+        ids = list(landmarks)
+        return {ids[row]: ellipses[row] for row in np.argsort(distances, kind='stable')
+                if is_inside[row]}
 
     def sightings(self, landmarks: Landmarks, landmark_id: str, limit: int = 6) -> list[Sighting]:
         """Return the views that show a landmark best; CliplocError: an image cannot be read."""
@@ -185,10 +175,7 @@ class Recording:
             layer, self.image)
         landmark_map, options, detections = map_of(landmarks), CheckOptions(), self.detections
         relocalizer, labels = make_relocalizer(landmark_map, options), LabelModel.of(landmark_map)
-        shown = np.full(len(detections.classes), -1, dtype=np.int64)
-        for landmark, rows in enumerate(self.boxes_of(landmarks).values()):
-            shown[rows] = landmark
-        answers = {}
+        shown, answers = self._shown(landmarks), {}
         for view in views:
             query = simulated(detections, view, shown, labels, options.random_seed)
             localizer = Localizer(relocalizer)

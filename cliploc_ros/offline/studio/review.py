@@ -17,8 +17,7 @@ from cliploc_ros.offline.mapping.check.findings import (
 from cliploc_ros.offline.mapping.check.report import SERIOUS
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
-from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.landmark import map_of
+from cliploc_ros.offline.studio.edits import EditError, map_of
 from cliploc_ros.offline.studio.recording import Recording
 
 

@@ -17,19 +17,17 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.offline.evaluation.pages import check_page
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.relocalization import Trial, count_verdicts, sample_frames
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.sightings import Sighting
 from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
-from cliploc_ros.offline.studio.edits import EditError
-from cliploc_ros.offline.studio.landmark import Landmark, Landmarks
+from cliploc_ros.offline.studio.edits import EditError, Landmark, Landmarks
 from cliploc_ros.offline.studio.new_landmark import NewLandmark
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.review import ReviewQueue
-from cliploc_ros.offline.studio.walls import Walls
+from cliploc_ros.offline.studio.room import Walls
 
 if TYPE_CHECKING:
     from cliploc_ros.offline.studio.live import LiveRelocalizer
@@ -157,7 +155,7 @@ class Studio:
             self.changed.set()
 
         # during a drag, the views are not updated
-        is_dragged = self.document.is_in_gesture and self._wanted[0] == landmark_id
+        is_dragged = self.document.gesture is not None and self._wanted[0] == landmark_id
         if recording is not None and wanted != self._wanted and not is_dragged:
             if self._search is not None:
                 self._search.cancel()  # unless it has begun
@@ -206,26 +204,22 @@ class Studio:
 
     def lock(self, ids: Sequence[str] | None = None) -> str:
         """Lock landmarks, by default the selection; unlock them if all are locked."""
-        return self._toggle(ids, 'is_locked', ('lock', 'locked'), ('unlock', 'unlocked'))
+        return self._toggle(ids, 'is_locked', 'locked', 'unlocked')
 
     def hide(self, ids: Sequence[str] | None = None) -> str:
         """Hide landmarks, by default the selection; show them if all are hidden."""
-        return self._toggle(ids, 'is_hidden', ('hide', 'hid'), ('show', 'showed'))
+        return self._toggle(ids, 'is_hidden', 'hid', 'showed')
 
-    def _toggle(self, ids: Sequence[str] | None, name: str, on: tuple[str, str],
-                off: tuple[str, str]) -> str:
-        """Set a mark, or clear it if all landmarks have it.
-
-        `on` and `off` are the verbs for setting and clearing, and their past tenses for the log.
-        """
+    def _toggle(self, ids: Sequence[str] | None, name: str, on: str, off: str) -> str:
+        """Set a mark, or clear it if all landmarks have it. `on` and `off` say it in the log."""
         if ids is not None and not (isinstance(ids, list)
                                     and all(isinstance(key, str) for key in ids)):
-            raise EditError(f'{on[0]}: expected a list of ids, not {ids!r:.60}')
+            raise EditError(f'{name}: expected a list of ids, not {ids!r:.60}')
         ids, landmarks = ids or self.document.chosen(), self.document.landmarks
         have_it = all(getattr(landmarks[key], name) for key in ids if key in landmarks)
-        what, past = off if have_it else on
+        what = off if have_it else on
         self.document.edit(edits.mark, ids, what, **{name: not have_it})
-        return f'{past} {", ".join(ids)}'
+        return f'{what} {", ".join(ids)}'
 
     def split(self) -> str:
         """Split the selected landmark along its longest axis, and select both halves."""
@@ -294,7 +288,7 @@ class Studio:
         stop, call ``allow_check`` before the next check.
         """
         # imported late, since matplotlib takes a second
-        from cliploc_ros.offline.evaluation.map_pictures import ViewPainter, draw_pictures
+        from cliploc_ros.offline.evaluation.check_page import check_page
 
         def tell(stage: str, share: float) -> None:
             if self._stopped.is_set():
@@ -305,14 +299,13 @@ class Studio:
         tell('', 0.0)
         with self.document.lock:
             landmarks, landmark_map = self.document.landmarks, self.document.to_map()
-        detections, view_of = None, None
+        detections, image_of = None, None
         if self.recording is not None and self.review.has_boxes:
-            detections = self.recording.detections
-            view_of = ViewPainter(landmark_map, detections, self.recording.image).of
+            detections, image_of = self.recording.detections, self.recording.image
         report = check_map(landmark_map, detections, options=self.CHECK, progress=tell,
                            layer=self.layer)
-        self.check_page = check_page(self.document.path.name, report,
-                                     draw_pictures(landmark_map, report), view_of)
+        self.check_page = check_page(self.document.path.name, landmark_map, report, detections,
+                                     image_of)
         self._checked = landmarks
         return '; '.join([f'checked the map: {report.verdict}', *report.localized])
 

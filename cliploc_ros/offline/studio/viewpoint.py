@@ -49,22 +49,18 @@ class Bounds(NamedTuple):
         return rotation_to_z(self.up)[0].T
 
 
-def up_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the direction (3,) that points up in a map, given the poses (n, 4, 4) of cameras.
-
-    It is z, unless the cameras' tilt clearly differs, because the map is in a camera's coordinate
-    frame.
-    """
-    z, found = np.array([0.0, 0.0, 1.0]), find_tilt(poses)
-    return z if found is None or found[1] < _SAME_UP_DEG else np.asarray(found[0].T @ z)
-
-
 def extent_of(landmarks: Sequence[NDArray[np.float64]], poses: NDArray[np.float64] | None
               ) -> Bounds:
-    """Return the extent of landmarks (n, 3) and the cameras (m, 4, 4) that saw them [m]."""
+    """Return the extent of landmarks (n, 3) and the cameras (m, 4, 4) that saw them [m].
+
+    Up is z, unless the cameras' tilt clearly differs, because the map is in a camera's coordinate
+    frame.
+    """
     centers = np.reshape(landmarks, (-1, 3))
     poses = np.empty((0, 4, 4)) if poses is None else poses
-    up = up_direction(poses)
+    up, found = np.array([0.0, 0.0, 1.0]), find_tilt(poses)
+    if found is not None and found[1] >= _SAME_UP_DEG:
+        up = np.asarray(found[0].T @ up)
     points = np.concatenate([centers, poses[:, :3, 3]])
     if not len(points):
         points = np.zeros((1, 3))

@@ -1,0 +1,385 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Write the page of the check of a map, with its figures, pictures, and the advice.
+
+The page begins with the main results. Each piece of advice has an image of the recording: the best
+view of a landmark, or the nearest view.
+"""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.patches import Circle, Rectangle
+from numpy.typing import NDArray
+
+from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, outline_points
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.files.storage import write_text
+from cliploc_ros.offline import page as html
+from cliploc_ros.offline.evaluation.figures import (
+    EDGED,
+    draw_outline,
+    new_top_view,
+    png_of,
+    write_name,
+)
+from cliploc_ros.offline.mapping.association import associate
+from cliploc_ros.offline.mapping.check.findings import RADIUS_M, LandmarkCheck
+from cliploc_ros.offline.mapping.check.relocalization import ImageOf, Trial, count_verdicts
+from cliploc_ros.offline.mapping.check.report import (
+    SERIOUS,
+    Advice,
+    CheckReport,
+    Measure,
+    count_by_objects,
+    share,
+)
+from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.sightings import crop_around, find_sightings, outlines_in_view
+from cliploc_ros.offline.mapping.views import make_views
+
+CHECK, CHECK_DATA = 'check.html', 'check.json'
+# Words and colour of each grade of a landmark.
+_GRADES = {'faulty': ('serious fault', html.MISLED), 'minor': ('minor fault', html.REFUSED),
+           'sound': ('sound', '#009E73')}
+_MOST_LANDMARKS = 300
+# Number of pieces of advice on the first screen.
+_FIRST_ADVICE = 3
+_DPI = 120
+_INK = '#222222'
+_HEAT = LinearSegmentedColormap.from_list('accepted', ['#FBE9C6', '#56B4E9', '#003E6B']
+                                          ).with_extremes(bad='#DDDDDD')
+_MARKERS = {'accepted': (html.ACCEPTED, 'o'), 'refused': (html.REFUSED, 's'),
+            'misled': (html.MISLED, 'X')}
+_MOST_NAMES, _MOST_LOOK_ALIKES = 30, 6
+# Margin of a picture around a landmark, in sizes of the landmark.
+_AROUND = 3.0
+# Angle that makes a view as different as 1 m does [deg]; greatest difference of a view that is
+# shown for another one [m].
+_DEGREES_PER_M, _MOST_DIFFERENT = 30.0, 3.0
+_WIDTH_PX = 480
+_BOX_RGB, _OUTLINE_RGB = (255, 255, 255), (230, 159, 0)
+
+
+def write_check(folder: Path, name: str, landmark_map: LandmarkMap, report: CheckReport,
+                detections: PosedDetections | None = None, image_of: ImageOf | None = None
+                ) -> None:
+    """Write the page and the JSON file of the check of a map, each atomically.
+
+    OptionsError: a file cannot be written; the old file stays.
+    """
+    write_text(folder / CHECK_DATA, json.dumps(_plain({'map': name, **_data(report)}), indent=1,
+                                               allow_nan=False))
+    write_text(folder / CHECK, check_page(name, landmark_map, report, detections, image_of))
+
+
+def _data(report: CheckReport) -> dict[str, Any]:
+    """Return the content of the JSON file."""
+    grid, recording, layer = report.grid, report.recording, report.keyframes
+    data = {
+        'passed': report.passed, 'verdict': report.verdict, 'localized': report.localized,
+        'scale_by_sizes': report.scale, 'failures': report.failures, 'advice': report.advice,
+        'notes': report.notes, 'faulty_landmarks': report.faulty, 'duplicates': report.duplicates,
+        'landmarks': report.landmarks, 'look_alikes': report.look_alikes,
+        'overlaps': [{'first': report.map_ids[overlap.first],
+                      'second': report.map_ids[overlap.second], 'distance': overlap.distance,
+                      'is_duplicate': overlap.is_duplicate} for overlap in report.overlaps],
+        'recording': None, 'keyframes': None,
+        'grid': {**vars(grid), 'headings': grid.headings, 'poses': None,
+                 'accepted_positions_near_recording': grid.accepted_positions,
+                 'verdicts': count_verdicts(grid.trials),
+                 'trials': [trial for trial in grid.trials if trial.verdict == 'misled']}}
+    if recording is not None:
+        data['recording'] = {
+            **vars(recording), 'simulated': None, 'judged_frames': len(recording.judged),
+            'verdicts': count_verdicts(recording.trials),
+            'verdicts_by_objects': count_by_objects(recording.trials),
+            'verdicts_with_simulated_boxes': count_verdicts(recording.simulated)}
+    if layer is not None:
+        data['keyframes'] = {
+            'keyframes': layer.keyframes, 'points': layer.points,
+            'recorded_frames_in_reach': layer.recorded.mean() if len(layer.recorded) else None,
+            'positions_in_reach_near_recording': layer.reached_positions,
+            'positions_without': grid.positions[layer.without]}
+    return data
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as a JSON tree: not finite numbers as None, trials without their results."""
+    if is_dataclass(value):
+        value = {key: item for key, item in vars(value).items()
+                 if not (key == 'result' and isinstance(value, Trial))}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.round(4).tolist() if value.dtype.kind == 'f' else value.tolist()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _grade(landmark: LandmarkCheck) -> str:
+    """Return the grade of a landmark: 'faulty', 'minor' or 'sound'."""
+    if landmark.severity >= SERIOUS:
+        return 'faulty'
+    return 'minor' if landmark.faults else 'sound'
+
+
+def check_page(name: str, landmark_map: LandmarkMap, report: CheckReport,
+               detections: PosedDetections | None = None, image_of: ImageOf | None = None) -> str:
+    """Return the page of the check of a map; advice has pictures if there are images."""
+    views: list[tuple[bytes, str] | None] = [None] * len(report.to_do)
+    if detections is not None and image_of is not None:
+        shown = group_boxes(associate(make_views(detections), landmarks_of_map(
+            landmark_map, detections.class_names)), len(landmark_map))
+        views = [_view_of(advice, landmark_map, detections, shown, image_of)
+                 for advice in report.to_do]
+    missed = len(report.failures)
+    said = html.verdict('The map reaches all thresholds.' if report.passed else
+                        'Keyframes only: the map misses the threshold for objects alone.'
+                        if report.verdict == 'keyframes only' else
+                        f'The map misses {missed} of {len(report.measures)} thresholds.',
+                        report.passed)
+    said += html.items(report.localized)
+    first, *others = (html.figure(png, caption, picture)
+                      for picture, caption, png in draw_pictures(landmark_map, report))
+    cards = [html.card(f'{number}. {text}', *(view or ()))
+             for number, (text, view) in enumerate(zip(report.advice, views, strict=True), 1)]
+    parts = [html.first_screen(
+        [said, html.bars(_bar(measure) for measure in report.measures),
+         '<h2>What to do first</h2>', *cards[:_FIRST_ADVICE]], [first])]
+    if later := cards[_FIRST_ADVICE:]:
+        parts.append(html.fold(f'{len(later)} more recommendations', *later))
+    faulty = sum(_grade(landmark) == 'faulty' for landmark in report.landmarks)
+    parts += [html.fold('All figures', html.table(('', ''), figures_of(report))),
+              html.fold('Pictures', *others),
+              html.fold(f'Landmarks, worst first: {faulty} of {len(report.landmarks)} with a '
+                        'serious fault', _landmarks(report.landmarks))]
+    return html.page(f'Check of {name}', *parts,
+                     html.fold('How these figures were computed', html.items(report.notes)))
+
+
+def _bar(measure: Measure) -> tuple[str, str, float, float, bool]:
+    """Return the bar of a figure. That of a count ends at its limit plus one, or at its value."""
+    scale = max(measure.limit + 1.0, measure.value) if measure.unit == 'count' else 1.0
+    word = 'at most' if measure.is_most else 'at least'
+    return (measure.name, f'{measure.show(measure.value)} ({word} {measure.show(measure.limit)})',
+            measure.value / scale, measure.limit / scale, not measure.is_missed)
+
+
+def figures_of(report: CheckReport) -> list[tuple[str, str]]:
+    """Return the names and values of the figures of a check."""
+    rows = [('landmarks', str(len(report.landmarks))),
+            *((measure.name, measure.show(measure.value)) for measure in report.measures)]
+    if (recording := report.recording) is not None:
+        rows += [
+            ('recording', f'{recording.frames} frames, {recording.boxes} boxes, '
+             f'{recording.duration_s:.0f} s'),
+            ('explained boxes, median IoU; map as given',
+             f'{recording.as_given.explained:.1%}, {recording.as_given.median_iou:.3f} '
+             '(optimistic if the map was built from this recording)'),
+            (f'recorded frames, cross-validated, {report.evidence}', _verdicts(recording.judged)),
+            ('the same poses with simulated boxes', _verdicts(recording.simulated)),
+            ('noise of box edges', f'{recording.edge_scale:.2f} times that assumed by build_map')]
+        if len(recording.judged) < len(recording.trials):
+            rows.append(('also frames whose objects are in no other part of the recording',
+                         _verdicts(recording.trials)))
+    rows.append(('grid views, by objects alone', _verdicts(report.grid.trials)))
+    if (layer := report.keyframes) is not None:
+        rows.append(('keyframes', f'{layer.keyframes} with {layer.points} points'))
+        if len(layer.recorded):
+            rows.append(('recorded frames within reach of a keyframe',
+                         f'{layer.recorded.mean():.0%} of {len(layer.recorded)}'))
+        rows.append(('grid positions within reach of a keyframe',
+                     f'{layer.reached_positions:.0%} of {int(report.grid.is_near.sum())}'))
+    return rows
+
+
+def _verdicts(trials: Sequence[Trial]) -> str:
+    counts = count_verdicts(trials)
+    return (f'{counts["accepted"]} of {len(trials)} accepted ({share(trials, "accepted"):.0%}), '
+            f'{counts["refused"]} refused, {counts["misled"]} misled')
+
+
+def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
+    head = ('landmark', 'label', 'faults', '#frames', '#seen [%]', '#baseline [°]',
+            '#deviation [cm]', '#offset [cm]', '#IoU', '#thinness', 'overlaps with')
+    rows: list[list[str | tuple[str, str]]] = []
+    for check in landmarks[:_MOST_LANDMARKS]:
+        support = '' if check.support is None else (
+            str(check.support) if check.expected is None
+            else f'{check.support} of {check.expected}')
+        label = (check.class_id if check.label == check.class_id
+                 else f'{check.label} ({check.class_id})')
+        numbers = [(check.seen_ratio, 100.0, 0), (check.baseline_deg, 1.0, 0),
+                   (check.position_sigma_m, 100.0, 1), (check.offset_m, 100.0, 1),
+                   (check.median_iou, 1.0, 2), (check.thinness, 1.0, 2)]
+        texts = [support, *('' if value is None else f'{value * factor:.{digits}f}'
+                            for value, factor, digits in numbers)]
+        faults = '; '.join(check.faults) if check.faults else _GRADES['sound'][0]
+        rows.append([
+            (check.landmark_id, _grade(check)), (label, 'text'), (faults, 'text'), *texts,
+            ', '.join(f'{name} ({distance:.2f})' for name, distance in check.overlaps)])
+    rest = len(landmarks) - _MOST_LANDMARKS
+    more = html.note(f'{rest} more landmarks are in the JSON file') if rest > 0 else ''
+    return html.table(head, rows) + more + html.note(
+        'frames: number of frames with a detection of the landmark, of the frames that should '
+        'show it. seen: their share. baseline: largest angle between two views. deviation: '
+        'standard deviation of the centre along its worst axis. offset: distance between the '
+        'centre and the centre of a fit to the boxes. IoU: median over the boxes. thinness: '
+        'smallest semi-axis divided by the largest. In brackets: normalized distance of '
+        'overlapping landmarks.')
+
+
+# ---- the map from above -------------------------------------------------------------------------
+
+def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
+                  ) -> Iterator[tuple[str, str, bytes]]:
+    """Yield the name, the caption and the PNG of each picture."""
+    yield ('grid', 'Expected relocalization, top view. Outlines are landmarks, a cell is a camera '
+           'position. Its shade shows the share of headings with a correct, accepted pose, among '
+           'the headings with three or more detectable landmarks; it is grey if no heading shows '
+           'three. Ticks show the headings at which a wrong pose was accepted. Positions inside '
+           'landmarks are omitted. Numbers refer to the advice.',
+           _drawn(_draw_grid, landmark_map, report))
+    yield ('landmarks', 'Top view of the landmarks. Landmarks with a fault are named; if there '
+           'are many, only those with a serious fault. Arrows are recorded frames, each '
+           'relocalized in a map that was fitted without the frames of that time; a line leads to '
+           'a wrong pose. Circles of one number are places that look alike.',
+           _drawn(_draw_landmarks, landmark_map, report))
+
+
+def _drawn(draw: Callable[[Axes, LandmarkMap, CheckReport], None], landmark_map: LandmarkMap,
+           report: CheckReport) -> bytes:
+    """Return a picture with the bounds of the grid and of the landmarks."""
+    positions, half = report.grid.positions[:, :2], report.grid.spacing_m / 2
+    points = [landmark_map.centers[:, :2], positions - half, positions + half]
+    if report.recording is not None:
+        points.append(report.recording.path_xyz[:, :2])
+    figure, axes = new_top_view(np.concatenate(points), landmark_map.frame_id)
+    if report.recording is not None:
+        axes.plot(*points[-1].T, color=_INK, linewidth=1.0, linestyle=(0, (4, 2)), zorder=4,
+                  path_effects=EDGED, label='path of the recording')
+    draw(axes, landmark_map, report)
+    handles = axes.get_legend_handles_labels()[0]
+    figure.legend(handles=handles, loc='outside lower center', ncols=min(3, len(handles)),
+                  frameon=False, fontsize=9)
+    return png_of(figure, _DPI)
+
+
+def _draw_grid(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) -> None:
+    grid, side = report.grid, report.grid.spacing_m
+    height = grid.positions[0, 2] if len(grid.positions) else 0.0
+    axes.set_title(f'Expected accepted poses, camera {height:.2f} m high', fontsize=12)
+    cells = PatchCollection(
+        [Rectangle(position[:2] - 0.48 * side, 0.96 * side, 0.96 * side)
+         for position in grid.positions], cmap=_HEAT, norm=Normalize(0, 100), zorder=1)
+    cells.set_array(np.ma.masked_where(
+        (grid.useful == 0) & (grid.accepted == 0),
+        100.0 * np.minimum(1.0, grid.accepted / np.maximum(1, grid.useful))))
+    axes.add_collection(cells)
+    axes.figure.colorbar(cells, ax=axes, shrink=0.7, pad=0.02).set_label(
+        'correct pose accepted\n[% of headings that show 3 landmarks]', fontsize=9)
+    for center, shape in zip(landmark_map.centers, landmark_map.shapes, strict=True):
+        draw_outline(axes, center, shape, facecolor='none', edgecolor=_INK, linewidth=0.7,
+                     zorder=3, path_effects=EDGED)
+    ticks = [(trial.position, trial.position + 0.45 * side * trial.forward, np.full(3, np.nan))
+             for trial in grid.trials if trial.verdict == 'misled']
+    axes.plot(*np.reshape(ticks, (-1, 3)).T[:2], 'X-', color=html.MISLED, markevery=3, zorder=7,
+              markersize=9, markeredgecolor='white', linewidth=2.5,
+              label=f'misled ({len(ticks)} of {len(grid.trials)} views)')
+    centers = dict(zip(landmark_map.landmark_ids, landmark_map.centers, strict=True))
+    for number, advice in enumerate(report.to_do[:_FIRST_ADVICE], start=1):
+        place = (centers[advice.landmarks[0]] if advice.landmarks
+                 else None if advice.view is None else advice.view.position)
+        if place is not None:
+            axes.text(place[0], place[1], str(number), fontsize=10, fontweight='bold', zorder=10,
+                      color='white', ha='center', va='center', bbox={
+                          'boxstyle': 'circle,pad=0.25', 'facecolor': _INK, 'edgecolor': 'white'})
+
+
+def _draw_landmarks(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) -> None:
+    grades = {check.landmark_id: _grade(check) for check in report.landmarks}
+    for name, center, shape in zip(landmark_map.landmark_ids, landmark_map.centers,
+                                   landmark_map.shapes, strict=True):
+        draw_outline(axes, center, shape, facecolor=_GRADES[grades[name]][1], alpha=0.6,
+                     edgecolor=_INK, linewidth=0.7, zorder=3)
+    counts = Counter(grades.values())
+    for name, (words, color) in _GRADES.items():
+        axes.plot([], [], 'o', color=color, alpha=0.6, markersize=9,
+                  label=f'{words} ({counts[name]})')
+    is_many = len(landmark_map) - counts['sound'] > _MOST_NAMES
+    for check in [check for check in report.landmarks if check.faults and not (
+            is_many and grades[check.landmark_id] != 'faulty')][:_MOST_NAMES]:
+        write_name(axes, check.center[:2], check.landmark_id)
+    trials = report.recording.trials if report.recording is not None else ()
+    axes.set_title('Landmarks and recorded frames' if trials else 'Landmarks', fontsize=12)
+    for verdict, (color, marker) in _MARKERS.items() if trials else ():
+        chosen = [trial for trial in trials if trial.verdict == verdict]
+        tips, forward = (np.reshape([getattr(trial, name)[:2] for trial in chosen], (-1, 2)).T
+                         for name in ('position', 'forward'))
+        axes.plot(*tips, marker, color=color, markersize=5, zorder=6, label=(
+            f'frame {verdict} ({len(chosen)})'))
+        axes.quiver(*tips, *forward, color=color, angles='xy', scale=25.0, width=0.004, zorder=5)
+        for trial in chosen if verdict == 'misled' else ():
+            axes.plot(*np.array([trial.position, trial.estimate]).T[:2], color=color, zorder=7)
+    for number, pair in enumerate(report.look_alikes[:_MOST_LOOK_ALIKES], start=1):
+        for x, y, _ in (pair.first, pair.second):
+            axes.add_patch(Circle((x, y), RADIUS_M, fill=False, edgecolor=html.LOOK_ALIKE,
+                                  linewidth=1.8, zorder=5))
+            axes.text(x, y + 0.8 * RADIUS_M, str(number), fontsize=11, fontweight='bold',
+                      ha='center', va='center', zorder=9, path_effects=EDGED, clip_on=True)
+
+
+# ---- recorded views -----------------------------------------------------------------------------
+
+def _view_of(advice: Advice, landmark_map: LandmarkMap, detections: PosedDetections,
+             shown: Sequence[NDArray[np.int64]], image_of: ImageOf) -> tuple[bytes, str] | None:
+    """Return a JPEG of the view that shows best what the advice is about, and its caption.
+
+    That is the best view of a landmark, with its outline and the boxes, or the view nearest to
+    that of the advice. ``shown`` are the boxes of each landmark. None: no image shows it.
+    """
+    rows = [landmark_map.landmark_ids.index(landmark) for landmark in advice.landmarks]
+    words, frames = 'the nearest recorded view', list[int]()
+    if rows:
+        words = 'outlined: ' + ' and '.join(advice.landmarks)
+        frames = [sighting.view for sighting in find_sightings(
+            detections, shown[rows[0]], landmark_map.centers[rows[0]],
+            landmark_map.shapes[rows[0]], len(detections))]
+    elif advice.view is not None:
+        poses = detections.map_from_camera
+        cosines = np.clip(poses[:, :3, 2] @ advice.view.forward, -1.0, 1.0)
+        different = (np.linalg.norm(poses[:, :3, 3] - advice.view.position, axis=1)
+                     + np.degrees(np.arccos(cosines)) / _DEGREES_PER_M)
+        frames = [frame for frame in np.argsort(different).tolist()
+                  if different[frame] < _MOST_DIFFERENT]
+    found = next(((frame, image) for frame in frames
+                  if (image := image_of(frame)) is not None), None)
+    if found is None:
+        return None
+    frame, image = found
+    outlines = outlines_in_view(detections, frame, landmark_map.centers[rows],
+                                landmark_map.shapes[rows])
+    drawn, thin = image.copy(), 1 + image.shape[1] // 640
+    boxes = detections.detections_of(frame).bboxes_xyxy.reshape(-1, 2, 2)
+    for first, second in np.rint(boxes).astype(int).tolist():
+        cv2.rectangle(drawn, first, second, _BOX_RGB, thin, cv2.LINE_AA)
+    for outline in outlines[np.isfinite(outlines).all(axis=1)]:
+        points = np.rint(outline_points(outline)).clip(-9999, 9999).astype(np.int32)
+        cv2.polylines(drawn, [points], True, _OUTLINE_RGB, 2 * thin, cv2.LINE_AA)
+    if rows:  # a crop, so that a small landmark is visible
+        drawn = crop_around(drawn, ellipse_bboxes(outlines[:1])[0], _AROUND)
+    seconds = detections.stamps_s[frame] - detections.stamps_s[0]
+    return html.jpeg_of(drawn, _WIDTH_PX), f'{words}; image at {seconds:.0f} s'

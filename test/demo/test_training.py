@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Train the demo's networks: CLIP's loss decreases, and the files load like any CLIP and YOLO."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from cliploc_ros.models.clip_encoder import load_encoder
+from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import DetectorOptions
+from demo.world import train_clip, train_detector
+from demo.world.appearance import CLASSES
+
+pytestmark = pytest.mark.full
+
+
+@pytest.fixture(scope='module')
+def worlds(tmp_path_factory):
+    """Two worlds of three images: one to train on, one held out."""
+    folder = tmp_path_factory.mktemp('worlds')
+    subprocess.run(
+        [sys.executable, '-m', 'demo.world.make_worlds', str(folder), '--count', '2',
+         '--frames', '3', '--seed', '40'], cwd=Path(__file__).parents[2], check=True, timeout=300)
+    return folder
+
+
+def test_it_learns_and_is_saved_as_any_clip(worlds, tmp_path, capsys):
+    model, tokenizer, preprocess = train_clip.make_model(train_clip.CONFIG, seed=0)
+    objects = list(train_clip.read_crops(worlds / 'world_000').values())
+    assert len(objects) > 10
+    losses = train_clip.train(objects, model, tokenizer, preprocess, steps=12, batch=16, seed=0)
+    assert np.mean(losses[-3:]) < np.mean(losses[:3]) - 0.1
+    file = tmp_path / 'clip.safetensors'
+    train_clip.save(model, file)
+    labels = ('a red mug', 'a blue box with white dots')
+    encoder, embeddings = load_encoder(
+        ClipOptions(model=str(train_clip.CONFIG), pretrained=str(file),
+                    cache_dir=str(tmp_path)), labels)
+    model.eval()
+    with torch.no_grad():
+        wanted = model.encode_text(tokenizer(list(labels)), normalize=True).numpy()
+    np.testing.assert_allclose(embeddings, wanted, atol=5e-3)  # half precision on disk
+    crop = objects[0][0]
+    image = np.asarray(crop.image)
+    box = np.array([[0, 0, image.shape[1] - 1, image.shape[0] - 1]], dtype=float)
+    assert encoder.encode_crops(image, box).shape == (1, 128)
+
+
+def test_the_command_writes_a_detector(worlds, tmp_path, capsys):
+    file = tmp_path / 'yolo.pt'
+    assert train_detector.run([str(worlds), '--out', str(file), '--epochs', '1', '--imgsz', '160',
+                               '--batch', '2']) == 0
+    assert re.search(r'1 worlds held out: mAP50 0\.\d+', capsys.readouterr().out)
+    assert file.stat().st_size < 3e6
+    assert str(tmp_path).encode() not in file.read_bytes()
+    detector = load_detector(DetectorOptions(model=str(file), conf=0.0, max_det=5))
+    assert detector.class_names == CLASSES
+    found = detector.detect(np.full((480, 640, 3), 128, dtype=np.uint8))
+    assert found.bboxes_xyxy.shape[1] == 4
