@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 
 ASSETS = Path(__file__).resolve().parents[1] / 'demo/assets'
 WALK = ASSETS / 'mapping'

@@ -11,7 +11,7 @@ import numpy as np
 
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagWriter, typestore
-from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.parsing import find_camera
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum
 

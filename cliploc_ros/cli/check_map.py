@@ -12,8 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from cliploc_ros import command
-from cliploc_ros.cli.map_layer import add_use_option, read_layer
-from cliploc_ros.cli.options import add_topic_options
+from cliploc_ros.cli.options import add_topic_options, add_use_option, read_layer
 from cliploc_ros.command import option
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, OptionsError
@@ -21,7 +20,7 @@ from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
-    from cliploc_ros.offline.datasets.images import Images
+    from cliploc_ros.offline.datasets.map_recording import Images
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 _ADVICE_SHOWN = 8
@@ -169,8 +168,11 @@ def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections
 def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':
     """Return the recording of the command line or of the map, and its images if they are found."""
     from cliploc_ros.offline.datasets.bag_frames import BagTopics
-    from cliploc_ros.offline.datasets.images import images_of_recording, open_images
-    from cliploc_ros.offline.datasets.map_recording import load_recording
+    from cliploc_ros.offline.datasets.map_recording import (
+        images_of_recording,
+        load_recording,
+        open_images,
+    )
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.recording.recorder import source_of
 

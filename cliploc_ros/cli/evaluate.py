@@ -13,14 +13,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.options import (
     add_folders,
     add_network_options,
     add_reading_options,
+    add_use_option,
     check_folder_options,
     folder_of,
     given_options,
+    read_layer,
 )
 from cliploc_ros.command import SEEDS, limit, not_negative, option, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions

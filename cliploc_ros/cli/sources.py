@@ -21,9 +21,14 @@ from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
 from cliploc_ros.models.profiles import with_detector, with_encoder
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets import bag_frames, bag_poses
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
-from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, join_frames, move_frames
+from cliploc_ros.offline.datasets.frames import (
+    DepthFormat,
+    FolderOptions,
+    Frames,
+    join_frames,
+    move_frames,
+)
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers

@@ -12,8 +12,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cliploc_ros.cli.map_layer import read_layer
-from cliploc_ros.cli.options import add_topic_options
+from cliploc_ros.cli.options import add_topic_options, read_layer
 from cliploc_ros.command import needs_ros, option, run_main, within
 from cliploc_ros.errors import OptionsError
 
@@ -106,12 +105,12 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     from cliploc_ros.cli.sources import find_topics
     from cliploc_ros.offline.datasets.bag_frames import BagTopics
     from cliploc_ros.offline.datasets.folders import find_layout
-    from cliploc_ros.offline.datasets.images import (
+    from cliploc_ros.offline.datasets.map_recording import (
         images_of_recording,
+        load_recording,
         open_images,
         views_of_folder,
     )
-    from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.studio.document import Document
     from cliploc_ros.offline.studio.recording import Recording

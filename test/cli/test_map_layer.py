@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cliploc_ros.cli.build_map import make_parser
-from cliploc_ros.cli.map_layer import layer_options
+from cliploc_ros.cli.options import layer_options
 from cliploc_ros.cli.sources import read_frames
 from cliploc_ros.core.keyframes.layer import load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap

@@ -17,8 +17,8 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.mapping.building import build_map as build
 from cliploc_ros.offline.mapping.check.checking import check_map as check

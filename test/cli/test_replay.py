@@ -24,12 +24,12 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.cli.tum_to_bag import main
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import LATCHED_QOS, BagReader, BagWriter
-from cliploc_ros.offline.datasets.intrinsics import PRESETS
-from cliploc_ros.offline.datasets.tum import read_tum
-from cliploc_ros.offline.datasets.tum_conversion import (
+from cliploc_ros.offline.datasets.parsing import PRESETS
+from cliploc_ros.offline.datasets.tum import (
     ConversionOptions,
     convert_tum,
     read_recorded_detections,
+    read_tum,
 )
 
 CLASSES = {'/image': Image, '/image/compressed': CompressedImage, '/camera_info': CameraInfo,

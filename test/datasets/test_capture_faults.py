@@ -16,8 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cliploc_ros.errors import CliplocError, DatasetError
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 
 pytestmark = pytest.mark.needs('pycolmap')
 METRES = FolderOptions(scale=1.0)

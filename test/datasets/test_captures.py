@@ -24,14 +24,13 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.make_map import scale_of_objects
 from cliploc_ros.offline.mapping.options import MappingOptions
-from cliploc_ros.offline.recording.networks import RunNetworks
-from cliploc_ros.offline.recording.recorder import record_every_frame
+from cliploc_ros.offline.recording.recorder import RunNetworks, record_every_frame
 
 pytestmark = pytest.mark.needs('pycolmap')
 METRES = FolderOptions(scale=1.0)

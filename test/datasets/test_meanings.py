@@ -22,8 +22,8 @@ from cliploc_ros.messages import image_from_msg
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 from cliploc_ros.offline.datasets.bag_poses import PoseSource
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 
 pytestmark = pytest.mark.needs('pycolmap')

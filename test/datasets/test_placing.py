@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import agreement
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import AXES, check_axes, find_layout, read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.mapping.tilt import find_vertical
 
 pytestmark = pytest.mark.needs('pycolmap')

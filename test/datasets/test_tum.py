@@ -14,15 +14,23 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
-from cliploc_ros.offline.datasets.frames import DepthFormat
-from cliploc_ros.offline.datasets.images import open_images
-from cliploc_ros.offline.datasets.intrinsics import PRESETS, find_camera, read_camera
-from cliploc_ros.offline.datasets.parsing import parse_stamp_ns, pose_of, read_numbers
+from cliploc_ros.offline.datasets.frames import DepthFormat, FolderOptions
+from cliploc_ros.offline.datasets.map_recording import open_images
+from cliploc_ros.offline.datasets.parsing import (
+    PRESETS,
+    find_camera,
+    parse_stamp_ns,
+    pose_of,
+    read_camera,
+    read_numbers,
+)
 from cliploc_ros.offline.datasets.poses import TimedPoses, mount_from_numbers
-from cliploc_ros.offline.datasets.tum import read_tum, read_tum_trajectory
-from cliploc_ros.offline.datasets.tum_conversion import read_recorded_detections
+from cliploc_ros.offline.datasets.tum import (
+    read_recorded_detections,
+    read_tum,
+    read_tum_trajectory,
+)
 from cliploc_ros.offline.recording.recorder import check_depth_unit
 
 MS = 1_000_000

@@ -15,9 +15,8 @@ from cliploc_ros.core.geometry.depth_image import DepthImage
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, load_layer_of_map, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
-from cliploc_ros.offline.datasets.frames import Frames, PosedImage, RawFrame
+from cliploc_ros.offline.datasets.frames import FolderOptions, Frames, PosedImage, RawFrame
 from cliploc_ros.offline.recording.keyframe_layer import (
     LayerOptions,
     build_layer,

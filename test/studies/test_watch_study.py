@@ -15,9 +15,8 @@ from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 from cliploc_ros.offline.datasets.bag_messages import pose_message, stamp_ns
 from cliploc_ros.offline.datasets.bag_poses import PoseSource, bag_odometry
 from cliploc_ros.offline.datasets.bags import BagReader, BagWriter
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.tum import read_tum
-from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
+from cliploc_ros.offline.datasets.parsing import find_camera
+from cliploc_ros.offline.datasets.tum import ConversionOptions, convert_tum, read_tum
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, record_once
 from cliploc_ros.ros.conversions import pose_from_msg
 from studies.watch.__main__ import run

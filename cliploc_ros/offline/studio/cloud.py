@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.depth_image import points_in_color
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
-from cliploc_ros.offline.datasets.images import Images
+from cliploc_ros.offline.datasets.map_recording import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.viewpoint import Bounds

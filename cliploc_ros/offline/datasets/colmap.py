@@ -16,8 +16,14 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.storage import open_file
 from cliploc_ros.offline.datasets import parsing
-from cliploc_ros.offline.datasets.captures import capture
-from cliploc_ros.offline.datasets.frames import NO_STAMP, ImageFile
+from cliploc_ros.offline.datasets.frames import (
+    IMAGES,
+    NO_STAMP,
+    Capture,
+    FolderOptions,
+    ImageFile,
+    beside,
+)
 
 _PLACES = ('.', 'sparse', 'sparse/0', 'sparse/1', 'colmap/sparse/0', 'model', 'colmap',
            'distorted/sparse', 'distorted/sparse/0')  # the last two of 3D Gaussian splatting
@@ -65,7 +71,7 @@ class _Posed(NamedTuple):
     pose: NDArray[np.float64] | None  #: (4, 4): map_from_camera
 
 
-def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture:
+def read_colmap(folder: Path, options: FolderOptions) -> Capture:
     """Read the images of a model, or of the largest model of a project.
 
     The folder is that of the model (cameras and images, .bin or .txt), or that of the project.
@@ -93,11 +99,11 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
         notes.append(f'the model is in {len(models)} pieces: {model.name} with '
                      f'{len(found[model])} images is used, {rest} images of the others are not')
     first = found[model][0].name if found[model] else ''
-    beside = ('input', 'images') if _is_distorted(model, folder) else ('images', 'input')
+    names = ('input', 'images') if _is_distorted(model, folder) else ('images', 'input')
     roots = [options.images] if options.images else [
-        *(above / name for above in (folder, *model.resolve().parents[:3]) for name in beside),
+        *(above / name for above in (folder, *model.resolve().parents[:3]) for name in names),
         folder]
-    root = next((path for path in roots if capture.beside(path / first)),
+    root = next((path for path in roots if beside(path / first)),
                 next((path for path in roots if path.is_dir()), folder))
     files = []
     for image in found[model]:
@@ -105,12 +111,12 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
             raise DatasetError(f'{model}: image {image.name} is of camera {image.camera_id}, '
                                'which the model does not have')
         color = root / image.name
-        if capture.beside(color) is None:  # a path of another operating system
-            color = next(filter(None, (capture.beside(root / name) for name in (
+        if beside(color) is None:  # a path of another operating system
+            color = next(filter(None, (beside(root / name) for name in (
                 image.name.replace('\\', '/'), PureWindowsPath(image.name).name))), color)
         files.append(ImageFile(NO_STAMP, color, cameras[image.camera_id], image.pose))
-    there = sum(file.suffix.lower() in capture.IMAGES for file in root.rglob('*'))
-    return capture.Capture.of(files, model, 'opencv', is_metric=False, notes=notes, images=there)
+    there = sum(file.suffix.lower() in IMAGES for file in root.rglob('*'))
+    return Capture.of(files, model, 'opencv', is_metric=False, notes=notes, images=there)
 
 
 def _check_same(model: Path, cameras: Mapping[int, Camera], images: Sequence[_Posed]) -> None:
