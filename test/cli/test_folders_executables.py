@@ -44,8 +44,7 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     assert run(build_map, *arguments, '--known-distance', first.path.name, last.path.name,
                distance_m) == 0
     shown = capsys.readouterr().out
-    assert '30 of 30 images' in shown
-    assert '0.4 m' in shown
+    assert '30 of 30 images' in shown and '0.4 m' in shown
     landmarks = LandmarkMap.from_file(built)
     # keyframes have the camera of their image, and the poses of the map
     layer = load_layer_of_map(layer_path(built), landmarks)
@@ -65,8 +64,6 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     studio = open_studio(make_parser().parse_args([str(built), '--images', str(walk)]))
     try:
         assert studio.views == 12 and studio.recording.detections.cameras[0].fx == 500.0
-        assert open_images(walk, None).near(float(
-            studio.recording.detections.stamps_s[3])).shape == (480, 640, 3)
     finally:
         studio.document.close()
     # the studio shows each image through the camera of its boxes, whatever focal length it states

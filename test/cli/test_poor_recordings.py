@@ -22,7 +22,7 @@ from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.mapping.building import build_map as build
 from cliploc_ros.offline.mapping.check.checking import check_map as check
-from cliploc_ros.offline.mapping.options import MappingOptions
+from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
 
 
 def test_a_map_of_keyframes_alone(shared_data, tmp_path, capsys):
@@ -79,7 +79,8 @@ def test_what_moves_is_no_landmark(office, tmp_path, capsys):
     built = build(crowded)
     assert 'person' not in built.landmark_map.class_ids
     assert any('person are not landmarks' in note for note in built.report.notes)
-    report = check(plain, crowded)
+    report = check(plain, crowded, CheckOptions(
+        folds=2, frames=1, max_positions=1, headings=1))
     faults = {landmark.landmark_id: landmark for landmark in report.landmarks}
     assert all(faults[name].severity >= 1.0 for name, kind in zip(
         plain.landmark_ids, plain.class_ids, strict=True) if kind == 'person')

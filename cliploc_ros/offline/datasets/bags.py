@@ -107,7 +107,7 @@ class BagReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._reader: Reader  # while it is open
-        self._topics: dict[str, BagTopic] = {}
+        self.topics: Mapping[str, BagTopic] = {}  #: Topics by name
         #: Reasons and times of unusable messages, by topic
         self.left_out: dict[str, dict[str, None]] = {}
         self.notes: list[str] = []  #: Notes for the user about the recording
@@ -128,7 +128,7 @@ class BagReader:
             raise self._unreadable(error) from error
         self._reader = reader
         try:
-            self._topics = self._collect_topics(reader.connections)
+            self.topics = self._collect_topics(reader.connections)
         except BaseException:
             reader.close()
             raise
@@ -140,14 +140,9 @@ class BagReader:
         self._reader.close()
 
     @property
-    def topics(self) -> Mapping[str, BagTopic]:
-        """Topics by name."""
-        return self._topics
-
-    @property
     def message_count(self) -> int:
         """Number of messages on all topics."""
-        return sum(topic.message_count for topic in self._topics.values())
+        return sum(topic.message_count for topic in self.topics.values())
 
     @property
     def start_ns(self) -> int:
@@ -165,11 +160,11 @@ class BagReader:
 
         DatasetError: the recording has no topic of that name; the message lists its topics.
         """
-        if name not in self._topics:
+        if name not in self.topics:
             recorded = ', '.join(f'{topic.name} ({topic.msgtype})'
-                                 for topic in self._topics.values())
+                                 for topic in self.topics.values())
             raise DatasetError(f'{self.path}: has no topic {name}; it has {recorded or "none"}')
-        return self._topics[name]
+        return self.topics[name]
 
     def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None,
                  stop_ns: int | None = None) -> Iterator[BagMessage]:
@@ -184,7 +179,7 @@ class BagReader:
         start_ns, stop_ns : int, optional
             Yield only messages at or after start_ns and before stop_ns [ns].
         """
-        names = self._topics if topics is None else topics
+        names = self.topics if topics is None else topics
         connections = self._connections({self.topic(name).name for name in names})
         if not connections:
             return
@@ -270,11 +265,9 @@ class BagReader:
         metadata.yaml, and users edit metadata.yaml to repair QoS. The connections of the files
         always match.
         """
-        reader = self._reader
-        files = getattr(reader.storage, 'storages', [])
-        handles = [*reader.connections,
-                   *(connection for file in files for connection in file.connections)]
-        return [handle for handle in handles if handle.topic in names]
+        files = getattr(self._reader.storage, 'storages', [])
+        return [connection for part in (self._reader, *files) for connection in part.connections
+                if connection.topic in names]
 
     def _unreadable(self, error: Exception) -> DatasetError:
         name = '' if isinstance(error, ReaderError) else f'{type(error).__name__}: '

@@ -159,13 +159,13 @@ def _cameras(model: Path, kind: str = '') -> Iterator[tuple[int, Camera]]:
             yield number, _camera(where, _BY_NAME.get(name, -1), name, (width, height),
                                   parsing.parse_all(cells[2:], float, where))
         return
-    with _Bytes(binary) as data:
-        for place in range(data.count(24)):
-            camera_id, number, width, height = data.take('<IiQQ')
-            name = _OTHERS.get(number, f'number {number}')
-            values = data.take(f'<{_MODELS[number].length}d') if number in _MODELS else ()
-            yield camera_id, _camera(f'{binary}: camera {place}', number, name, (width, height),
-                                     values)
+    data = _Bytes(binary)
+    for place in range(data.count(24)):
+        camera_id, number, width, height = data.take('<IiQQ')
+        name = _OTHERS.get(number, f'number {number}')
+        values = data.take(f'<{_MODELS[number].length}d') if number in _MODELS else ()
+        yield camera_id, _camera(f'{binary}: camera {place}', number, name, (width, height),
+                                 values)
 
 
 def _camera(where: str, number: int, name: str, size: tuple[int, int], values: Sequence[float]
@@ -200,12 +200,12 @@ def _images(model: Path, kind: str = '') -> Iterator[_Posed]:
             yield _posed(cells[9], parsing.parse_all(cells[8:9], int, where)[0],
                          parsing.parse_all(cells[1:8], float, where), where)
         return
-    with _Bytes(binary) as data:
-        for _ in range(data.count(73)):
-            _, *numbers, camera_id = data.take('<I7dI')
-            name = data.name()
-            data.skip(24 * data.take('<Q')[0])
-            yield _posed(name, camera_id, numbers, f'{binary}: image {name}')
+    data = _Bytes(binary)
+    for _ in range(data.count(73)):
+        _, *numbers, camera_id = data.take('<I7dI')
+        name = data.name()
+        data.skip(24 * data.take('<Q')[0])
+        yield _posed(name, camera_id, numbers, f'{binary}: image {name}')
 
 
 def _posed(name: str, camera_id: int, numbers: Sequence[float], where: str) -> _Posed:
@@ -224,12 +224,6 @@ class _Bytes:
         with (parsing.naming(path, OSError, ValueError, what='cannot be read: '),
               open_file(path) as file):
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-
-    def __enter__(self) -> '_Bytes':
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._data.close()
 
     def count(self, least_bytes: int) -> int:
         """Read the number of entries that follow, each of at least this size."""
