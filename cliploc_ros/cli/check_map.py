@@ -56,13 +56,6 @@ def make_parser() -> argparse.ArgumentParser:
            command.positive_int, 1)
     option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
     add_use_option(parser, 'report what the keyframes next to the map reach')
-    _add_relocalizer_options(parser)
-    _add_thresholds(parser)
-    add_topic_options(parser.add_argument_group('images of a bag'))
-    return parser
-
-
-def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
     option(group, '--frames N', 'greatest number of recorded frames to relocalize (%(default)s)',
            command.positive_int, CheckOptions.frames)
@@ -79,9 +72,6 @@ def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--gravity', 'the robot knows the vertical')
     option(group, '--min-confidence', 'min_confidence of the relocalizer (%(default)s)',
            command.within(0.0, 1.0), RelocalizerOptions().min_confidence)
-
-
-def _add_thresholds(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('thresholds; if the map misses one, the exit code is 1')
     share, count = command.within(0.0, 1.0), command.within(0, 10**9)
     for name, kind, text in (
@@ -96,6 +86,8 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
             ('max_look_alikes', count, 'pairs of places that look alike')):
         group.add_argument(f'--{name.replace("_", "-")}', type=kind, metavar='N',
                            default=getattr(Thresholds, name), help=f'{text} (%(default)s)')
+    add_topic_options(parser.add_argument_group('images of a bag'))
+    return parser
 
 
 def check(options: argparse.Namespace) -> int:

@@ -110,7 +110,8 @@ def read_source(options: argparse.Namespace) -> Source:
     find_topics(options, options.bag)
     if options.observations is not None:
         return Source(load_observations(options.observations), options.observations, None)
-    frames = read_frames(options)
+    of_cameras = read_cameras(options)
+    frames = of_cameras[''] if '' in of_cameras else join_frames(of_cameras)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
     recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))
     file = options.record_to or recorder.observation_file(frames, recording)
@@ -179,12 +180,6 @@ def source_of(options: argparse.Namespace) -> Path:
     """Return the folder or file that the command line names."""
     found = folder_of(options)
     return found[0] if found is not None else Path(options.bag or options.observations)
-
-
-def read_frames(options: argparse.Namespace) -> Frames:
-    """Return the images of all cameras of the source, see read_cameras."""
-    of_cameras = read_cameras(options)
-    return of_cameras[''] if '' in of_cameras else join_frames(of_cameras)
 
 
 def read_cameras(options: argparse.Namespace, gap_s: float | None = None, *,

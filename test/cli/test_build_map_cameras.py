@@ -38,7 +38,7 @@ def built(bag):
         paths[names] = path = bag.with_name(f'{len(names)}.yaml')
         assert run(build_map, '--bag', bag, '--cameras', *names, *NETWORKS, '--map-frame', 'map',
                    '--out', path, '--record-to', path.with_suffix('.npz'),
-                   '--keyframe-points', 500) == 0
+                   '--keyframe-points', 200) == 0
     return paths
 
 
@@ -76,7 +76,7 @@ def test_each_camera_has_keyframes(built):
     # small images have fewer features
     assert np.bincount(layer.camera_rows).tolist() == pytest.approx([18, 6], abs=1)
     assert {layer.camera_of(row).width for row in range(len(layer))} == {320, 640}
-    assert np.diff(layer.offsets).max() == 500
+    assert np.diff(layer.offsets).max() == 200
     for row in range(len(layer)):  # the points lie where the keyframe shows them
         points, camera = layer.points[layer.rows(row)], layer.camera_of(row)
         pixels = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)

@@ -19,7 +19,7 @@ import pytest
 from cliploc_ros.cli import evaluate
 from cliploc_ros.cli.build_map import make_parser
 from cliploc_ros.cli.options import layer_options, read_layer
-from cliploc_ros.cli.sources import read_frames
+from cliploc_ros.cli.sources import read_cameras
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import SIFT
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, save_layer
@@ -209,7 +209,7 @@ def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch,
     options = make_parser().parse_args([
         '--tum', str(ASSETS / 'mapping'), '--keyframe-features', 'xfeat', '--keyframe-layer',
         '--out', str(tmp_path / 'map.yaml')])
-    save_layer(layer_path(options.out), build_layer(read_frames(options), landmark_map,
+    save_layer(layer_path(options.out), build_layer(read_cameras(options)[''], landmark_map,
                                                     layer_options(options)[0]))
     layer = read_layer(options.out, landmark_map, wanted=True)
     assert layer.kind.dimensions == 64

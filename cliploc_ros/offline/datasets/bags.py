@@ -6,11 +6,10 @@ rosbag2_py is not on PyPI, but recordings are also read and written without ROS.
 of replay, this module imports little.
 """
 
-import shutil
 import sqlite3
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -294,42 +293,35 @@ class BagWriter:
         if storage not in STORAGES:
             raise DatasetError(f'storage {storage!r} is not one of {", ".join(STORAGES)}')
         self._storage = STORAGES[storage]
-        self._staging: Path | None = None
         self._writer: Writer  # while it is open
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> Self:
         """Begin the recording next to its final path."""
         self._check_free()
-        try:
-            with self._naming_failures():
-                self._staging = Path(tempfile.mkdtemp(
-                    prefix=f'.{self.path.name}.', suffix='.partial', dir=self.path.parent))
-                self._writer = Writer(self._staging / self.path.name, version=9,
-                                      storage_plugin=self._storage)
-                self._writer.open()
-        except BaseException:  # Ctrl-C, too
-            self._discard()
-            raise
+        with ExitStack() as begun, self._naming_failures():
+            self._staging = Path(begun.enter_context(tempfile.TemporaryDirectory(
+                '.partial', f'.{self.path.name}.', self.path.parent, ignore_cleanup_errors=True)))
+            self._writer = Writer(self._staging / self.path.name, version=9,
+                                  storage_plugin=self._storage)
+            begun.callback(self._abort)
+            self._writer.open()
+            self._removal = begun.pop_all()  # of the folder, at the end
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         """Complete the recording and move it to its final path, or remove it."""
-        assert self._staging is not None
-        is_complete = False
-        try:
+        with self._removal:
             if kind is None:
                 with self._naming_failures():
                     self._writer.close()
                     self._check_free()  # another process may have written it meanwhile
                     (self._staging / self.path.name).rename(self.path)
-                is_complete = True
-        finally:
-            if not is_complete:
-                with suppress(Exception):  # the first exception is the one to report
-                    self._writer.abort()
-            self._discard()
+
+    def _abort(self) -> None:
+        with suppress(Exception):  # the first exception is the one to report
+            self._writer.abort()  # does nothing after close
 
     def add_topic(self, name: str, msgtype: str, qos: Qos = RELIABLE_QOS) -> None:
         """Declare a topic before its first message.
@@ -358,11 +350,6 @@ class BagWriter:
             raise DatasetError(f'{self.path}: already exists and is not overwritten')
         if not self.path.parent.is_dir():
             raise DatasetError(f'{self.path}: the folder {self.path.parent} does not exist')
-
-    def _discard(self) -> None:
-        if self._staging is not None:
-            shutil.rmtree(self._staging, ignore_errors=True)
-            self._staging = None
 
     @contextmanager
     def _naming_failures(self) -> Iterator[None]:
