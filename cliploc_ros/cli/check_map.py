@@ -159,12 +159,8 @@ def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections
 
 def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':
     """Return the recording of the command line or of the map, and its images if they are found."""
-    from cliploc_ros.offline.datasets.bag_frames import BagTopics
-    from cliploc_ros.offline.datasets.map_recording import (
-        images_of_recording,
-        load_recording,
-        open_images,
-    )
+    from cliploc_ros.cli.sources import images_at
+    from cliploc_ros.offline.datasets.map_recording import images_of_recording, load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.recording.recorder import source_of
 
@@ -184,9 +180,8 @@ def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Imag
     images = None
     try:
         if (path := options.images or source) is not None:
-            images = open_images(
-                path, BagTopics(options.image, options.camera_info, options.rectified),
-                detections.camera_names if options.cameras == [''] else options.cameras)
+            images = images_at(options, path, detections.camera_names
+                               if options.cameras == [''] else options.cameras)
         elif recording is not None:
             images = images_of_recording(recording, detections.camera_names)
     except CliplocError as error:

@@ -118,8 +118,7 @@ def add_network_options(group: Any) -> None:
     option(group, '--no-clip', 'run no CLIP: boxes and classes only', dest='clip',
            action='store_false')
     option(group, '--scheduler ADDRESS', 'address of a Dask cluster, used instead of local '
-           'processes',
-           default='')
+           'processes', default='')
 
 
 def add_weights_options(group: Any) -> None:

@@ -3,6 +3,7 @@
 """Read the recording that the command line names, see cli.options."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
 from cliploc_ros.models.profiles import with_detector, with_encoder
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets import bag_frames, bag_poses
-from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
+from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import (
     DepthFormat,
     FolderOptions,
@@ -29,7 +30,12 @@ from cliploc_ros.offline.datasets.frames import (
     join_frames,
     move_frames,
 )
-from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
+from cliploc_ros.offline.datasets.map_recording import (
+    Images,
+    MapRecording,
+    load_recording,
+    open_images,
+)
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
@@ -88,6 +94,17 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
         options.image, options.camera_info = bag_frames.find_topics(bag, options.image,
                                                                     options.camera_info)
         print(f'{bag}: {" and ".join(getattr(options, name) for name in open_topics)}', flush=True)
+
+
+def images_at(options: argparse.Namespace, path: Path, cameras: Sequence[str]) -> Images:
+    """Open the images of cameras in a folder or bag, with the topics of the command line.
+
+    DatasetError: the path is neither, or a topic that the command line does not name is ambiguous.
+    """
+    is_folder = path.exists() and find_layout(path) is not None
+    find_topics(options, None if is_folder or [*cameras] != [''] else path)
+    return open_images(path, bag_frames.BagTopics(
+        options.image, options.camera_info, options.rectified), cameras)
 
 
 class Source(NamedTuple):

@@ -102,13 +102,11 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
 
 def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
-    from cliploc_ros.cli.sources import find_topics
-    from cliploc_ros.offline.datasets.bag_frames import BagTopics
+    from cliploc_ros.cli.sources import images_at
     from cliploc_ros.offline.datasets.folders import find_layout
     from cliploc_ros.offline.datasets.map_recording import (
         images_of_recording,
         load_recording,
-        open_images,
         views_of_folder,
     )
     from cliploc_ros.offline.datasets.observations import load_observations
@@ -128,10 +126,7 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     elif built_from is not None:
         detections = built_from.load()
     if options.images is not None:
-        cameras = _cameras(options, detections)
-        find_topics(options, options.images if not is_folder and cameras == [''] else None)
-        topics = BagTopics(options.image, options.camera_info, options.rectified)
-        images = open_images(options.images, topics, cameras)
+        images = images_at(options, options.images, _cameras(options, detections))
     elif built_from is not None and detections is not None:
         images = images_of_recording(built_from, _cameras(options, detections))
     if detections is None and options.images is not None:

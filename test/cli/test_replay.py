@@ -405,9 +405,9 @@ def test_small_sequence_round_trip(sequence, tmp_path, run_here, storage, form):
 
 def test_accelerations_become_an_imu(sequence, tmp_path, run_here):
     (sequence.folder / 'accelerometer.txt').write_text('# t a\n1.25 0.5 7 -5\n1.5 0.25 8 -6\n')
-    done = run_here(main, sequence.folder, tmp_path / 'bag')
+    done = run_here(main, sequence.folder, tmp_path / 'bag', '--every', 2)
     assert done.returncode == 0, done.stderr
-    assert '2 accelerations' in done.stdout
+    assert '2 images' in done.stdout and '2 accelerations' in done.stdout
     first, second = read_all(tmp_path / 'bag')['/imu']
     assert bag_messages.stamp_ns(first) == 1_250_000_000
     assert first.header.frame_id == 'imu'

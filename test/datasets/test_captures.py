@@ -12,7 +12,6 @@ import shutil
 import struct
 import time
 import tracemalloc
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -67,15 +66,10 @@ def look():
 
 
 @pytest.fixture(scope='session')
-def recorded(look):
-    """Return the detections of the walk as a TUM folder."""
-    return record_every_frame(read_folder(WALK, FolderOptions(layout='tum')), look)
-
-
-@pytest.fixture(scope='session')
-def original(recorded):
-    """Its map."""
-    return build_map(recorded, OPTIONS).landmark_map
+def original(look):
+    """Return the map of the walk as a TUM folder."""
+    return build_map(record_every_frame(read_folder(WALK, FolderOptions(layout='tum')), look),
+                     OPTIONS).landmark_map
 
 
 @pytest.fixture(scope='session')
@@ -84,8 +78,7 @@ def shots():
 
 
 @pytest.mark.parametrize('layout', WRITERS)
-def test_what_is_seen_and_from_where_is_that_of_the_original(layout, shots, look, recorded,
-                                                             tmp_path):
+def test_what_is_seen_and_from_where_is_that_of_the_original(layout, shots, tmp_path):
     folder = WRITERS[layout](tmp_path / 'scan', shots)
     assert find_layout(folder).name == layout
     frames = read_folder(folder, METRES)
@@ -95,19 +88,13 @@ def test_what_is_seen_and_from_where_is_that_of_the_original(layout, shots, look
         np.testing.assert_allclose(raw.color.args[0].camera.matrix, shot.camera.matrix, atol=1e-6)
         if layout not in ('COLMAP model', 'transforms.json'):
             assert abs(raw.stamp_ns - shot.stamp_ns) < 2_000
-    has_depth = layout in ('Polycam', 'Stray Scanner', 'ARKitScenes')
-    assert (raw.depth is not None) == has_depth
-    if has_depth:
+    assert (raw.depth is not None) == (layout in ('Polycam', 'Stray Scanner', 'ARKitScenes'))
+    if raw.depth is not None:
         depths = raw.depth().depths_m
         assert depths.shape == DEPTH_MM.shape and depths[-1, -1] == 2.0
         # where Polycam's confidence is low
         assert np.isnan(depths[0, 0]) == (layout == 'Polycam')
-    # flat depth does not match this room
-    seen = record_every_frame(frames, lambda raw: look(replace(raw, depth=None)))
-    assert len(seen.classes) > 200
-    np.testing.assert_array_equal(seen.frames, recorded.frames)
-    np.testing.assert_array_equal(seen.classes, recorded.classes)
-    np.testing.assert_allclose(seen.bboxes_xyxy, recorded.bboxes_xyxy, atol=1e-3)
+    np.testing.assert_array_equal(raw.color()[0], cv2.imread(str(shot.path))[..., ::-1])
 
 
 def test_text_models_and_per_frame_intrinsics_say_the_same(shots, tmp_path):
@@ -128,6 +115,7 @@ def test_text_models_and_per_frame_intrinsics_say_the_same(shots, tmp_path):
 
 @pytest.mark.parametrize(('model', 'values'), [
     ('SIMPLE_RADIAL', [500, 320, 240, 0.1]),
+    ('OPENCV', [500, 505, 318, 244, 0.1, -0.05, 0.001, -0.002]),
     ('FULL_OPENCV', [500, 505, 318, 244, 0.1, -0.05, 0.001, -0.002, 0.01, 0.02, 0.01, 0.003]),
     ('OPENCV_FISHEYE', [300, 305, 318, 244, 0.1, -0.05, 0.01, -0.002]),
     ('FISHEYE', [300, 305, 318, 244])])

@@ -19,6 +19,7 @@ from foreign_maps import (
 )
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.given_map import place, read_table
@@ -103,8 +104,10 @@ def test_scale_and_transform(true_map, tmp_path):
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn.as_matrix(), [5.0, 6.0, 7.0]
     path = write(tmp_path / 'm.csv', table_text(true_map))
-    found, _ = import_all(read_table(path), ('world', 2.0, pose))
-    assert found.frame_id == 'world'
+    given = read_table(path)
+    given.landmarks[0] = given.landmarks[0]._replace(details=LandmarkDetails(position_sigma=0.2))
+    found, _ = import_all(given, ('world', 2.0, pose))
+    assert found.frame_id == 'world' and found.details[0].position_sigma == 0.4
     np.testing.assert_allclose(
         found.centers, turn.apply(2.0 * true_map.centers) + pose[:3, 3], atol=1e-9)
     matrix = turn.as_matrix()

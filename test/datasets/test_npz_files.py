@@ -87,6 +87,7 @@ def become(name, value):
 # ---- both ---------------------------------------------------------------------------------------
 @pytest.mark.parametrize(('change', 'message'), [
     (lambda arrays: arrays.pop('scores'), 'scores is missing'),
+    (become('scores', [0.5, 0.5]), 'scores has shape'),
     (become('class_ids', [1, 2, 3]), 'class_ids has type'),
     (become('frame_offsets', [0, 2, 2, 4]), 'ranges from 0 to 4'),
     (put('boxes_xyxy', (1, 2), np.nan), 'finite in row 1'),

@@ -81,6 +81,7 @@ def test_poses_are_interpolated_within_a_gap(tmp_path):
 
 
 @pytest.mark.parametrize(('camera', 'frame_id', 'topic', 'error', 'note'), [
+    (replace(CAMERA, cx=63.0, cy=47.0), 'camera', '/image', '126x94 px', None),
     (replace(CAMERA, distortion=(-0.3, 0.1, 0.0, 0.0)), 'camera', '/image_rect',
      'rectified is false', None),
     (replace(CAMERA, cx=42.0), 'camera', '/image', None, '84x47 px'),

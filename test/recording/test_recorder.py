@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.cli import check_map
 from cliploc_ros.cli.build_map import main
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
@@ -181,7 +182,8 @@ def test_other_poses_use_the_boxes_again_and_depth_is_stored(walk, recorded, tmp
     file = tmp_path / 'depth.npz'
     command = ('--rgbd', walk, *NETWORKS, '--no-clip', *ALL, '--record-to', file, '--out',
                tmp_path / 'map.yaml')
-    assert main(arguments(*command, '--depth-unit', '1')) == 1
+    for unit_m in (1.0, 1e-7):  # implausible
+        assert main(arguments(*command, '--depth-unit', unit_m)) == 1
     outputs, = tmp_path.glob('.*.outputs')
     rows, moved = np.loadtxt(walk / 'groundtruth.txt'), tmp_path / 'moved.txt'
     rows[:, 1] += 1.0
@@ -223,6 +225,10 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
     assert main(arguments(*linked, '/ground_truth', '--pose-noise', 0.02, 0.5,
                           '--odometry-noise', 0.02, 1)) == 0
     assert 'joins 14 of 14' in capsys.readouterr().out
+    assert check_map.main(arguments(
+        tmp_path / 'map.yaml', '--observations', file, '--images', bag, '--positions', 1,
+        '--headings', 1, '--frames', 1, '--out', tmp_path / 'check')) in (0, 1)
+    assert f'{bag}: /image and /camera_info' in capsys.readouterr().out
     stamp = file.stat().st_mtime_ns
     assert main(arguments(*command, '--pose-topic', '/ground_truth')) == 0
     assert 'odometry' not in capsys.readouterr().out

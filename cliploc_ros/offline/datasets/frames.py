@@ -65,11 +65,6 @@ class RawFrame:
     depth: Callable[[], DepthImage] | None = None  #: Returns the depth image
     camera: str = ''  #: Name of the camera; '' if there is only one
 
-    def __str__(self) -> str:
-        """Return the frame's name for messages."""
-        of = f' of {self.camera}' if self.camera else ''
-        return f'image {self.place}{of} at {self.stamp_ns / NS_PER_S:.6f} s'
-
     def decode(self) -> PosedImage:
         """Decode the frame.
 

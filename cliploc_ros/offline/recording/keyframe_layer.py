@@ -66,10 +66,7 @@ class LayerOptions:
     kind: FeatureKind = SIFT  #: Kind of the features
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        if not (self.distance_m >= 0.0 and self.angle_deg >= 0.0):
-            raise OptionsError(f'keyframes {self.distance_m} m or {self.angle_deg} degrees apart: '
-                               'give 0 or more')
+        """Refuse a number of points out of range."""
         if not _LEAST_POINTS <= self.most_points <= _MOST_FOUND:
             raise OptionsError(f'{self.most_points} points of a keyframe: give {_LEAST_POINTS} '
                                f'to {_MOST_FOUND}')

@@ -30,7 +30,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth_image import PLAUSIBLE_DEPTH_M, depths_of_boxes
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import parse_json
@@ -181,12 +181,6 @@ class KeyframeOptions:
     #: [m] [deg]. 0: every frame with a pose.
     distance_m: float = 0.1
     angle_deg: float = 5.0
-
-    def __post_init__(self) -> None:
-        """Refuse negative values."""
-        if not (self.distance_m >= 0.0 and self.angle_deg >= 0.0):
-            raise OptionsError(f'keyframes {self.distance_m} m or {self.angle_deg} degrees apart: '
-                               'give 0 or more')
 
 
 #: Every frame with a pose.
