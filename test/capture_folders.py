@@ -87,6 +87,14 @@ def write_nerf(folder, shots, per_frame=False, **more):
     return folder
 
 
+def edited(folder, edit):
+    """Change the values of a transforms.json by a function."""
+    values = json.loads((folder / 'transforms.json').read_text())
+    edit(values)
+    (folder / 'transforms.json').write_text(json.dumps(values))
+    return folder
+
+
 def write_polycam(folder, shots):
     root = folder / 'keyframes'
     for name in ('corrected_images', 'corrected_cameras', 'cameras', 'depth', 'confidence'):

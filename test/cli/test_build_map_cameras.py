@@ -4,14 +4,13 @@
 
 import numpy as np
 import pytest
-from rig_bag import MOUNTS, RIG, write_rig_bag
+from rig_bag import MOUNTS, RIG, errors_of, write_rig_bag
 
 from cliploc_ros.cli.build_map import main as build_map
 from cliploc_ros.core.keyframes.layer import load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.tum import read_tum
-from demo.truth import read_objects
 
 ASSETS = RIG.parent
 ALL = tuple(MOUNTS)
@@ -42,16 +41,8 @@ def built(bag):
     return paths
 
 
-def errors_of(path):
-    """Return the distance of each landmark to the nearest true object of its class [m]."""
-    found, objects = LandmarkMap.from_file(path), read_objects(RIG / 'front')
-    return np.array([min(np.linalg.norm(item.center - center) for item in objects
-                         if item.class_id == name)
-                     for center, name in zip(found.centers, found.class_ids, strict=True)])
-
-
 def test_four_cameras_find_more_and_are_as_near_the_truth(built):
-    one, four = errors_of(built['back',]), errors_of(built[ALL])
+    one, four = (errors_of(built[names], RIG / 'front') for names in (('back',), ALL))
     print(f'\nlandmarks, median error: one camera {len(one)}, {1e3 * np.median(one):.0f} mm; '
           f'four {len(four)}, {1e3 * np.median(four):.0f} mm')
     assert len(four) > 1.5 * len(one)

@@ -231,7 +231,7 @@ def test_clock_runs_with_the_messages(tmp_path, listener):
     wait_until(lambda: len(listener.received['/pose']) == 21)
     clocks = [deserialize_message(data, Clock).clock for data in listener.received['/clock']]
     stamps_ns = np.array([clock.sec * 10**9 + clock.nanosec for clock in clocks])
-    assert (np.diff(stamps_ns) > 0).all()
+    assert np.diff(stamps_ns).min() == 20 * MS
     assert stamps_ns[0] >= START_NS and stamps_ns[-1] <= START_NS + 2000 * MS
     # 1 s of real time at 100 Hz; replay skips the ticks that it misses under load.
     assert 50 <= len(stamps_ns) <= 101
@@ -405,7 +405,7 @@ def test_small_sequence_round_trip(sequence, tmp_path, run_here, storage, form):
 
 def test_accelerations_become_an_imu(sequence, tmp_path, run_here):
     (sequence.folder / 'accelerometer.txt').write_text('# t a\n1.25 0.5 7 -5\n1.5 0.25 8 -6\n')
-    done = run_here(main, sequence.folder, tmp_path / 'bag', '--every', 2)
+    done = run_here(main, sequence.folder, tmp_path / 'bag', '--every', 3)
     assert done.returncode == 0, done.stderr
     assert '2 images' in done.stdout and '2 accelerations' in done.stdout
     first, second = read_all(tmp_path / 'bag')['/imu']

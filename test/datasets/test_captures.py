@@ -7,7 +7,6 @@ message that names the necessary fix, whatever the bytes are.
 """
 
 import itertools
-import json
 import shutil
 import struct
 import time
@@ -22,6 +21,7 @@ from capture_folders import (
     FLIP,
     WALK,
     WRITERS,
+    edited,
     shots_of,
     write_colmap,
     write_nerf,
@@ -276,13 +276,6 @@ def refuses(folder, expected, options=METRES):
     with pytest.raises(DatasetError, match=expected):
         for frame in read_folder(folder, options).read():
             assert frame is not None
-
-
-def edited(folder, edit, name='transforms.json'):
-    values = json.loads((folder / name).read_text())
-    edit(values)
-    (folder / name).write_text(json.dumps(values))
-    return folder
 
 
 @pytest.mark.parametrize('name', ['..', 'C:\\', 'a\0b'])

@@ -12,7 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from capture_folders import shots_of, write_colmap, write_nerf
+from capture_folders import edited, shots_of, write_colmap, write_nerf
 from rig_bag import TF, depth_message, make, transform, write_messages
 from scipy.spatial.transform import Rotation
 
@@ -79,14 +79,6 @@ def reads(bag, topics=None, poses=None, depth=None):
 def refuses(expected, bag, *more):
     with pytest.raises(DatasetError, match=expected):
         list(reads(bag, *more).read())
-
-
-def edited(folder, edit):
-    path = folder / 'transforms.json'
-    values = json.loads(path.read_text())
-    edit(values)
-    path.write_text(json.dumps(values))
-    return folder
 
 
 def test_depth_of_transforms_json_is_in_the_unit_of_its_poses(shots, tmp_path):
