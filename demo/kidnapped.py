@@ -32,7 +32,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.watch.watch import WatchState
 from cliploc_ros.messages import detections_from_msg
-from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.parsing import find_camera
 from cliploc_ros.offline.datasets.poses import slerp
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.ros import qos

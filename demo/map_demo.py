@@ -12,16 +12,15 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.map_rows import embed_map
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.offline.evaluation.run import run_methods
 from cliploc_ros.offline.evaluation.summary import Summary, summarize
 from cliploc_ros.offline.evaluation.trials import make_queries, make_queries_of
-from cliploc_ros.offline.recording.networks import LoadNetworks
-from cliploc_ros.offline.recording.recorder import record_every_frame
+from cliploc_ros.offline.recording.recorder import LoadNetworks, record_every_frame
 from demo.map_review import (
     PICTURE,
     console_lines,

@@ -18,8 +18,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
 from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.parsing import parse_stamp_ns
+from cliploc_ros.offline.datasets.parsing import find_camera, parse_stamp_ns
 from cliploc_ros.offline.datasets.tum import TumSequence
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S

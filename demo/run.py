@@ -20,9 +20,8 @@ from rclpy.signals import SignalHandlerOptions
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.files.storage import make_folder
 from cliploc_ros.offline.datasets.bags import BagReader
-from cliploc_ros.offline.datasets.intrinsics import find_camera
-from cliploc_ros.offline.datasets.tum import TumSequence, read_tum
-from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
+from cliploc_ros.offline.datasets.parsing import find_camera
+from cliploc_ros.offline.datasets.tum import ConversionOptions, TumSequence, convert_tum, read_tum
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from demo import page
 from demo.pictures import draw_top_view, draw_wake_up

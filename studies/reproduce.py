@@ -42,7 +42,7 @@ from cliploc_ros.files.storage import make_folder, write_file, write_text
 from cliploc_ros.models.files import download
 from cliploc_ros.offline import page as html
 from cliploc_ros.offline.datasets.folders import find_layout, read_sequence
-from cliploc_ros.offline.datasets.tum_conversion import ConversionOptions, convert_tum
+from cliploc_ros.offline.datasets.tum import ConversionOptions, convert_tum
 from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.run import CAPTIONS, COMPARISON
 from cliploc_ros.offline.evaluation.trials import Result

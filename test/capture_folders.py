@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 
 ASSETS = Path(__file__).resolve().parents[1] / 'demo/assets'
 WALK = ASSETS / 'mapping'
@@ -84,6 +84,14 @@ def write_nerf(folder, shots, per_frame=False, **more):
         shutil.copy(shot.path, folder / 'images')
     (folder / 'transforms.json').write_text(json.dumps({
         **({} if per_frame else intrinsics), 'aabb_scale': 16, 'frames': frames, **more}))
+    return folder
+
+
+def edited(folder, edit):
+    """Change the values of a transforms.json by a function."""
+    values = json.loads((folder / 'transforms.json').read_text())
+    edit(values)
+    (folder / 'transforms.json').write_text(json.dumps(values))
     return folder
 
 

@@ -9,11 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagWriter, typestore
-from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.parsing import find_camera
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum
+from demo.truth import read_objects
 
 RIG = Path(__file__).resolve().parents[1] / 'demo/assets/rig'
 #: By camera: x y z qx qy qz qw on the robot, whose origin is the front camera.
@@ -99,3 +101,11 @@ def write_messages(path, recorded):
         for at, topic, _, message in sorted(recorded, key=lambda one: one[0]):
             bag.write(topic, at, message)
     return path
+
+
+def errors_of(map_file, world):
+    """Return the distance of each landmark to the nearest true object of its class [m]."""
+    found, objects = LandmarkMap.from_file(map_file), read_objects(world)
+    return np.array([min(np.linalg.norm(item.center - center) for item in objects
+                         if item.class_id == name)
+                     for center, name in zip(found.centers, found.class_ids, strict=True)])

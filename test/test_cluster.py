@@ -4,14 +4,25 @@
 
 import os
 import signal
+from contextlib import contextmanager
 from dataclasses import dataclass
 
+import dask
 import pytest
-from clusters import kill_a_worker, local_cluster
+from distributed import LocalCluster
 
 from cliploc_ros.files.parallel import WorkersError, run_tasks
 
 pytestmark = pytest.mark.full
+
+
+@contextmanager
+def local_cluster(workers=2, allowed_failures=3):
+    """Start a scheduler with single-threaded worker processes, which restart when they die."""
+    with (dask.config.set({'distributed.scheduler.allowed-failures': allowed_failures}),
+          LocalCluster(n_workers=workers, threads_per_worker=1, processes=True,
+                       dashboard_address='127.0.0.1:0') as cluster):
+        yield cluster
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +46,7 @@ def test_a_dead_worker_costs_time_only_and_a_deadly_task_is_an_error():
         address = cluster.scheduler_address
         for task, result in run_tasks(Cube(), range(40), scheduler=address):
             if len(found) == 5:
-                kill_a_worker(cluster)
+                os.kill(min(one.pid for one in cluster.workers.values()), signal.SIGKILL)
             found[task] = result
         assert found == {number: number ** 3 for number in range(40)}
         with pytest.raises(WorkersError, match='its workers died'):

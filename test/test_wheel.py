@@ -5,10 +5,8 @@
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-import urllib.request
 import zipfile
 from pathlib import Path
 
@@ -22,7 +20,7 @@ PROJECT = Path(__file__).resolve().parents[1]
 ROOM = PROJECT / 'test/mapping/changed_room'
 SOURCES = ('cliploc_ros', 'config', 'demo', 'launch', 'resource', 'LICENSE', 'README.md',
            'package.xml', 'setup.cfg', 'setup.py')
-MAX_MB = 1.2
+MAX_BYTES = 1.2e6
 #: Packages missing on a computer without ROS and the extra "models". ROS's .pth file restarts the
 #: interpreter with its libraries.
 LEFT_OUT = re.compile(r'(?!rosbags)(rclpy|rpyutils|ament|ros|\w+_(msgs|srvs|interfaces)|launch|'
@@ -92,17 +90,12 @@ def test_a_robot_gets_neither_worlds_nor_training_nor_tests(wheel):
     assert {name.partition('/')[0] for name in names} == {
         'cliploc_ros', wheel.name.removesuffix('-py3-none-any.whl') + '.dist-info',
         wheel.name.removesuffix('-py3-none-any.whl') + '.data'}
-    modules = {name for name in names if name.startswith('cliploc_ros/') and name.endswith('.py')}
-    assert modules == {str(path.relative_to(PROJECT))
-                       for path in (PROJECT / 'cliploc_ros').rglob('*.py')}
+    of_package = {name for name in names if name.startswith('cliploc_ros/')}
+    assert of_package == {str(path.relative_to(PROJECT)) for path in (
+        PROJECT / 'cliploc_ros').rglob('*.*') if path.is_file() and path.suffix != '.pyc'
+        and '__pycache__' not in path.parts}
     assert not [name for name in names if re.search(r'train_|make_world|test|/build/', name)]
-
-
-def test_the_wheel_is_small(wheel):
-    assert not [name for name in zipfile.ZipFile(wheel).namelist() if '/assets/' in name]
-    size_mb = wheel.stat().st_size / 1e6
-    print(f'{size_mb:.2f} MB')
-    assert size_mb < MAX_MB
+    assert wheel.stat().st_size < MAX_BYTES
 
 
 def test_commands_have_names_of_their_own(programs):
@@ -137,20 +130,3 @@ def test_what_is_missing_names_its_extra(programs, tmp_path):
         link.symlink_to(target)
     assert (done.returncode, done.stderr) == (
         1, "error: viser is not installed; pip install 'cliploc_ros[studio]'\n")
-
-
-def test_studio_serves_its_page(programs, tmp_path):
-    with subprocess.Popen([programs / 'cliploc_studio', ROOM / 'map.yaml', '--no-browser'],
-                          cwd=tmp_path, env=environment(), text=True, stdout=subprocess.PIPE,
-                          stderr=subprocess.STDOUT) as studio:
-        try:
-            lines = iter(studio.stdout.readline, '')
-            url = next(line.split()[1] for line in lines if line.startswith('studio: http'))
-            with urllib.request.urlopen(url, timeout=60.0) as page:
-                assert b'<!doctype html>' in page.read(200).lower()
-            with urllib.request.urlopen(url + 'studio.js', timeout=60.0) as script:
-                assert script.status == 200, 'the wheel has the files of the page'
-        finally:
-            studio.send_signal(signal.SIGINT)
-            rest, _ = studio.communicate(timeout=60.0)
-    assert studio.returncode == 130, rest

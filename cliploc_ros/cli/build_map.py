@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cliploc_ros import command
-from cliploc_ros.cli import check_map, map_layer
-from cliploc_ros.cli.options import add_source_options, folder_of
+from cliploc_ros.cli import check_map
+from cliploc_ros.cli.options import add_layer_options, add_source_options, folder_of, layer_options
 from cliploc_ros.command import option
 from cliploc_ros.errors import CliplocError, MappingError, OptionsError, misspelt_classes
 
@@ -65,7 +65,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(labels, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--object-size CLASS METRES', 'the longest extent of the objects of a class, '
            'which gives the scale of the poses')
-    map_layer.add_layer_options(parser)
+    add_layer_options(parser)
     poses = parser.add_argument_group('poses with errors')
     option(poses, '--joint', 'refine the poses together with the landmarks (default: if '
            '--pose-noise is given, or the boxes show that the poses have errors)',
@@ -100,7 +100,7 @@ def build(options: argparse.Namespace) -> int:
     begin = time.monotonic()
     update, name = options.update, sources.source_of(options).name
     command.check_output(options.out)
-    layer, note = map_layer.layer_options(options)
+    layer, note = layer_options(options)
     _refuse_conflicts(options)
     if update is not None and not len(LandmarkMap.from_file(update)):
         raise OptionsError(f'--update {update}: is a map of keyframes alone, which cannot be '

@@ -12,8 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from cliploc_ros import command
-from cliploc_ros.cli.map_layer import add_use_option, read_layer
-from cliploc_ros.cli.options import add_topic_options
+from cliploc_ros.cli.options import add_topic_options, add_use_option, read_layer
 from cliploc_ros.command import option
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, OptionsError
@@ -21,7 +20,7 @@ from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
-    from cliploc_ros.offline.datasets.images import Images
+    from cliploc_ros.offline.datasets.map_recording import Images
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 _ADVICE_SHOWN = 8
@@ -57,13 +56,6 @@ def make_parser() -> argparse.ArgumentParser:
            command.positive_int, 1)
     option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
     add_use_option(parser, 'report what the keyframes next to the map reach')
-    _add_relocalizer_options(parser)
-    _add_thresholds(parser)
-    add_topic_options(parser.add_argument_group('images of a bag'))
-    return parser
-
-
-def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('expected relocalization')
     option(group, '--frames N', 'greatest number of recorded frames to relocalize (%(default)s)',
            command.within(1, 10**6), CheckOptions.frames)
@@ -80,9 +72,6 @@ def _add_relocalizer_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--gravity', 'the robot knows the vertical')
     option(group, '--min-confidence', 'min_confidence of the relocalizer (%(default)s)',
            command.within(0.0, 1.0), RelocalizerOptions().min_confidence)
-
-
-def _add_thresholds(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('thresholds; if the map misses one, the exit code is 1')
     share, count = command.within(0.0, 1.0), command.within(0, 10**9)
     for name, kind, text in (
@@ -97,6 +86,8 @@ def _add_thresholds(parser: argparse.ArgumentParser) -> None:
             ('max_look_alikes', count, 'pairs of places that look alike')):
         group.add_argument(f'--{name.replace("_", "-")}', type=kind, metavar='N',
                            default=getattr(Thresholds, name), help=f'{text} (%(default)s)')
+    add_topic_options(parser.add_argument_group('images of a bag'))
+    return parser
 
 
 def check(options: argparse.Namespace) -> int:
@@ -165,9 +156,8 @@ def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections
 
 def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':
     """Return the recording of the command line or of the map, and its images if they are found."""
-    from cliploc_ros.offline.datasets.bag_frames import BagTopics
-    from cliploc_ros.offline.datasets.images import images_of_recording, open_images
-    from cliploc_ros.offline.datasets.map_recording import load_recording
+    from cliploc_ros.cli.sources import images_at
+    from cliploc_ros.offline.datasets.map_recording import images_of_recording, load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.recording.recorder import source_of
 
@@ -187,9 +177,8 @@ def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Imag
     images = None
     try:
         if (path := options.images or source) is not None:
-            images = open_images(
-                path, BagTopics(options.image, options.camera_info, options.rectified),
-                detections.camera_names if options.cameras == [''] else options.cameras)
+            images = images_at(options, path, detections.camera_names
+                               if options.cameras == [''] else options.cameras)
         elif recording is not None:
             images = images_of_recording(recording, detections.camera_names)
     except CliplocError as error:

@@ -13,14 +13,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cliploc_ros.cli.map_layer import add_use_option, read_layer
 from cliploc_ros.cli.options import (
     add_folders,
     add_network_options,
     add_reading_options,
+    add_use_option,
     check_folder_options,
     folder_of,
     given_options,
+    read_layer,
 )
 from cliploc_ros.command import SEEDS, limit, not_negative, option, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
@@ -64,12 +65,12 @@ def make_parser() -> argparse.ArgumentParser:
         description="Compare methods on the same input. Writes the paper's table as a page, text, "
         'LaTeX and CSV, results.json, run.json with input and options, figures and trajectories. '
         'Runs without ROS.')
-    group = parser.add_mutually_exclusive_group(required=True)
-    option(group, '--queries NPZ', 'recorded boxes and similarities; options of networks and '
+    sources = parser.add_mutually_exclusive_group(required=True)
+    option(sources, '--queries NPZ', 'recorded boxes and similarities; options of networks and '
            'recordings have no effect on it and are refused')
-    option(group, '--bag', 'a rosbag2 recording with ground truth; or a request that was '
+    option(sources, '--bag', 'a rosbag2 recording with ground truth; or a request that was '
            'stored by ~/record (npz), to answer it again', Path)
-    add_folders(group)
+    add_folders(sources)
     option(parser, '--map YAML', 'several maps are searched as one; the true poses are in the '
            'first', nargs='+', required=True)
     option(parser, '--methods M', f'methods to compare ({ALL}); see below', default=[ALL],
@@ -89,23 +90,12 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--no-figures', dest='figures', action='store_false')
     add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does, on "
                    'the images of --bag or a folder')
-    _add_paper_options(parser)
-    _add_sensor_options(parser)
-    _add_recording_options(parser)
-    add_reading_options(parser)
-    return parser
-
-
-def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("options of the paper's methods")
     option(group, '--iterations', '(%(default)s)', positive_int, 500)
     option(group, '--k', '(%(default)s)', positive_int, 3)
     option(group, '--iou-threshold', '(%(default)s)', within(0.0, 1.0), 0.2)
     option(group, '--sweep N', 'numbers of iterations to compare in a figure (50 100 200 1000)',
            positive_int, [50, 100, 200, 1000], nargs='*')
-
-
-def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('simulated sensors in addition to the camera')
     option(group, '--gravity', f"'{AUTO}' knows the vertical, which is simulated from the true "
            "poses; the paper's methods do not use it")
@@ -120,6 +110,8 @@ def _add_sensor_options(parser: argparse.ArgumentParser) -> None:
            'odometry from the true poses')
     option(group, '--odometry-noise METRES DEGREES', 'standard deviations of the error of '
            'odometry from frame to frame, on each axis (0 0)', not_negative, (0.0, 0.0))
+    _add_recording_options(parser)
+    return parser
 
 
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
@@ -133,6 +125,7 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--sync-tolerance SECONDS', 'greatest distance in time of images of several '
            '--cameras that are localized together, from the first camera (%(default)s)',
            not_negative, 0.05)
+    add_reading_options(parser)
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -195,7 +188,6 @@ def _check_options(options: argparse.Namespace) -> None:
     if options.queries is not None:
         of_images = argparse.ArgumentParser()
         _add_recording_options(of_images)
-        add_reading_options(of_images)
         defaults = vars(of_images.parse_args([]))
         del defaults['scheduler']  # searches use it, too
         if idle := given_options(options, defaults):

@@ -3,6 +3,7 @@
 """Read the recording that the command line names, see cli.options."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,10 +22,20 @@ from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
 from cliploc_ros.models.profiles import with_detector, with_encoder
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets import bag_frames, bag_poses
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
-from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
-from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, join_frames, move_frames
-from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
+from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
+from cliploc_ros.offline.datasets.frames import (
+    DepthFormat,
+    FolderOptions,
+    Frames,
+    join_frames,
+    move_frames,
+)
+from cliploc_ros.offline.datasets.map_recording import (
+    Images,
+    MapRecording,
+    load_recording,
+    open_images,
+)
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
@@ -85,6 +96,17 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
         print(f'{bag}: {" and ".join(getattr(options, name) for name in open_topics)}', flush=True)
 
 
+def images_at(options: argparse.Namespace, path: Path, cameras: Sequence[str]) -> Images:
+    """Open the images of cameras in a folder or bag, with the topics of the command line.
+
+    DatasetError: the path is neither, or a topic that the command line does not name is ambiguous.
+    """
+    is_folder = path.exists() and find_layout(path) is not None
+    find_topics(options, None if is_folder or [*cameras] != [''] else path)
+    return open_images(path, bag_frames.BagTopics(
+        options.image, options.camera_info, options.rectified), cameras)
+
+
 class Source(NamedTuple):
     """The content of a source: observations, their file, and images if there are any."""
 
@@ -105,7 +127,8 @@ def read_source(options: argparse.Namespace) -> Source:
     find_topics(options, options.bag)
     if options.observations is not None:
         return Source(load_observations(options.observations), options.observations, None)
-    frames = read_frames(options)
+    of_cameras = read_cameras(options)
+    frames = of_cameras[''] if '' in of_cameras else join_frames(of_cameras)
     print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
     recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))
     file = options.record_to or recorder.observation_file(frames, recording)
@@ -174,12 +197,6 @@ def source_of(options: argparse.Namespace) -> Path:
     """Return the folder or file that the command line names."""
     found = folder_of(options)
     return found[0] if found is not None else Path(options.bag or options.observations)
-
-
-def read_frames(options: argparse.Namespace) -> Frames:
-    """Return the images of all cameras of the source, see read_cameras."""
-    of_cameras = read_cameras(options)
-    return of_cameras[''] if '' in of_cameras else join_frames(of_cameras)
 
 
 def read_cameras(options: argparse.Namespace, gap_s: float | None = None, *,

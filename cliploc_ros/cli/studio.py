@@ -12,8 +12,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cliploc_ros.cli.map_layer import read_layer
-from cliploc_ros.cli.options import add_topic_options
+from cliploc_ros.cli.options import add_topic_options, read_layer
 from cliploc_ros.command import needs_ros, option, run_main, within
 from cliploc_ros.errors import OptionsError
 
@@ -103,15 +102,13 @@ def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocaliz
 
 def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
-    from cliploc_ros.cli.sources import find_topics
-    from cliploc_ros.offline.datasets.bag_frames import BagTopics
+    from cliploc_ros.cli.sources import images_at
     from cliploc_ros.offline.datasets.folders import find_layout
-    from cliploc_ros.offline.datasets.images import (
+    from cliploc_ros.offline.datasets.map_recording import (
         images_of_recording,
-        open_images,
+        load_recording,
         views_of_folder,
     )
-    from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.studio.document import Document
     from cliploc_ros.offline.studio.recording import Recording
@@ -129,10 +126,7 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     elif built_from is not None:
         detections = built_from.load()
     if options.images is not None:
-        cameras = _cameras(options, detections)
-        find_topics(options, options.images if not is_folder and cameras == [''] else None)
-        topics = BagTopics(options.image, options.camera_info, options.rectified)
-        images = open_images(options.images, topics, cameras)
+        images = images_at(options, options.images, _cameras(options, detections))
     elif built_from is not None and detections is not None:
         images = images_of_recording(built_from, _cameras(options, detections))
     if detections is None and options.images is not None:

@@ -60,7 +60,7 @@ def convert(options: argparse.Namespace) -> int:
     # Imported late, so that --help is fast.
     from tqdm import tqdm
 
-    from cliploc_ros.offline.datasets import tum_conversion
+    from cliploc_ros.offline.datasets import tum
     from cliploc_ros.offline.datasets.folders import read_sequence
 
     begin = time.monotonic()
@@ -68,12 +68,12 @@ def convert(options: argparse.Namespace) -> int:
     sequence = sequence.every(options.every)
     detections = None
     if options.detections is not None:
-        detections = tum_conversion.read_recorded_detections(
+        detections = tum.read_recorded_detections(
             options.detections, (camera.width, camera.height))
     print(f'{len(sequence)} images, intrinsics: {origin}', flush=True)
-    result = tum_conversion.convert_tum(
+    result = tum.convert_tum(
         sequence, camera, options.output,
-        tum_conversion.ConversionOptions(
+        tum.ConversionOptions(
             options.storage, options.image_format, prefix=options.prefix,
             camera_frame=options.camera_frame, world_frame=options.world_frame),
         detections,

@@ -172,15 +172,17 @@ class Player:
                    on_message: Callable[[BagMessage], None]) -> tuple[Counter[str], float]:
         """Publish messages; return their number by topic, and the greatest delay [s]."""
         timeline = _Timeline(origin_ns, self.start_ns, self._options.rate, self._stop)
-        ticker = None
-        if self._clock is not None and self._options.clock_hz:
-            ticker = _Ticker(self._clock, timeline, self._options.clock_hz)
-        counts: Counter[str] = Counter()
-        worst_lateness_s = 0.0
+        # /clock ticks on a regular grid of real time
+        step_ns = max(round(self._options.rate * NS_PER_S / (self._options.clock_hz or 1.0)), 1)
+        tick_ns, counts, worst_lateness_s = self.start_ns, Counter[str](), 0.0
         for message in messages:
-            while ticker is not None and ticker.next_ns <= message.stamp_ns \
-                    and timeline.wait_for(ticker.next_ns):
-                ticker.tick()
+            while self._clock is not None and tick_ns <= message.stamp_ns \
+                    and timeline.wait_for(tick_ns):
+                tick = Clock()
+                tick.clock.sec, tick.clock.nanosec = divmod(tick_ns, NS_PER_S)
+                self._clock.publish(tick)
+                missed = max(timeline.now_ns() - tick_ns, 0) // step_ns  # skipped
+                tick_ns += step_ns * max(missed, 1)
             if not timeline.wait_for(message.stamp_ns):
                 break
             worst_lateness_s = max(worst_lateness_s, timeline.lateness_s(message.stamp_ns))
@@ -221,23 +223,6 @@ class _Timeline:
     def now_ns(self) -> int:
         """Return the current time of the recording [ns]."""
         return self.start_ns + round((time.monotonic_ns() - self._origin_ns) * self.rate)
-
-
-class _Ticker:
-    """Publishes /clock on a regular grid of real time."""
-
-    def __init__(self, publisher: Publisher, timeline: _Timeline, clock_hz: float) -> None:
-        self._publisher, self._timeline = publisher, timeline
-        self._step_ns = max(round(timeline.rate * NS_PER_S / clock_hz), 1)
-        self.next_ns = timeline.start_ns
-
-    def tick(self) -> None:
-        """Publish the tick that is due, and skip missed ticks."""
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = divmod(self.next_ns, NS_PER_S)
-        self._publisher.publish(message)
-        missed = max(self._timeline.now_ns() - self.next_ns, 0) // self._step_ns
-        self.next_ns += self._step_ns * max(missed, 1)
 
 
 def _select_topics(reader: BagReader, options: PlayOptions

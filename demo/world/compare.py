@@ -25,15 +25,14 @@ from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import Queries, save_queries
 from cliploc_ros.offline.evaluation.methods import parse_methods
 from cliploc_ros.offline.evaluation.run import compare_methods
 from cliploc_ros.offline.evaluation.trials import make_queries, make_queries_of
 from cliploc_ros.offline.posed_query import PosedQuery
-from cliploc_ros.offline.recording.networks import RunNetworks
-from cliploc_ros.offline.recording.recorder import record_every_frame
+from cliploc_ros.offline.recording.recorder import RunNetworks, record_every_frame
 from demo import ASSETS
 from demo.truth import SAME_OBJECT_IOU, TrueFrame, read_frames
 from demo.world import train_detector

@@ -20,8 +20,8 @@ from cliploc_ros.core.map.landmark_embeddings import embeddings_path, save_landm
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.models.clip_weights import ClipOptions
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import save_observations
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.labelling import embed_landmarks

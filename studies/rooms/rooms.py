@@ -27,10 +27,10 @@ from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.storage import make_folder, write_file
 from cliploc_ros.models.profiles import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder
 from cliploc_ros.offline.datasets.frames import (
     DepthFormat,
+    FolderOptions,
     Frames,
     ImageFile,
     RawFrame,

@@ -14,9 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from doc_commands import PROJECT, commands_of
 from rig_bag import TF, transform
-from test_doc_commands import program_of
+from test_doc_commands import PROJECT, commands_of, program_of
 from without_pytorch import hide_pytorch
 
 from cliploc_ros.cli.studio import make_parser, open_studio
@@ -29,15 +28,15 @@ from cliploc_ros.offline.datasets.folders import read_sequence
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 from demo import ASSETS
 
-pytestmark = pytest.mark.full
-
+FULL = pytest.mark.full
 PAGES = [PROJECT / page for page in ('doc/first_relocalization.md', 'README.md',
                                      'doc/your_robot.md', 'doc/mapping.md', 'doc/keyframes.md')]
 # Commands for another robot or recording, or for a network that has to be downloaded.
 OTHER = {'--cameras', '--update', '--observations', '--colmap', '--queries', '--keyframe-features'}
 MOUNT = mount_from_numbers([0.1, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5])
 FEW = ('--positions', '4', '--headings', '2', '--frames', '10')
-BOTH = pytest.mark.parametrize('drive', ['rendered', 'real'], indirect=True)
+WHOLE = [pytest.param(name, marks=FULL) for name in ('rendered', 'real')]
+BOTH = pytest.mark.parametrize('drive', WHOLE, indirect=True)
 TOPICS = {'/camera/image_raw': bag_messages.IMAGE,
           '/camera/camera_info': bag_messages.CAMERA_INFO, '/tf': TF, '/tf_static': TF}
 
@@ -70,7 +69,10 @@ def write_drive(path, folder, every):
 def drive(request, tmp_path_factory):
     """Return a folder with the bag, and its networks as arguments and as parameters."""
     folder = tmp_path_factory.mktemp(request.param)
-    if request.param == 'rendered':
+    if request.param == 'short':
+        write_drive(folder / 'drive', ASSETS / 'mapping', 3)
+        found, more = {'model': ASSETS / 'yolo.onnx'}, ['--no-clip', '--no-check']
+    elif request.param == 'rendered':
         write_drive(folder / 'drive', ASSETS / 'mapping', 1)
         found, more = {'model': ASSETS / 'yolo.onnx', 'clip_pretrained': ASSETS / 'clip'}, []
     else:
@@ -120,12 +122,14 @@ FIRST, *ON_PAGE = documented(PAGES[:1])
 ELSEWHERE = [command for command in documented(PAGES) if command not in (FIRST, *ON_PAGE)]
 
 
-@BOTH
+@pytest.mark.parametrize('drive', ['short', *WHOLE], indirect=True)
 def test_one_command_leads_from_a_bag_to_a_checked_map(built):
-    folder, _, _, printed = built
+    folder, networks, _, printed = built
     assert FIRST == ('build_map', '--bag', 'drive', '--out', 'office.yaml')
     assert printed.endswith('to correct it: studio office.yaml\n')
     assert layer_path(folder / 'office.yaml').exists()
+    if '--no-check' in networks:
+        return
     checked = json.loads((folder / 'office_check/check.json').read_text())
     assert 'fails: ' in printed or checked['passed']
     verdicts, alone = (checked['recording'][one] for one in ('verdicts', 'verdicts_by_objects'))
@@ -182,6 +186,7 @@ def test_the_nodes_answer_as_the_page_says(built, monkeypatch):
             process.wait(60)
 
 
+@FULL
 def test_the_demos_room_gives_the_figures_of_the_page(tmp_path, monkeypatch, capsys):
     """The section for readers without a recording, with the files that it copies."""
     section = ' '.join(PAGES[0].read_text().split('\n## Without a recording')[1].split())

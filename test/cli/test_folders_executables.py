@@ -18,8 +18,7 @@ from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets.images import open_images
-from cliploc_ros.offline.datasets.map_recording import load_recording
+from cliploc_ros.offline.datasets.map_recording import load_recording, open_images
 from cliploc_ros.offline.mapping.evidence import explained_boxes
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.views import make_views
@@ -45,8 +44,7 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     assert run(build_map, *arguments, '--known-distance', first.path.name, last.path.name,
                distance_m) == 0
     shown = capsys.readouterr().out
-    assert '30 of 30 images' in shown
-    assert '0.4 m' in shown
+    assert '30 of 30 images' in shown and '0.4 m' in shown
     landmarks = LandmarkMap.from_file(built)
     # keyframes have the camera of their image, and the poses of the map
     layer = load_layer_of_map(layer_path(built), landmarks)
@@ -66,8 +64,6 @@ def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys)
     studio = open_studio(make_parser().parse_args([str(built), '--images', str(walk)]))
     try:
         assert studio.views == 12 and studio.recording.detections.cameras[0].fx == 500.0
-        assert open_images(walk, None).near(float(
-            studio.recording.detections.stamps_s[3])).shape == (480, 640, 3)
     finally:
         studio.document.close()
     # the studio shows each image through the camera of its boxes, whatever focal length it states
@@ -139,8 +135,7 @@ def test_a_levelled_map_is_evaluated_on_the_bag_that_made_it(tmp_path, capsys):
     (tmp_path / 'walk/groundtruth.txt').unlink()
     np.savetxt(tmp_path / 'walk/groundtruth.txt', truth, fmt='%.9f')
     bag, other, built = tmp_path / 'bag', tmp_path / 'other', tmp_path / 'built.yaml'
-    assert tum_to_bag([str(tmp_path / 'walk'), str(bag)]) == 0
-    assert tum_to_bag([str(tmp_path / 'walk'), str(other)]) == 0
+    assert [run(tum_to_bag, tmp_path / 'walk', path) for path in (bag, other)] == [0, 0]
     assert run(build_map, '--bag', bag, '--level', *NETWORKS, '--no-clip', '--out', built) == 0
     asked = ('--map', built, *NETWORKS, '--no-clip', '--methods', 'auto', '--trials', 1, '--sweep',
              '--no-figures', '--out', tmp_path / 'out')

@@ -27,7 +27,7 @@ from cliploc_ros.core.geometry.transforms import (
     transform_from_pose,
 )
 from cliploc_ros.errors import CameraError
-from cliploc_ros.offline.datasets.intrinsics import PRESETS, read_camera
+from cliploc_ros.offline.datasets.parsing import PRESETS, read_camera
 
 LENSES = {
     'none': ('', ()),

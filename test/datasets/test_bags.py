@@ -12,7 +12,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.messages import detections_from_msg
+from cliploc_ros.messages import camera_from_msg, detections_from_msg, image_from_msg
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import (
     LATCHED_QOS,
@@ -69,6 +69,8 @@ def write_bag(path, storage, parts, compression='NONE'):
         for topic, more in zip(info['topics_with_message_count'],
                                part_info['topics_with_message_count'], strict=True):
             topic['message_count'] += more['message_count']
+    # a user has edited the QoS of /status
+    info['topics_with_message_count'][2]['topic_metadata']['offered_qos_profiles'][0]['depth'] = 7
     (path / 'metadata.yaml').write_text(yaml.safe_dump(every[0]))
     return path
 
@@ -98,7 +100,6 @@ def truncate(path, size):
 
 @pytest.mark.parametrize(('damage', 'reason'), [
     (lambda bag: (bag / 'metadata.yaml').unlink(), 'ros2 bag reindex'),
-    (lambda bag: (bag / 'metadata.yaml').write_text('version: 9'), 'rosbag2_bagfile_informa'),
     (lambda bag: (bag / 'part_0.mcap').unlink(), 'part_0.mcap'),
     (lambda bag: truncate(bag / 'part_0.mcap', -20), 'magic')])
 def test_broken_recordings_are_refused(tmp_path, damage, reason):
@@ -111,9 +112,6 @@ def test_broken_recordings_are_refused(tmp_path, damage, reason):
 def test_missing_recording_and_topic_are_named(tmp_path):
     with pytest.raises(DatasetError, match='no such recording'), BagReader(tmp_path / 'none'):
         pass
-    (tmp_path / 'notes.txt').write_text('hello')
-    with pytest.raises(DatasetError, match='txt'), BagReader(tmp_path / 'notes.txt'):
-        pass
     bag = write_bag(tmp_path / 'bag', 'mcap', [make_messages(3)])
     with BagReader(bag) as reader, pytest.raises(DatasetError, match='/chatter'):
         reader.topic('/image')
@@ -123,12 +121,7 @@ STAMP_NS = 1341847980722988001
 CAMERA = Camera(64, 48, 53.5, 53.9, 32.0, 24.7, 'plumb_bob', (0.1, -0.2, 0.001, 0.002, 0.3))
 
 
-@pytest.fixture(params=['sqlite3', 'mcap'])
-def plugin(request):
-    return request.param
-
-
-def test_messages_come_back(tmp_path, plugin):
+def test_messages_come_back(tmp_path):
     pixels_rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
     detections = Detections(np.array([[1.5, 2.0, 30.25, 40.0], [0.0, 0.0, 63.0, 47.0]]),
                             ('teddy bear', 'tv'), np.array([0.5, 0.25]))
@@ -139,7 +132,7 @@ def test_messages_come_back(tmp_path, plugin):
         bag_messages.CAMERA_INFO: bag_messages.camera_info_message(STAMP_NS, 'camera', CAMERA),
         bag_messages.DETECTIONS: bag_messages.detections_message(STAMP_NS, 'camera', detections),
         bag_messages.POSE: bag_messages.pose_message(STAMP_NS, 'world', map_from_camera)}
-    with BagWriter(tmp_path / 'bag', plugin) as bag:
+    with BagWriter(tmp_path / 'bag') as bag:
         for number, (msgtype, message) in enumerate(written.items()):
             bag.add_topic(f'/topic_{number}', msgtype)
             bag.write(f'/topic_{number}', STAMP_NS, message)
@@ -147,14 +140,10 @@ def test_messages_come_back(tmp_path, plugin):
         raws = sorted(reader.messages(), key=lambda one: one.topic)
         image, info, array, pose = map(reader.deserialize, raws)
     assert {raw.stamp_ns for raw in raws} == {bag_messages.stamp_ns(image)} == {STAMP_NS}
-    assert (image.encoding, image.height, image.width, image.step) == ('rgb8', 48, 64, 192)
     assert image.header.frame_id == 'camera'
-    np.testing.assert_array_equal(image.data.reshape(48, 64, 3), pixels_rgb)
-    assert (info.width, info.height, info.distortion_model) == (64, 48, 'plumb_bob')
-    assert list(info.d) == [0.1, -0.2, 0.001, 0.002, 0.3]
-    assert list(info.k) == [53.5, 0, 32.0, 0, 53.9, 24.7, 0, 0, 1]
+    np.testing.assert_array_equal(image_from_msg(image), pixels_rgb)
+    assert camera_from_msg(info, (64, 48), False) == CAMERA
     assert list(info.p) == [53.5, 0, 32.0, 0, 0, 53.9, 24.7, 0, 0, 0, 1, 0]
-    assert list(info.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1]
     stamps_ns = [bag_messages.stamp_ns(message) for message in (array, *array.detections)]
     assert stamps_ns == [STAMP_NS] * 3
     again = detections_from_msg(array)
@@ -165,6 +154,7 @@ def test_messages_come_back(tmp_path, plugin):
     np.testing.assert_allclose(pose_from_msg(pose.pose), map_from_camera, atol=1e-15)
 
 
+@pytest.mark.parametrize('plugin', STORAGES)
 def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
     with BagWriter(tmp_path / 'office', plugin) as bag:
         bag.add_topic('/pose', bag_messages.POSE, RELIABLE_QOS)
@@ -193,14 +183,15 @@ def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
     assert topics[1]['type_description_hash'].startswith('RIHS01_2142741200')
 
 
-def test_existing_output_is_kept(tmp_path, plugin):
+def test_existing_output_is_kept(tmp_path):
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / 'precious').write_text('data')
-    with pytest.raises(DatasetError, match='already exists'), BagWriter(tmp_path / 'bag', plugin):
+    with pytest.raises(DatasetError, match='already exists'), BagWriter(tmp_path / 'bag'):
         pass
     assert [path.name for path in tmp_path.rglob('*')] == ['bag', 'precious']
 
 
+@pytest.mark.parametrize('plugin', STORAGES)
 def test_failure_leaves_nothing(tmp_path, plugin):
     with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', plugin) as bag:
         bag.add_topic('/pose', bag_messages.POSE)

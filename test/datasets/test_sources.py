@@ -69,9 +69,9 @@ def positions(frames):
 def test_poses_are_interpolated_within_a_gap(tmp_path):
     bag = write_bag(tmp_path / 'bag', [250, 500, 710, 950],
                     drive([0, 200, 300, 600, 1000]))
+    assert positions(bag_frames(bag, BagTopics(), PoseSource('/pose'))) == [None] * 4
     frames = bag_frames(bag, BagTopics(), PoseSource('/pose', topic_gap_ns=300 * MS))
     assert positions(frames) == [0.25, 0.5, None, None]
-    assert positions(bag_frames(bag, BagTopics(), PoseSource('/pose'))) == [None] * 4
     assert frames.count == 4
     raw = list(frames.read_raw(lambda place, stamp, pose: pose is not None and place > 0))
     assert [frame.place for frame in raw] == [1]

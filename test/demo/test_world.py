@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.ellipsoid import (
 )
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.parsing import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from demo import ASSETS
 from demo.truth import read_frames

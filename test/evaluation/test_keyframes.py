@@ -24,8 +24,8 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import Watch
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from studies.keyframes.cases import IMAGE_CHANGES, World, twin
 

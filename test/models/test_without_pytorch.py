@@ -26,7 +26,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import ModelError
-from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.parsing import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from demo import ASSETS
 from cliploc_ros.models.clip_weights import ClipOptions

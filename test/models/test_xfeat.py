@@ -18,8 +18,8 @@ import pytest
 
 from cliploc_ros.cli import evaluate
 from cliploc_ros.cli.build_map import make_parser
-from cliploc_ros.cli.map_layer import layer_options, read_layer
-from cliploc_ros.cli.sources import read_frames
+from cliploc_ros.cli.options import layer_options, read_layer
+from cliploc_ros.cli.sources import read_cameras
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import SIFT
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, save_layer
@@ -27,8 +27,8 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_fea
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MapError, ModelError, OptionsError
 from cliploc_ros.models.xfeat import FILE_NAME, any_size, feature_kinds, load_xfeat
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import rgbd_frames
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.ros.frame_localizer import load_keyframes
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -209,7 +209,7 @@ def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch,
     options = make_parser().parse_args([
         '--tum', str(ASSETS / 'mapping'), '--keyframe-features', 'xfeat', '--keyframe-layer',
         '--out', str(tmp_path / 'map.yaml')])
-    save_layer(layer_path(options.out), build_layer(read_frames(options), landmark_map,
+    save_layer(layer_path(options.out), build_layer(read_cameras(options)[''], landmark_map,
                                                     layer_options(options)[0]))
     layer = read_layer(options.out, landmark_map, wanted=True)
     assert layer.kind.dimensions == 64

@@ -15,8 +15,8 @@ from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'

@@ -9,18 +9,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rig_bag import errors_of
 
 from cliploc_ros.cli.build_map import main as build_map
 from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.views import make_views
-from cliploc_ros.offline.recording.networks import RunNetworks
-from demo.truth import read_objects
+from cliploc_ros.offline.recording.recorder import RunNetworks
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.onnx')
@@ -64,21 +63,13 @@ def recorded(folder):
     """Return the observations of the mapping walk; its map lies next to them."""
     bend(ASSETS / 'mapping', folder / 'mapping')
     assert build_map(arguments('--tum', folder / 'mapping', *NETWORKS, '--no-clip', '--no-check',
-                               '--no-joint', '--out', folder / 'map.yaml', '--record-to',
-                               folder / 'mapping.npz')) == 0
+                               '--no-joint', '--no-keyframe-layer', '--out', folder / 'map.yaml',
+                               '--record-to', folder / 'mapping.npz')) == 0
     return load_observations(folder / 'mapping.npz')
 
 
-def landmarks_off(file):
-    """Return the distance of each landmark to the nearest object of its class [m]."""
-    objects, built = read_objects(ASSETS / 'mapping'), LandmarkMap.from_file(file)
-    return np.array([min(np.linalg.norm(item.center - center) for item in objects
-                         if item.class_id == class_id)
-                     for center, class_id in zip(built.centers, built.class_ids, strict=True)])
-
-
 def test_a_folder_gives_the_map_of_the_room(recorded, folder):
-    off = landmarks_off(folder / 'map.yaml')
+    off = errors_of(folder / 'map.yaml', ASSETS / 'mapping')
     assert len(off) > 50 and (off < 0.1).mean() > 0.95, off
     assert recorded.cameras == (Camera(640, 480, 500.0, 500.0, 319.5, 239.5),)
 

@@ -19,8 +19,8 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import CASE, Case, case_arrays, read_case
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
+from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.methods import AUTO, Method
 from cliploc_ros.offline.evaluation.trials import (
@@ -35,8 +35,7 @@ from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.offline.recording.networks import LoadNetworks
-from cliploc_ros.offline.recording.recorder import record_every_frame
+from cliploc_ros.offline.recording.recorder import LoadNetworks, record_every_frame
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
 from cliploc_ros.ros.inputs.frame_source import Frame

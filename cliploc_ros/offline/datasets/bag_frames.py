@@ -24,7 +24,7 @@ from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_ag
 from cliploc_ros.offline.datasets.bag_poses import PoseSource, plain_name, poses_of_images
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
-from cliploc_ros.offline.datasets.intrinsics import find_camera
+from cliploc_ros.offline.datasets.parsing import find_camera
 from cliploc_ros.offline.datasets.poses import STAMP_TOLERANCE_NS, Poses, check_forward
 from cliploc_ros.units import NS_PER_S
 

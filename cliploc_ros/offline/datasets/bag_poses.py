@@ -39,6 +39,8 @@ _POSE_TYPES: dict[str, Callable[[Any], Any]] = {
 GROUND_TRUTH, MAP_FRAME = '/ground_truth', 'map'
 _TF, _TF_STATIC = '/tf', '/tf_static'
 _TF_TYPE = 'tf2_msgs/msg/TFMessage'
+# Tolerance of a static transform, whose pose is constant in time.
+_ALWAYS_NS = 2**63
 # Two sources of poses are compared at this many stamps, and agree within this [m] [deg].
 _COMPARED, _SAME_M, _SAME_DEG = 50, 0.05, 2.0
 
@@ -158,18 +160,6 @@ def _difference(poses: Poses, others: Poses) -> str:
 
 
 @dataclass(frozen=True)
-class FixedPose:
-    """A pose that is constant in time."""
-
-    pose: NDArray[np.float64]  #: (4, 4)
-    span_ns = (-2**63, 2**63 - 1)
-
-    def pose_at(self, stamp_ns: int) -> NDArray[np.float64]:
-        """Return the pose (4, 4)."""
-        return self.pose
-
-
-@dataclass(frozen=True)
 class TransformChain:
     """The transforms from two coordinate frames up to their common ancestor.
 
@@ -177,8 +167,8 @@ class TransformChain:
     is that of the body, whose poses are in a map.
     """
 
-    up: tuple[Poses, ...]  #: Links from the map, or the body, to the common ancestor
-    down: tuple[Poses, ...]  #: Links from the camera to the common ancestor
+    up: tuple[TimedPoses, ...]  #: Links from the map, or the body, to the common ancestor
+    down: tuple[TimedPoses, ...]  #: Links from the camera to the common ancestor
     body: Poses | None = None
 
     @property
@@ -186,7 +176,8 @@ class TransformChain:
         """Return the first and last stamp at which all links, or the body, are known [ns]."""
         if self.body is not None:
             return self.body.span_ns
-        spans = [FixedPose.span_ns, *(link.span_ns for link in (*self.up, *self.down))]
+        spans = [(-_ALWAYS_NS, _ALWAYS_NS - 1), *(
+            link.span_ns for link in (*self.up, *self.down) if link.tolerance_ns < _ALWAYS_NS)]
         if None in spans:
             return None
         return max(span[0] for span in spans if span), min(span[1] for span in spans if span)
@@ -281,7 +272,7 @@ def _ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
 
 
 def _read_links(reader: BagReader, topics: Collection[str], children: Collection[str],
-                parents: Mapping[str, str], max_gap_ns: int) -> dict[str, Poses]:
+                parents: Mapping[str, str], max_gap_ns: int) -> dict[str, TimedPoses]:
     """Read the poses of frames in their parents, by frame; a static frame has its last pose."""
     samples: dict[str, dict[str, tuple[list[int], list[tuple[float, ...]]]]] = {
         topic: {child: ([], []) for child in children} for topic in topics}
@@ -300,16 +291,15 @@ def _read_links(reader: BagReader, topics: Collection[str], children: Collection
                 stamps, rows = samples[topic][child]
                 stamps.append(bag_messages.stamp_ns(message))
                 rows.append(numbers)
-    links: dict[str, Poses] = {}
+    links: dict[str, TimedPoses] = {}
     for child in children:
         where = f"{reader.path}: tf of '{child}'"
         fixed = [samples[name][child] for name in topics if name.endswith('_static')]
         moving = [samples[name][child] for name in topics if not name.endswith('_static')]
         stamps, rows = next((recorded for recorded in fixed if recorded[0]), ([], []))
         if stamps:
-            pose = TimedPoses.from_samples(stamps[-1:], rows[-1:], where).pose_at(stamps[-1])
-            assert pose is not None
-            links[child] = FixedPose(pose)
+            links[child] = replace(TimedPoses.from_samples(stamps[-1:], rows[-1:], where),
+                                   tolerance_ns=_ALWAYS_NS)
         else:
             stamps, rows = moving[0] if moving else ([], [])
             check_forward(stamps, where)

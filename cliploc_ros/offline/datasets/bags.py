@@ -6,11 +6,10 @@ rosbag2_py is not on PyPI, but recordings are also read and written without ROS.
 of replay, this module imports little.
 """
 
-import shutil
 import sqlite3
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -107,7 +106,7 @@ class BagReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._reader: Reader  # while it is open
-        self._topics: dict[str, BagTopic] = {}
+        self.topics: Mapping[str, BagTopic] = {}  #: Topics by name
         #: Reasons and times of unusable messages, by topic
         self.left_out: dict[str, dict[str, None]] = {}
         self.notes: list[str] = []  #: Notes for the user about the recording
@@ -128,7 +127,7 @@ class BagReader:
             raise self._unreadable(error) from error
         self._reader = reader
         try:
-            self._topics = self._collect_topics(reader.connections)
+            self.topics = self._collect_topics(reader.connections)
         except BaseException:
             reader.close()
             raise
@@ -140,14 +139,9 @@ class BagReader:
         self._reader.close()
 
     @property
-    def topics(self) -> Mapping[str, BagTopic]:
-        """Topics by name."""
-        return self._topics
-
-    @property
     def message_count(self) -> int:
         """Number of messages on all topics."""
-        return sum(topic.message_count for topic in self._topics.values())
+        return sum(topic.message_count for topic in self.topics.values())
 
     @property
     def start_ns(self) -> int:
@@ -165,11 +159,11 @@ class BagReader:
 
         DatasetError: the recording has no topic of that name; the message lists its topics.
         """
-        if name not in self._topics:
+        if name not in self.topics:
             recorded = ', '.join(f'{topic.name} ({topic.msgtype})'
-                                 for topic in self._topics.values())
+                                 for topic in self.topics.values())
             raise DatasetError(f'{self.path}: has no topic {name}; it has {recorded or "none"}')
-        return self._topics[name]
+        return self.topics[name]
 
     def messages(self, topics: Collection[str] | None = None, start_ns: int | None = None,
                  stop_ns: int | None = None) -> Iterator[BagMessage]:
@@ -184,7 +178,7 @@ class BagReader:
         start_ns, stop_ns : int, optional
             Yield only messages at or after start_ns and before stop_ns [ns].
         """
-        names = self._topics if topics is None else topics
+        names = self.topics if topics is None else topics
         connections = self._connections({self.topic(name).name for name in names})
         if not connections:
             return
@@ -270,11 +264,9 @@ class BagReader:
         metadata.yaml, and users edit metadata.yaml to repair QoS. The connections of the files
         always match.
         """
-        reader = self._reader
-        files = getattr(reader.storage, 'storages', [])
-        handles = [*reader.connections,
-                   *(connection for file in files for connection in file.connections)]
-        return [handle for handle in handles if handle.topic in names]
+        files = getattr(self._reader.storage, 'storages', [])
+        return [connection for part in (self._reader, *files) for connection in part.connections
+                if connection.topic in names]
 
     def _unreadable(self, error: Exception) -> DatasetError:
         name = '' if isinstance(error, ReaderError) else f'{type(error).__name__}: '
@@ -301,42 +293,35 @@ class BagWriter:
         if storage not in STORAGES:
             raise DatasetError(f'storage {storage!r} is not one of {", ".join(STORAGES)}')
         self._storage = STORAGES[storage]
-        self._staging: Path | None = None
         self._writer: Writer  # while it is open
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> Self:
         """Begin the recording next to its final path."""
         self._check_free()
-        try:
-            with self._naming_failures():
-                self._staging = Path(tempfile.mkdtemp(
-                    prefix=f'.{self.path.name}.', suffix='.partial', dir=self.path.parent))
-                self._writer = Writer(self._staging / self.path.name, version=9,
-                                      storage_plugin=self._storage)
-                self._writer.open()
-        except BaseException:  # Ctrl-C, too
-            self._discard()
-            raise
+        with ExitStack() as begun, self._naming_failures():
+            self._staging = Path(begun.enter_context(tempfile.TemporaryDirectory(
+                '.partial', f'.{self.path.name}.', self.path.parent, ignore_cleanup_errors=True)))
+            self._writer = Writer(self._staging / self.path.name, version=9,
+                                  storage_plugin=self._storage)
+            begun.callback(self._abort)
+            self._writer.open()
+            self._removal = begun.pop_all()  # of the folder, at the end
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         """Complete the recording and move it to its final path, or remove it."""
-        assert self._staging is not None
-        is_complete = False
-        try:
+        with self._removal:
             if kind is None:
                 with self._naming_failures():
                     self._writer.close()
                     self._check_free()  # another process may have written it meanwhile
                     (self._staging / self.path.name).rename(self.path)
-                is_complete = True
-        finally:
-            if not is_complete:
-                with suppress(Exception):  # the first exception is the one to report
-                    self._writer.abort()
-            self._discard()
+
+    def _abort(self) -> None:
+        with suppress(Exception):  # the first exception is the one to report
+            self._writer.abort()  # does nothing after close
 
     def add_topic(self, name: str, msgtype: str, qos: Qos = RELIABLE_QOS) -> None:
         """Declare a topic before its first message.
@@ -365,11 +350,6 @@ class BagWriter:
             raise DatasetError(f'{self.path}: already exists and is not overwritten')
         if not self.path.parent.is_dir():
             raise DatasetError(f'{self.path}: the folder {self.path.parent} does not exist')
-
-    def _discard(self) -> None:
-        if self._staging is not None:
-            shutil.rmtree(self._staging, ignore_errors=True)
-            self._staging = None
 
     @contextmanager
     def _naming_failures(self) -> Iterator[None]:

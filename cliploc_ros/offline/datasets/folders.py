@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Folders of images with poses: the table of their layouts, and a reader for all layouts.
 
-This module reads TUM RGB-D, with or without depth, and 7-Scenes; ``captures`` reads the others. It
-converts stored poses to poses in a map: camera axes, unit and vertical. The images reveal a wrong
-choice of axes, see agreement.
+This module reads TUM RGB-D, with or without depth, and 7-Scenes; ``devices`` and ``colmap`` read
+the others. It converts stored poses to poses in a map: camera axes, unit and vertical. The images
+reveal a wrong choice of axes, see agreement.
 """
 
 import hashlib
@@ -23,18 +23,24 @@ from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets import colmap, devices
 from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_agreement, w_first
-from cliploc_ros.offline.datasets.captures import colmap, devices
-from cliploc_ros.offline.datasets.captures.capture import Capture, FolderOptions
 from cliploc_ros.offline.datasets.frames import (
+    Capture,
     DepthFormat,
+    FolderOptions,
     Frames,
     ImageFile,
     folder_frames,
     read_color,
 )
-from cliploc_ros.offline.datasets.intrinsics import find_camera, read_camera
-from cliploc_ros.offline.datasets.parsing import naming, parse_all, read_lines
+from cliploc_ros.offline.datasets.parsing import (
+    find_camera,
+    naming,
+    parse_all,
+    read_camera,
+    read_lines,
+)
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_tum
 from cliploc_ros.offline.mapping.posed_detections import find_levelling, tilt_note

@@ -66,10 +66,7 @@ class LayerOptions:
     kind: FeatureKind = SIFT  #: Kind of the features
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        if not (self.distance_m >= 0.0 and self.angle_deg >= 0.0):
-            raise OptionsError(f'keyframes {self.distance_m} m or {self.angle_deg} degrees apart: '
-                               'give 0 or more')
+        """Refuse a number of points out of range."""
         if not _LEAST_POINTS <= self.most_points <= _MOST_FOUND:
             raise OptionsError(f'{self.most_points} points of a keyframe: give {_LEAST_POINTS} '
                                f'to {_MOST_FOUND}')
@@ -159,22 +156,19 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
     """Yield the images of the keyframes: those without an earlier keyframe nearby."""
-    size = options.distance_m or 1.0  # of the cells that hold poses; at 0, every image is new
-    cells: dict[tuple[int, ...], list[NDArray[np.float64]]] = {}
+    chosen = np.empty((0, 4, 4))
 
     def is_new(place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
+        nonlocal chosen
         if pose is None:
             return False
-        cell = np.floor(pose[:3, 3] / size).astype(np.int64)
-        near = np.array([other for step in np.ndindex(3, 3, 3)
-                         for other in cells.get(tuple((cell + step - 1).tolist()), ())]
-                        ).reshape(-1, 4, 4)
-        near = near[np.linalg.norm(near[:, :3, 3] - pose[:3, 3], axis=1) < options.distance_m]
+        # rotations are compared with the few near ones only, since that takes most of the time
+        near = chosen[np.linalg.norm(chosen[:, :3, 3] - pose[:3, 3], axis=1) < options.distance_m]
         turns = pose[:3, :3].T @ near[:, :3, :3]
         if len(near) and (np.degrees(Rotation.from_matrix(turns).magnitude())
                           < options.angle_deg).any():
             return False
-        cells.setdefault(tuple(cell.tolist()), []).append(pose)
+        chosen = np.concatenate([chosen, pose[None]])
         return True
     for raw in frames.read_raw(is_new):
         try:

@@ -16,8 +16,14 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.storage import open_file
 from cliploc_ros.offline.datasets import parsing
-from cliploc_ros.offline.datasets.captures import capture
-from cliploc_ros.offline.datasets.frames import NO_STAMP, ImageFile
+from cliploc_ros.offline.datasets.frames import (
+    IMAGES,
+    NO_STAMP,
+    Capture,
+    FolderOptions,
+    ImageFile,
+    beside,
+)
 
 _PLACES = ('.', 'sparse', 'sparse/0', 'sparse/1', 'colmap/sparse/0', 'model', 'colmap',
            'distorted/sparse', 'distorted/sparse/0')  # the last two of 3D Gaussian splatting
@@ -65,7 +71,7 @@ class _Posed(NamedTuple):
     pose: NDArray[np.float64] | None  #: (4, 4): map_from_camera
 
 
-def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture:
+def read_colmap(folder: Path, options: FolderOptions) -> Capture:
     """Read the images of a model, or of the largest model of a project.
 
     The folder is that of the model (cameras and images, .bin or .txt), or that of the project.
@@ -93,11 +99,11 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
         notes.append(f'the model is in {len(models)} pieces: {model.name} with '
                      f'{len(found[model])} images is used, {rest} images of the others are not')
     first = found[model][0].name if found[model] else ''
-    beside = ('input', 'images') if _is_distorted(model, folder) else ('images', 'input')
+    names = ('input', 'images') if _is_distorted(model, folder) else ('images', 'input')
     roots = [options.images] if options.images else [
-        *(above / name for above in (folder, *model.resolve().parents[:3]) for name in beside),
+        *(above / name for above in (folder, *model.resolve().parents[:3]) for name in names),
         folder]
-    root = next((path for path in roots if capture.beside(path / first)),
+    root = next((path for path in roots if beside(path / first)),
                 next((path for path in roots if path.is_dir()), folder))
     files = []
     for image in found[model]:
@@ -105,12 +111,12 @@ def read_colmap(folder: Path, options: capture.FolderOptions) -> capture.Capture
             raise DatasetError(f'{model}: image {image.name} is of camera {image.camera_id}, '
                                'which the model does not have')
         color = root / image.name
-        if capture.beside(color) is None:  # a path of another operating system
-            color = next(filter(None, (capture.beside(root / name) for name in (
+        if beside(color) is None:  # a path of another operating system
+            color = next(filter(None, (beside(root / name) for name in (
                 image.name.replace('\\', '/'), PureWindowsPath(image.name).name))), color)
         files.append(ImageFile(NO_STAMP, color, cameras[image.camera_id], image.pose))
-    there = sum(file.suffix.lower() in capture.IMAGES for file in root.rglob('*'))
-    return capture.Capture.of(files, model, 'opencv', is_metric=False, notes=notes, images=there)
+    there = sum(file.suffix.lower() in IMAGES for file in root.rglob('*'))
+    return Capture.of(files, model, 'opencv', is_metric=False, notes=notes, images=there)
 
 
 def _check_same(model: Path, cameras: Mapping[int, Camera], images: Sequence[_Posed]) -> None:
@@ -153,13 +159,13 @@ def _cameras(model: Path, kind: str = '') -> Iterator[tuple[int, Camera]]:
             yield number, _camera(where, _BY_NAME.get(name, -1), name, (width, height),
                                   parsing.parse_all(cells[2:], float, where))
         return
-    with _Bytes(binary) as data:
-        for place in range(data.count(24)):
-            camera_id, number, width, height = data.take('<IiQQ')
-            name = _OTHERS.get(number, f'number {number}')
-            values = data.take(f'<{_MODELS[number].length}d') if number in _MODELS else ()
-            yield camera_id, _camera(f'{binary}: camera {place}', number, name, (width, height),
-                                     values)
+    data = _Bytes(binary)
+    for place in range(data.count(24)):
+        camera_id, number, width, height = data.take('<IiQQ')
+        name = _OTHERS.get(number, f'number {number}')
+        values = data.take(f'<{_MODELS[number].length}d') if number in _MODELS else ()
+        yield camera_id, _camera(f'{binary}: camera {place}', number, name, (width, height),
+                                 values)
 
 
 def _camera(where: str, number: int, name: str, size: tuple[int, int], values: Sequence[float]
@@ -194,12 +200,12 @@ def _images(model: Path, kind: str = '') -> Iterator[_Posed]:
             yield _posed(cells[9], parsing.parse_all(cells[8:9], int, where)[0],
                          parsing.parse_all(cells[1:8], float, where), where)
         return
-    with _Bytes(binary) as data:
-        for _ in range(data.count(73)):
-            _, *numbers, camera_id = data.take('<I7dI')
-            name = data.name()
-            data.skip(24 * data.take('<Q')[0])
-            yield _posed(name, camera_id, numbers, f'{binary}: image {name}')
+    data = _Bytes(binary)
+    for _ in range(data.count(73)):
+        _, *numbers, camera_id = data.take('<I7dI')
+        name = data.name()
+        data.skip(24 * data.take('<Q')[0])
+        yield _posed(name, camera_id, numbers, f'{binary}: image {name}')
 
 
 def _posed(name: str, camera_id: int, numbers: Sequence[float], where: str) -> _Posed:
@@ -218,12 +224,6 @@ class _Bytes:
         with (parsing.naming(path, OSError, ValueError, what='cannot be read: '),
               open_file(path) as file):
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-
-    def __enter__(self) -> '_Bytes':
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._data.close()
 
     def count(self, least_bytes: int) -> int:
         """Read the number of entries that follow, each of at least this size."""

@@ -19,13 +19,11 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth_image import MILLIMETRE
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets import parsing
-from cliploc_ros.offline.datasets.captures import capture
-from cliploc_ros.offline.datasets.frames import NO_STAMP, DepthFormat, ImageFile
+from cliploc_ros.offline.datasets import frames, parsing
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.units import NS_PER_S
 
-_IN_MILLIMETRES = DepthFormat(MILLIMETRE)
+_IN_MILLIMETRES = frames.DepthFormat(MILLIMETRE)
 # HoloLens counts ticks of 100 ns since 1601; ROS counts from 1970.
 _TICK_NS, _TICKS_TO_1970 = 100, 116_444_736_000_000_000
 # ARKitScenes rounds the times in its file names to a millisecond.
@@ -34,7 +32,7 @@ _ROUNDING_S = 0.001
 _MAX_GAP_NS = 200_000_000
 
 
-def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Capture:
+def read_polycam(folder: Path, options: frames.FolderOptions) -> frames.Capture:
     """Read the keyframes of Polycam's raw data, with optimized poses if there are any."""
     root, kind = folder / 'keyframes', 'corrected_'
     if not ((root / 'corrected_images').is_dir() and (root / 'corrected_cameras').is_dir()):
@@ -49,21 +47,22 @@ def read_polycam(folder: Path, options: capture.FolderOptions) -> capture.Captur
             fields.number(name) for name in ('fx', 'fy', 'cx', 'cy')))
         is_stamp = path.stem.isdecimal() and len(path.stem) < 20
         files.append(_with_depth(
-            ImageFile(1000 * int(path.stem) if is_stamp else NO_STAMP,
-                      root / f'{kind}images' / f'{path.stem}.jpg', camera, pose),
+            frames.ImageFile(1000 * int(path.stem) if is_stamp else frames.NO_STAMP,
+                             root / f'{kind}images' / f'{path.stem}.jpg', camera, pose),
             root / 'depth', root / 'confidence', path.stem))
     notes = () if kind else ('its poses are not optimized: they have the drift of ARKit',)
-    return capture.Capture.of(files, root, 'opengl', _IN_MILLIMETRES, 'y', notes=notes)
+    return frames.Capture.of(files, root, 'opengl', _IN_MILLIMETRES, 'y', notes=notes)
 
 
-def _with_depth(image: ImageFile, depths: Path, confidences: Path, stem: str) -> ImageFile:
+def _with_depth(image: frames.ImageFile, depths: Path, confidences: Path, stem: str
+                ) -> frames.ImageFile:
     """Add the depth and confidence images of a stem to an image, if they exist."""
-    depth = capture.beside(depths / f'{stem}.png')
+    depth = frames.beside(depths / f'{stem}.png')
     return image._replace(depth=depth,
-                          confidence=depth and capture.beside(confidences / f'{stem}.png'))
+                          confidence=depth and frames.beside(confidences / f'{stem}.png'))
 
 
-def read_record3d(folder: Path, options: capture.FolderOptions) -> capture.Capture:
+def read_record3d(folder: Path, options: frames.FolderOptions) -> frames.Capture:
     """Read the images of Record3D; its compressed depth is not supported."""
     path = metadata_of_record3d(folder)
     assert path is not None
@@ -82,12 +81,12 @@ def read_record3d(folder: Path, options: capture.FolderOptions) -> capture.Captu
     files = []
     for place, (pose, intrinsics) in enumerate(zip(rows, own, strict=False)):
         where = f'{path}: frame {place}'
-        files.append(ImageFile(
-            _stamp_ns(times[place]) if place < len(times) else NO_STAMP,
-            capture.first_image(images, str(place)) or images / f'{place}.jpg',
+        files.append(frames.ImageFile(
+            _stamp_ns(times[place]) if place < len(times) else frames.NO_STAMP,
+            frames.first_image(images, str(place)) or images / f'{place}.jpg',
             parsing.camera_of(where, *size, *intrinsics.tolist()),
             parsing.pose_of(pose[4:], pose[:4], where)))
-    return capture.Capture.of(files, path, 'opengl', up='y', notes=(
+    return frames.Capture.of(files, path, 'opengl', up='y', notes=(
         'the depth of Record3D is not read: it is compressed with LZFSE or EXR',))
 
 
@@ -95,10 +94,10 @@ def metadata_of_record3d(folder: Path) -> Path | None:
     """Return the metadata file of an unpacked .r3d or an export of Record3D; None if missing."""
     if not any((folder / name).is_dir() for name in ('rgbd', 'rgb')):
         return None
-    return capture.beside(folder / 'metadata') or capture.beside(folder / 'metadata.json')
+    return frames.beside(folder / 'metadata') or frames.beside(folder / 'metadata.json')
 
 
-def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
+def read_stray(folder: Path, options: frames.FolderOptions) -> frames.Capture:
     """Read the images of Stray Scanner, from its video or from rgb/ if it was unpacked there.
 
     The quaternions refer to OpenCV's camera axes.
@@ -108,29 +107,30 @@ def read_stray(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     matrix = parsing.read_numbers(lens, 'fx 0 cx ...')
     if len(matrix) != 3:
         raise DatasetError(f'{lens} has {len(matrix)} rows, expected 3')
-    video = capture.beside(folder / 'rgb.mp4')
+    video = frames.beside(folder / 'rgb.mp4')
     camera = parsing.camera_of(str(lens), *_size_of(folder, video), matrix[0][0], matrix[1][1],
                                matrix[0][2], matrix[1][2])
     files = []
     for place, (where, cells) in enumerate(table):
         time_s, frame, *numbers = parsing.parse_all(cells, float, where)
         stem = f'{frame:06.0f}'
-        image = capture.first_image(folder / 'rgb', stem)
+        image = frames.first_image(folder / 'rgb', stem)
         files.append(_with_depth(
-            ImageFile(_stamp_ns(time_s), image or video or folder / 'rgb' / f'{stem}.jpg', camera,
-                      parsing.pose_of(numbers[:3], numbers[3:7], where),
-                      number=place if image is None and video is not None else None),
+            frames.ImageFile(
+                _stamp_ns(time_s), image or video or folder / 'rgb' / f'{stem}.jpg', camera,
+                parsing.pose_of(numbers[:3], numbers[3:7], where),
+                number=place if image is None and video is not None else None),
             folder / 'depth', folder / 'confidence', stem))
-    return capture.Capture.of(files, path, 'opencv', _IN_MILLIMETRES, 'y')
+    return frames.Capture.of(files, path, 'opencv', _IN_MILLIMETRES, 'y')
 
 
 def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
     """Read width and height of Stray Scanner's images from the first image: no file has them."""
     first = next((file for file in sorted((folder / 'rgb').glob('*.*'))
-                  if file.suffix in capture.IMAGES), None)
+                  if file.suffix in frames.IMAGES), None)
     size = None
     if first is not None:
-        size = capture.size_of_image(first)
+        size = frames.size_of_image(first)
     elif video is not None and (image := cv2.VideoCapture(str(video)).read()[1]) is not None:
         size = image.shape[1], image.shape[0]
     if size is None:
@@ -138,7 +138,7 @@ def _size_of(folder: Path, video: Path | None) -> tuple[int, int]:
     return size
 
 
-def read_arkitscenes(folder: Path, options: capture.FolderOptions) -> capture.Capture:
+def read_arkitscenes(folder: Path, options: frames.FolderOptions) -> frames.Capture:
     """Read a scan of ARKitScenes.
 
     The file of poses has camera_from_map as rotation vector and translation, with OpenCV's camera
@@ -166,10 +166,10 @@ def read_arkitscenes(folder: Path, options: capture.FolderOptions) -> capture.Ca
         camera = _pincam(folder / f'{kind}_intrinsics', scan, float(time))
         if camera is None:
             without.append(color)
-        elif stamp != NO_STAMP:
-            files.append(_with_depth(ImageFile(stamp, color, camera, known.pose_at(stamp)),
+        elif stamp != frames.NO_STAMP:
+            files.append(_with_depth(frames.ImageFile(stamp, color, camera, known.pose_at(stamp)),
                                      folder / 'lowres_depth', folder / 'confidence', color.stem))
-    return capture.Capture.of(files, folder, 'opencv', _IN_MILLIMETRES, 'z', notes=(
+    return frames.Capture.of(files, folder, 'opencv', _IN_MILLIMETRES, 'z', notes=(
         [f'{len(without)} images have no file of intrinsics and are left out, such as '
          f'{without[0]}'] if without else []))
 
@@ -177,7 +177,7 @@ def read_arkitscenes(folder: Path, options: capture.FolderOptions) -> capture.Ca
 def _pincam(folder: Path, scan: str, time_s: float) -> Camera | None:
     """Read the camera of an image, from a file whose time may be rounded; None if missing."""
     for shift_s in (0.0, -_ROUNDING_S, _ROUNDING_S):
-        path = capture.beside(folder / f'{scan}_{time_s + shift_s:.3f}.pincam')
+        path = frames.beside(folder / f'{scan}_{time_s + shift_s:.3f}.pincam')
         if path is not None:
             rows = parsing.read_numbers(path, 'width height fx fy cx cy ...')
             if not rows or not np.isfinite(rows[0]).all():
@@ -187,7 +187,7 @@ def _pincam(folder: Path, scan: str, time_s: float) -> Camera | None:
     return None
 
 
-def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Capture:
+def read_hololens(folder: Path, options: frames.FolderOptions) -> frames.Capture:
     """Read the images of the photo-video camera, unpacked and converted to PNG by the sample.
 
     Long-throw depth needs a table of rays and is not supported.
@@ -206,17 +206,17 @@ def read_hololens(folder: Path, options: capture.FolderOptions) -> capture.Captu
         if len(row) < 18 or not (time.isdecimal() and len(time) < 20):
             raise DatasetError(f'{where}: expected time, fx, fy and the 16 numbers of the pose')
         pose = np.array(row[2:18]).reshape(4, 4)
-        files.append(ImageFile(
+        files.append(frames.ImageFile(
             _TICK_NS * (int(time) - _TICKS_TO_1970), images / f'{time}.png',
             parsing.camera_of(where, round(width), round(height), row[0], row[1], cx, cy),
             pose if pose.any() else None))
-    return capture.Capture.of(files, path, 'opengl', up='y', notes=(
+    return frames.Capture.of(files, path, 'opengl', up='y', notes=(
         'the depth of the HoloLens is not read: it needs its table of rays',))
 
 
 def _stamp_ns(time_s: float) -> int:
-    """Convert a time [s] to nanoseconds; NO_STAMP if it is out of range."""
-    return round(time_s * NS_PER_S) if abs(time_s) < 1e15 else NO_STAMP
+    """Convert a time [s] to nanoseconds; frames.NO_STAMP if it is out of range."""
+    return round(time_s * NS_PER_S) if abs(time_s) < 1e15 else frames.NO_STAMP
 
 
 TRANSFORMS = 'transforms.json'
@@ -229,7 +229,7 @@ _IMAGE_FOLDERS = ('images', 'input', '.')
 _ENDINGS = ('.png', '.jpg', '.jpeg', '.JPG', '.PNG')
 
 
-def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
+def read_nerf(folder: Path, options: frames.FolderOptions) -> frames.Capture:
     """Read the images listed in a transforms.json; `folder` may be that file.
 
     The file is that of nerfstudio, Instant-NGP or the original NeRF. If a folder of images is
@@ -238,14 +238,14 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
     """
     path = folder if folder.name.endswith('.json') else folder / TRANSFORMS
     meta = parsing.Fields.of_file(path)
-    frames = meta.entries('frames') if 'frames' in meta else []
-    if not frames:
+    listed = meta.entries('frames') if 'frames' in meta else []
+    if not listed:
         raise DatasetError(f'{path}: lists no frames')
     scale = meta.number('applied_scale', 1.0)
     if scale <= 0.0:
         raise DatasetError(f'{path}: applied_scale is {scale:g}, not above 0')
     files, cameras, images = [], dict[str, Camera](), options.images
-    for place, values in enumerate(frames):
+    for place, values in enumerate(listed):
         # values of a frame override those of the file
         frame = parsing.Fields(values, f'{path}: frame {place}')
         both = parsing.Fields({**meta.values, 'frames': None, **frame.values}, frame.where)
@@ -260,14 +260,14 @@ def read_nerf(folder: Path, options: capture.FolderOptions) -> capture.Capture:
         full = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])[:4]
         full[:3, 3] /= scale
         depth = frame.text('depth_file_path', frame.text('depth_path', ''))
-        files.append(ImageFile(NO_STAMP, color, cameras[shown], full,
+        files.append(frames.ImageFile(frames.NO_STAMP, color, cameras[shown], full,
                                _file_of(path.parent, depth, None) if depth else None))
     # depth has the unit of the poses: metres, or the arbitrary unit of COLMAP; no field gives it
     unit = next((meta.number(name) for name in ('depth_unit_scale_factor', 'integer_depth_scale')
                  if name in meta), None)
     if unit is not None and unit <= 0.0:
         raise DatasetError(f'{path}: the unit of depth is {unit:g}, not above 0')
-    return capture.Capture.of(files, path, 'opengl', DepthFormat(unit, scale=1.0 / scale),
+    return frames.Capture.of(files, path, 'opengl', frames.DepthFormat(unit, scale=1.0 / scale),
                               is_metric=False)
 
 
@@ -285,7 +285,7 @@ def _file_of(folder: Path, name: str, images: Path | None) -> Path:
         paths = [images / within, images / alone]
     # the original NeRF omits the endings of images
     endings = [Path(f'{path}{end}') for path in paths for end in ('', *_ENDINGS)]
-    return next(filter(None, map(capture.beside, endings)), paths[0])
+    return next(filter(None, map(frames.beside, endings)), paths[0])
 
 
 def _camera(values: parsing.Fields, image: Path) -> Camera:
@@ -295,7 +295,7 @@ def _camera(values: parsing.Fields, image: Path) -> Camera:
     if 'w' in values and 'h' in values:
         width, height = values.size('w', 'h')
     else:
-        size = capture.size_of_image(image)
+        size = frames.size_of_image(image)
         if size is None:
             raise DatasetError(f'{where}: fields w and h are missing, and {image} cannot be read')
         width, height = size
