@@ -17,7 +17,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
-from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.protocols import ClipOptions
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.parsing import parse_stamp_ns
 from cliploc_ros.offline.datasets.tum import TumSequence
@@ -117,7 +117,7 @@ class Reviewer:
         self._localizer = Localizer(self._relocalizer)
         self._observer = None
         if self._options.needs_similarities:
-            from cliploc_ros.models.map_rows import load_encoder_for_map
+            from cliploc_ros.models.clip_encoder import load_encoder_for_map
             from cliploc_ros.models.observer import Observer
             self._observer = Observer(*load_encoder_for_map(
                 ClipOptions(model=values.clip_model, pretrained=values.clip_pretrained),

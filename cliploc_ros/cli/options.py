@@ -9,7 +9,7 @@ from typing import Any
 
 from cliploc_ros.command import finite, not_negative, option, positive, positive_int, within
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.models.profiles import PROFILE_NAMES
+from cliploc_ros.models.protocols import PROFILE_NAMES
 
 # Options for folders only.
 _PLACING = ('images', 'axes', 'scale', 'known_distance')

@@ -25,7 +25,7 @@ from cliploc_ros.core.keyframes.localization import ImageFeatures, query_feature
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.storage import make_folder, write_file
-from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder

@@ -16,8 +16,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT, Features, extract
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, save_layer
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
-from cliploc_ros.core.keyframes.places import Recognition
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognition
 from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, find_pose, free_focal, refine
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError

@@ -12,10 +12,10 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room, see_room
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.acceptance.comparison import weakest_link
 from cliploc_ros.core.acceptance.confidence import Setting, none_right
 from cliploc_ros.core.acceptance.contenders import join_frames
 from cliploc_ros.core.acceptance.depth_check import DepthCheck
-from cliploc_ros.core.acceptance.links import weakest_link
 from cliploc_ros.core.acceptance.looks import EarlierLook, Look, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.calibration import CALIBRATION
@@ -23,8 +23,7 @@ from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.features import SIFT
-from cliploc_ros.core.keyframes.localization import LEAST_S
-from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.localization import LEAST_S, Recognition, RecognizedPlace
 from cliploc_ros.core.localizer import KeptInstant, Localizer, instants_to_fuse
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions

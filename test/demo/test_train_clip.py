@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from cliploc_ros.models.clip_encoder import load_encoder
-from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.onnx_clip import resolve_clip_weights
+from cliploc_ros.models.protocols import ClipOptions
 from demo.world import train_clip
 
 pytestmark = pytest.mark.full
@@ -23,9 +24,9 @@ def test_it_learns_and_is_saved_as_any_clip(worlds, tmp_path, capsys):
     file = tmp_path / 'clip.safetensors'
     train_clip.save(model, file)
     labels = ('a red mug', 'a blue box with white dots')
-    encoder, embeddings = load_encoder(
-        ClipOptions(model=str(train_clip.CONFIG), pretrained=str(file),
-                    cache_dir=str(tmp_path)), labels)
+    clip = ClipOptions(model=str(train_clip.CONFIG), pretrained=str(file), cache_dir=str(tmp_path))
+    encoder = ClipEncoder(resolve_clip_weights(clip), clip)
+    embeddings = encoder.encode_labels(labels)
     model.eval()
     with torch.no_grad():
         wanted = model.encode_text(tokenizer(list(labels)), normalize=True).numpy()

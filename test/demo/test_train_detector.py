@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from demo.world import train_detector
 from demo.world.appearance import CLASSES

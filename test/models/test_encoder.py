@@ -27,13 +27,19 @@ from cliploc_ros.core.map.landmark_embeddings import (
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.clip_encoder import (
+    ClipEncoder,
+    LabelCache,
+    embed_map,
+    encode_labels,
+    load_encoder_for_map,
+    mixed_rows,
+)
 from cliploc_ros.models.files import fingerprint_file
 from cliploc_ros.models.images import crop_bounds, visible_boxes
-from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
-from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
 from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.onnx_clip import resolve_clip_weights
+from cliploc_ros.models.protocols import ClipOptions
 from cliploc_ros.offline.mapping.labelling import embed_phrases
 from demo import ASSETS
 from demo.truth import read_frames

@@ -25,9 +25,10 @@ COMMIT = '1' * 40
 RESOLVE = """
 import json, sys
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.hub import find_network, resolve_folder
-from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.protocols import ClipOptions
+from cliploc_ros.models.onnx_clip import resolve_clip_weights
+from cliploc_ros.models.files import find_network, resolve_folder
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 cache, name = sys.argv[1:]
 networks = ['model.onnx', 'onnx/model.onnx']

@@ -18,9 +18,9 @@ from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
 from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_encoder import ClipEncoder
-from cliploc_ros.models.clip_weights import ClipOptions, names_onnx, resolve_clip_weights
 from cliploc_ros.models.exports import describe_export
-from cliploc_ros.models.onnx_clip import OnnxTextTower
+from cliploc_ros.models.onnx_clip import OnnxTextTower, names_onnx, resolve_clip_weights
+from cliploc_ros.models.protocols import ClipOptions
 from demo import ASSETS
 
 DIM, WORDS, CONTEXT = 8, 49_408, 77

@@ -29,10 +29,10 @@ from cliploc_ros.errors import ModelError
 from cliploc_ros.offline.datasets.intrinsics import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from demo import ASSETS
-from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.map_rows import load_encoder_for_map
+from cliploc_ros.models.protocols import ClipOptions
+from cliploc_ros.models.clip_encoder import load_encoder_for_map
 from cliploc_ros.models.observer import Observer
-from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 
 model, clip_model, pretrained, cache, wake_ups = sys.argv[1:]

@@ -21,11 +21,18 @@ from scene import make_room
 from torchvision.ops import box_iou
 
 from cliploc_ros.errors import ModelError, OptionsError
-from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.hub import is_hub_name
-from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
-from cliploc_ros.models.profiles import PROFILES, load_detector, with_detector, with_encoder
-from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
+from cliploc_ros.models.files import is_hub_name
+from cliploc_ros.models.onnx_detector import load_detector
+from cliploc_ros.models.protocols import (
+    PROFILES,
+    ClipOptions,
+    DetectorOptions,
+    ObjectDetector,
+    prompts_of_map,
+    prompts_of_names,
+    with_detector,
+    with_encoder,
+)
 from cliploc_ros.models.yolo_weights import import_ultralytics, load_yolo
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, describe
@@ -172,7 +179,7 @@ def watch(event, arguments):
 sys.addaudithook(watch)
 
 import numpy as np
-from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 detector = load_detector(DetectorOptions(sys.argv[1], cache_dir=sys.argv[2]))
 for _ in range(3):

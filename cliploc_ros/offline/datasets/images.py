@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth_image import DepthImage
+from cliploc_ros.core.geometry.depth import DepthImage
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.offline.datasets.captures.capture import FolderOptions

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Observation
-from cliploc_ros.models.map_rows import embed_map
+from cliploc_ros.models.clip_encoder import embed_map
 from cliploc_ros.offline.datasets.frames import Frames, undistorted
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth_image import depths_of_boxes
+from cliploc_ros.core.geometry.depth import depths_of_boxes
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.clip_encoder import ClipEncoder
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.profiles import load_detector
-from cliploc_ros.models.protocols import DetectorOptions, ImageTextEncoder
+from cliploc_ros.models.onnx_clip import resolve_clip_weights
+from cliploc_ros.models.onnx_detector import load_detector
+from cliploc_ros.models.protocols import ClipOptions, DetectorOptions, ImageTextEncoder
 from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.observations import camera_from_numbers
 from cliploc_ros.offline.mapping.views import at_border

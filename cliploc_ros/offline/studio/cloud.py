@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.depth_image import points_in_color
+from cliploc_ros.core.geometry.depth import points_in_color
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
