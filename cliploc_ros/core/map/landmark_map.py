@@ -28,14 +28,7 @@ from cliploc_ros.core.map.landmark_details import (
     read_details,
 )
 from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
-from cliploc_ros.core.map.parameter_file import (
-    NO_SET,
-    MapSet,
-    parse_parameters,
-    parse_written_map,
-    read_text,
-    set_of,
-)
+from cliploc_ros.core.map.parameter_file import NO_SET, MapSet, parse_parameters, read_text, set_of
 from cliploc_ros.errors import MapError, did_you_mean
 from cliploc_ros.files.storage import finish_set
 
@@ -349,10 +342,8 @@ class LandmarkMap:
         text = read_text(path)
         map_set = set_of(text)
         finish_set(Path(path), map_set.digest)
-        found: Any = parse_written_map(text)
-        if found is None:
-            tree = parse_parameters(text, path)
-            found = tree[find_map_node(tree, path)]['ros__parameters']['map']
+        tree = parse_parameters(text, path)
+        found = tree[find_map_node(tree, path)]['ros__parameters']['map']
         return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set)
 
     @staticmethod
