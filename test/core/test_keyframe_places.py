@@ -52,12 +52,6 @@ def test_a_layer_comes_back_as_it_was(file):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name
 
 
-def test_an_edited_map_keeps_its_layer(file):
-    fewer = ROOM.select(range(1, len(ROOM)))
-    moved = replace(fewer, centers=fewer.centers + np.eye(len(fewer))[:, :1] * 3.0)
-    assert len(load_layer_of_map(file, moved)) == KEYFRAMES
-
-
 @pytest.fixture
 def corridor():
     """Return twenty keyframes 10 m apart, each with forty points in the middle of the image."""
@@ -216,13 +210,6 @@ def test_malformed_files_are_named(file, changes, message):
         load_layer_of_map(file, ROOM)
 
 
-def test_a_missing_file_and_a_failed_write_are_named(file, tmp_path):
-    with pytest.raises(MapError, match='no such file'):
-        load_layer_of_map(tmp_path / 'none.npz', ROOM)
-    with pytest.raises(MapError, match='cannot be written'):
-        save_layer(tmp_path / 'missing' / 'room.npz', make_layer(ROOM))
-
-
 def test_another_camera_is_noted():
     layer = make_layer(ROOM)
     assert layer.camera_note(CAMERA) == ''
@@ -279,15 +266,6 @@ def test_points_tell_focal_length_and_aspect_also_where_few_agree_with_the_given
     assert (abs(found - 0.5 * np.log((x * y, x / y))) < 3.0 * deviations).all()
     assert (deviations < 0.004).all()
     assert len(inliers) > 250
-
-
-def test_a_plane_that_fills_little_of_the_image_tells_no_focal_length():
-    rng = np.random.default_rng(13)
-    bearings = rng.uniform(-0.1, 0.1, (100, 2))
-    points = 2.0 * np.column_stack([bearings, np.ones(100)])
-    bearings += rng.normal(0.0, 1.0 / LENS.fx, bearings.shape)
-    found = free_focal(points, bearings, np.eye(4))
-    assert found is None or found[1][0] > 0.1
 
 
 def test_few_points_and_points_that_agree_on_nothing_give_no_pose():
@@ -389,16 +367,6 @@ def test_rays_of_equal_features_meet_in_their_point():
     images[2].bearings[:5] += 0.1  # mismatched there, but not in the second image
     found = triangulate(images, 0)
     assert np.abs(found - points).max() < 1e-6
-
-
-def test_without_parallax_there_are_no_points():
-    rng = np.random.default_rng(5)
-    descriptors = rng.integers(0, 255, (20, DIMENSIONS)).astype(np.uint8)
-    bearings = rng.uniform(-0.4, 0.4, (20, 2))
-    images = [PosedFeatures(make_transform(np.eye(3), np.array([x, 0.0, 0.0])), bearings,
-                            descriptors) for x in (0.0, 0.1)]
-    assert np.isnan(triangulate(images, 0)).all()
-    assert np.isnan(triangulate(images[:1], 0)).all()
 
 
 def test_features_are_found_in_any_image():

@@ -185,20 +185,6 @@ def camera():
     return Camera()
 
 
-def test_one_look_of_many_does_not_agree(camera):
-    for number in range(6):
-        camera.look(number / 10, 2.0 * number)
-    assert camera.look(0.7, 3.1) == pytest.approx(1 / 7)
-    assert camera.look(0.8, 3.1, yaw_deg=30.0) == pytest.approx(1 / 8), 'turned by 30 degrees'
-
-
-def test_sure_looks_outweigh_unsure_ones(camera):
-    camera.look(0.0, 9.0, confidence=0.2)
-    assert camera.look(0.1, 1.0) == 0.5
-    assert camera.look(0.2, 1.2, confidence=0.8) == pytest.approx(0.6)
-    assert camera.look(0.3, 9.0) == pytest.approx(0.3)
-
-
 @pytest.mark.parametrize(('turned_deg', 'driven_m'), [(0.0, 0.0), (10.0, 0.0), (10.0, 0.8)])
 def test_odometry_carries_the_looks(camera, turned_deg, driven_m):
     for number in range(10):

@@ -55,10 +55,6 @@ def faults_of(images, where):
     return [faults.add(image, pose) for image, pose in zip(images, where, strict=True)]
 
 
-def test_good_images_have_no_fault(images):
-    assert faults_of(images, poses(6)) == [''] * 6
-
-
 @pytest.mark.parametrize(('change', 'word', 'looks'), [
     (lambda one: one // 20, 'dark', 3),
     (lambda one: np.full_like(one, 90), 'covered', 3),
@@ -233,23 +229,6 @@ def test_a_standing_robot_learns_little_from_more_of_the_same():
 
 
 NOTHING = Detections(np.empty((0, 4)), (), np.empty(0))
-
-
-def test_looks_that_say_the_opposite_are_no_repetitions():
-    weights = []
-    for odds in (-3.0, 3.0):
-        belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
-        assert belief.add(seen, 3.0, is_full=True) == 1.0
-        weights.append(belief.add(seen, odds, is_full=True))
-    assert weights == pytest.approx([1.0 - TERMS.correlated * np.exp(-6.0 / TERMS.most),
-                                     1.0 - TERMS.correlated])
-
-
-def test_without_odometry_looks_share_errors_for_some_seconds():
-    belief, seen = Belief(), Observation(CAMERA, NOTHING)
-    belief.add(seen, 3.0, is_full=True)
-    assert belief.add(replace(seen, stamp_ns=5 * NS_PER_S), 3.0, is_full=True) == pytest.approx(
-        1.0 - TERMS.correlated * np.exp(-5.0 / TERMS.correlated_s))
 
 
 @pytest.mark.parametrize(('way_m', 'time_s'), [(100.0, 0), (0.0, 100), (50.0, 200)])
@@ -448,11 +427,3 @@ def test_a_pose_that_is_off_is_aligned_with_what_is_seen(room):
                  for degrees in (19.0, 21.0))
     assert near.away_deg == pytest.approx(19.0, abs=0.2)
     assert far.away_deg < 20.0, 'no localizer is that far off'
-
-
-@pytest.mark.parametrize(('similarities', 'matching'), [(False, 'class'), (True, 'hybrid')])
-def test_without_similarities_a_look_matches_by_class(room, similarities, matching):
-    seen = see(room, drive(1)[0])
-    if similarities:
-        seen = replace(seen, similarities=np.zeros((len(seen.detections), COUNT)))
-    assert look_at(room, seen, RelocalizerOptions()).options.matching == matching

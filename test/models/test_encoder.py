@@ -13,8 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scene import make_room
 
 from cliploc_ros.core.map.joined_map import join_maps
@@ -90,14 +88,6 @@ def test_the_weighted_mean_in_numbers():
     assert rows[0] == pytest.approx([0.6, 0.8, 0.0])
     assert np.array_equal(rows[1], encode('c')[0])  # to the last bit
     assert rows[2] == pytest.approx(np.array([0.0, 1.6, 0.8]) / np.sqrt(3.2))
-
-
-def test_a_label_beside_the_list_counts_like_the_best():
-    """As when a person renames a landmark that build_map had described."""
-    one = LandmarkDetails(labels=(('a red mug', 0.5), ('a cup', 0.2)))
-    assert one.labels_with('a cup') == one.labels
-    assert one.labels_with('my mug') == (('my mug', 0.5), *one.labels)
-    assert LandmarkDetails().labels_with('my mug') == (('my mug', 1.0),)
 
 
 @pytest.fixture(scope='module')
@@ -217,16 +207,6 @@ def test_box(bbox, bounds):
     else:
         with pytest.raises(CliplocError, match=r'box 0, .*64x48'):
             crop_bounds(bboxes, 64, 48)
-
-
-@given(st.lists(st.lists(st.floats(), min_size=4, max_size=4), max_size=8),
-       st.integers(1, 50), st.integers(1, 50))
-def test_every_visible_box_has_pixels(boxes, width, height):
-    bboxes = np.array(boxes).reshape(-1, 4)
-    kept = bboxes[visible_boxes(bboxes, width, height)]
-    left, top, right, bottom = crop_bounds(kept, width, height).T
-    assert ((left >= 0) & (left < right) & (right <= width)).all()
-    assert ((top >= 0) & (top < bottom) & (bottom <= height)).all()
 
 
 def test_fingerprint(tmp_path):

@@ -157,11 +157,6 @@ def test_an_interrupted_download_goes_on(hub, tmp_path):
     assert not any('GET' in line and line.endswith('/config.json') for line in hub.requests)
 
 
-def test_a_repository_without_onnx(hub, tmp_path):
-    hub.files = {'model.safetensors': b'large'}
-    assert 'has none of model.onnx, onnx/model.onnx' in resolve(tmp_path)['error']
-
-
 def test_weights_of_a_tag(hub, tmp_path):
     """They are downloaded once, even if they are then refused."""
     hub.files = {'open_clip_model.safetensors': safetensors(4 * 16)}

@@ -154,21 +154,6 @@ def test_boxes_of_d_fine_equal_those_of_the_library(tmp_path, cache):
     assert px < 0.5 and score < 0.01
 
 
-def test_files_that_are_no_yolo(tmp_path, cache):
-    for name, write, message in (
-            ('other.pt', lambda file: torch.save({'visual.proj': torch.zeros(3)}, file),
-             'not a detection model'),
-            ('gone.pt', lambda file: None, 'does not exist'),
-            ('folder', Path.mkdir, 'has none of model.onnx'),
-            ('text.pt', lambda file: file.write_text('text'), 'holds no weights')):
-        write(tmp_path / name)
-        with pytest.raises(ModelError) as caught:
-            detector(tmp_path / name, cache)
-        text = str(caught.value)
-        assert message in text and str(tmp_path / name) in text
-        assert '\n' not in text and text.isascii()
-
-
 WATCHED_RUN = """
 import json, os, sys
 events = []
