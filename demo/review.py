@@ -158,11 +158,10 @@ class Reviewer:
         image_rgb = np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
         detections = wake_up.detections[name].usable(camera.width, camera.height,
                                                      self._values.max_detections)
-        observation = Observation(camera, detections, stamp_ns=stamp_ns) \
-            if self._observer is None else self._observer.observe(image_rgb, camera, detections,
-                                                                  stamp_ns)
-        return image_rgb, replace(observation, camera_name=name,
-                                  odom_from_camera=self._mounts[name])
+        similarities = None if self._observer is None else self._observer.crops(
+            image_rgb, detections.bboxes_xyxy, {}).compare(np.arange(len(detections)))
+        return image_rgb, Observation(camera, detections, similarities, stamp_ns, name,
+                                      odom_from_camera=self._mounts[name])
 
     def _search(self, localizer: Localizer, first: Observation, others: Sequence[Observation]
                 ) -> Relocalization:

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,15 +62,9 @@ _SCHEMA = Schema('file of label embeddings', {
 logger = logging.getLogger(__name__)
 
 
-class LoadedEncoder(NamedTuple):
-    """An encoder for crops, and the embeddings (L, d) of a map's labels."""
-
-    encoder: 'ClipEncoder'
-    label_embeddings: LabelEmbeddings
-
-
 def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
-                         map_files: Sequence[str], compare: str) -> LoadedEncoder:
+                         map_files: Sequence[str], compare: str
+                         ) -> tuple['ClipEncoder', LabelEmbeddings]:
     """Load CLIP and the embeddings that crops are compared with, see embed_map.
 
     If the cache has the embeddings for model, weights and labels, the text tower is not loaded.
@@ -84,7 +77,7 @@ def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
     weights = resolve_clip_weights(options)
     encoder = ClipEncoder(weights, options)
     logger.info('CLIP %s is ready after %.1f s', weights.model, time.monotonic() - started)
-    return LoadedEncoder(encoder, embeddings)
+    return encoder, embeddings
 
 
 def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequence[str],
@@ -176,7 +169,6 @@ class ClipEncoder:
 
     def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
         self._weights = weights
-        self._options = options
         self._tower = OnnxTower(weights, options.cache_dir)
         #: Equal keys (model and weights) give equal label embeddings.
         self.key = weights.key
@@ -203,10 +195,6 @@ class ClipEncoder:
                 for left, top, right, bottom in
                 bounds[start:start + _BATCH].tolist()])))
         return _unit_rows(features, self._weights)
-
-    def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:
-        """Return the embeddings (L, d) of labels; loads and frees the text tower."""
-        return encode_labels(self._weights, labels, self._options)
 
 
 def encode_labels(weights: ClipWeights, labels: Sequence[str], options: ClipOptions

@@ -79,7 +79,7 @@ class ClipOptions:
 
 
 class ImageTextEncoder(Protocol):
-    """Embeds image crops and text labels in a common space, with cosine similarity."""
+    """Embeds image crops in the space of label embeddings, with cosine similarity."""
 
     key: str  #: Identifies model and weights: equal keys give equal embeddings
 
@@ -90,9 +90,6 @@ class ImageTextEncoder(Protocol):
         The boxes (n, 4) are left, top, right, bottom [px]; each must overlap the image. The
         embeddings have unit length.
         """
-
-    def encode_labels(self, labels: Sequence[str]) -> 'NDArray[np.float32]':
-        """Return the embeddings (L, d) of L labels, float32 rows of unit length."""
 
 
 class ObjectDetector(Protocol):

@@ -96,9 +96,9 @@ class KeptFeatures(ImageFeatures):
         super().__init__(lambda: raw.color()[0], raw.color()[1])
         self._looker = looker
 
-    def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
-        """Return the features of a pass, with a time of 0."""
-        return self._looker.features(self._read_rgb(), is_thorough), 0.0
+    def of_pass(self, is_thorough: bool) -> Features:
+        """Return the features of a pass."""
+        return self._looker.features(self._read_rgb(), is_thorough)
 
 
 def keep(path: Path, what: Any) -> None:

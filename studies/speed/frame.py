@@ -165,7 +165,9 @@ def _demo_frame(crops: int, folder: str) -> tuple[NDArray[np.uint8], Observation
     clip = ClipOptions(pretrained=str(ASSETS / 'clip'), cache_dir=folder)
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     observer = Observer(*load_encoder_for_map(clip, landmark_map, [], 'text'))
-    return image_rgb, observer.observe(image_rgb, camera, detections, 0)
+    observed = observer.crops(image_rgb, detections.bboxes_xyxy, {})
+    return image_rgb, Observation(camera, detections,
+                                  observed.compare(np.arange(len(detections))))
 
 
 def _resident_mib() -> float:

@@ -11,7 +11,8 @@ from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.fit.covariance import EXACT, normalized_square, refined_covariance
+from cliploc_ros.core.fit.camera_fit import ERRORS
+from cliploc_ros.core.fit.covariance import normalized_square, refined_covariance
 from cliploc_ros.core.fit.refinement import (
     LEAST_SHARE,
     jacobian_of,
@@ -188,7 +189,10 @@ def boxes_at(map_from_camera, noise_px=0.0, rng=None):
     return boxes if rng is None else boxes + rng.normal(0, noise_px, boxes.shape)
 
 
-def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=None,
+UNSHARED, EXACT = np.zeros((len(ROOM), 2)), np.zeros(ERRORS)
+
+
+def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=UNSHARED,
            wrong_share=0.0, camera=CAMERA, deviations=EXACT):
     """Return the pose of the last camera in a map with these centres, and its covariance."""
     scenes = [make_scene(camera.normalize_bboxes(boxes_at(pose, noise_px, rng)), centers,
@@ -201,7 +205,7 @@ def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=No
     stamps = np.arange(len(poses)) if stamps is None else np.array(stamps)
     return (invert_transform(make_transform(found.rotation, found.translation)),
             refined_covariance(rig, found.rotation, found.translation, stamps, shared,
-                               wrong_share, camera_deviations=deviations))
+                               wrong_share, (0.0, 0.0), deviations))
 
 
 def turning(count):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions
 from demo.world import train_clip
@@ -25,8 +25,8 @@ def test_it_learns_and_is_saved_as_any_clip(worlds, tmp_path, capsys):
     train_clip.save(model, file)
     labels = ('a red mug', 'a blue box with white dots')
     clip = ClipOptions(model=str(train_clip.CONFIG), pretrained=str(file), cache_dir=str(tmp_path))
-    encoder = ClipEncoder(resolve_clip_weights(clip), clip)
-    embeddings = encoder.encode_labels(labels)
+    weights = resolve_clip_weights(clip)
+    encoder, embeddings = ClipEncoder(weights, clip), encode_labels(weights, labels, clip)
     model.eval()
     with torch.no_grad():
         wanted = model.encode_text(tokenizer(list(labels)), normalize=True).numpy()

@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 
 from cliploc_ros.cli.export_network import main as export_network
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
 from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.onnx_clip import OnnxTextTower, resolve_clip_weights
 from cliploc_ros.models.onnx_detector import load_detector
@@ -85,15 +85,20 @@ def image_rgb() -> np.ndarray:
     return (127 + 50 * waves + noise).clip(0, 255).astype(np.uint8)
 
 
-def load(clip: Reference | Path, cache: Path, file: Path | None = None) -> ClipEncoder:
-    options = (ClipOptions(pretrained=str(clip), cache_dir=str(cache)) if isinstance(clip, Path)
-               else ClipOptions(str(clip.config), str(file or clip.file), cache_dir=str(cache)))
+def options_of(clip: Reference | Path, cache: Path, file: Path | None = None) -> ClipOptions:
+    return (ClipOptions(pretrained=str(clip), cache_dir=str(cache)) if isinstance(clip, Path)
+            else ClipOptions(str(clip.config), str(file or clip.file), cache_dir=str(cache)))
+
+
+def load(*clip: Any) -> ClipEncoder:
+    options = options_of(*clip)
     return ClipEncoder(resolve_clip_weights(options), options)
 
 
-def least_cosines(encoder: ClipEncoder, expected: Reference, image_rgb: np.ndarray
-                  ) -> list[float]:
-    found = encoder.encode_crops(image_rgb, BBOXES), encoder.encode_labels(LABELS)
+def least_cosines(options: ClipOptions, expected: Reference, image_rgb: np.ndarray) -> list[float]:
+    weights = resolve_clip_weights(options)
+    found = (ClipEncoder(weights, options).encode_crops(image_rgb, BBOXES),
+             encode_labels(weights, LABELS, options))
     assert all(rows.dtype == np.float32 for rows in found)
     return [float((rows * wanted).sum(axis=1).min())
             for rows, wanted in zip(found, expected.embed(image_rgb), strict=True)]
@@ -133,7 +138,7 @@ def test_forms_of_checkpoints(small_clip, tmp_path, image_rgb, write, suffix):
         other = (expected.embed(image_rgb)[0] * small_clip.embed(image_rgb)[0]).sum(axis=1)
         assert other.min() < 0.99999, 'the two activations differ'
     encoder = load(small_clip, tmp_path, file)
-    cosines = least_cosines(encoder, expected, image_rgb)
+    cosines = least_cosines(options_of(small_clip, tmp_path, file), expected, image_rgb)
     print(f'\nleast cosine to open_clip: {cosines}')
     assert cosines[0] > 0.9999 and cosines[1] > 0.999999  # crops may be encoded in bf16
     # the batch size has no influence
@@ -155,7 +160,7 @@ def test_export_network_gives_the_embeddings_of_open_clip(exported, small_clip, 
                                                           image_rgb, caplog):
     assert exported.stat().st_mode & 0o055 == 0o055, 'other users may read it'
     encoder = load(exported, tmp_path)
-    assert min(least_cosines(encoder, small_clip, image_rgb)) > 0.999
+    assert min(least_cosines(options_of(exported, tmp_path), small_clip, image_rgb)) > 0.999
     # embeddings that were made with the weights themselves stay valid
     assert encoder.key == load(small_clip, tmp_path).key
     caplog.clear()

@@ -154,7 +154,7 @@ def test_images_of_this_encoder_are_compared(clip, map_file, compare):
     images = images_of(clip)
     save_landmark_embeddings(embeddings_path(map_file), images)
     plain = np.asarray(embed_map(clip, ROOM, [str(map_file)], 'text'))
-    rows = np.asarray(load_encoder_for_map(clip, ROOM, [str(map_file)], compare).label_embeddings)
+    rows = np.asarray(load_encoder_for_map(clip, ROOM, [str(map_file)], compare)[1])
     assert np.array_equal(plain, np.asarray(embed_map(clip, ROOM, [], compare)))
     similar = np.sum(rows * images.means, axis=1)
     assert (similar > np.sum(plain * images.means, axis=1) + 0.2).all()

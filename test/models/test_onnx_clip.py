@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_encoder import ClipEncoder
+from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
 from cliploc_ros.models.exports import describe_export
 from cliploc_ros.models.onnx_clip import OnnxTextTower, names_onnx, resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions
@@ -109,7 +109,8 @@ def test_both_layouts_give_the_embeddings_of_their_towers(layout, cache, request
     np.testing.assert_allclose(crops, expected, atol=1e-2)  # may be encoded in bf16
     rows = [[START, *tokens, END] + [0] * (CONTEXT - 2 - len(tokens))
             for tokens in TOKENS.values()]
-    labels = encoder.encode_labels(list(TOKENS))
+    clip = ClipOptions(pretrained=str(request.getfixturevalue(layout)), cache_dir=cache)
+    labels = encode_labels(resolve_clip_weights(clip), list(TOKENS), clip)
     np.testing.assert_allclose(labels, unit(OF_TOKEN[rows].mean(axis=1)), atol=1e-4)
 
 
@@ -173,8 +174,10 @@ def other_words(file: Path) -> None:
 def test_what_is_no_clip(published, cache, tmp_path, change, named):
     folder = Path(shutil.copytree(published, tmp_path / 'clip'))
     change(folder)
+    clip = ClipOptions(pretrained=str(folder), cache_dir=cache)
     with pytest.raises(ModelError) as caught:
-        load(folder, cache).encode_labels(['a cup'])
+        ClipEncoder(resolve_clip_weights(clip), clip)
+        encode_labels(resolve_clip_weights(clip), ['a cup'], clip)
     assert named in str(caught.value) and str(folder) in str(caught.value)
 
 

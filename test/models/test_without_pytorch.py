@@ -23,6 +23,7 @@ POSES = """
 import json, sys
 import cv2, numpy as np
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import ModelError
@@ -49,7 +50,8 @@ found = []
 for file in read_tum(ASSETS / 'sequence').image_paths[::5][:int(wake_ups)]:
     image = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
     boxes = detector.detect(image).usable(camera.width, camera.height, 50)
-    pose = relocalizer.relocalize([observer.observe(image, camera, boxes, 0)])
+    crops = observer.crops(image, boxes.bboxes_xyxy, {}).compare(np.arange(len(boxes)))
+    pose = relocalizer.relocalize([Observation(camera, boxes, crops)])
     found.append(np.asarray(pose.map_from_camera).tolist() if pose.accepted else None)
 print(json.dumps({'poses': found,
                   'loaded': sorted({'torch', 'ultralytics', 'open_clip'} & set(sys.modules))}))

@@ -48,10 +48,9 @@ from cliploc_ros.core.acceptance.look_alikes import find_twins, lead_over_twin, 
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
 from cliploc_ros.core.calibration import CALIBRATION
-from cliploc_ros.core.fit.covariance import fuse, share_within
+from cliploc_ros.core.fit.covariance import POSE_UNKNOWN, fuse, refined_covariance, share_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
-    covariance_of,
     find_finalists,
     instants_of,
     matches_of,
@@ -216,10 +215,13 @@ class Comparison:
                 return by_points
         assert best is not None
         joined = self._joined
-        covariance = covariance_of(joined.frames, joined.rig, best.finalist,
-                                   joined.landmark_map.shared_sigmas,
-                                   joined.options.mount_deviation, CALIBRATED)
-        if best.finalist.information is not None:
+        finalist, covariance = best.finalist, POSE_UNKNOWN
+        if finalist.information is None or finalist.information.any():
+            covariance = refined_covariance(
+                joined.rig, finalist.rotation, finalist.translation, instants_of(joined.frames),
+                joined.landmark_map.shared_sigmas, CALIBRATION.covariance.wrong_share,
+                joined.options.mount_deviation, CALIBRATED)
+        if finalist.information is not None:
             found_by_objects = [contender for contender in self.contenders
                                 if contender.recognized is None]
             found_by_objects.sort(key=lambda contender: contender is not best)

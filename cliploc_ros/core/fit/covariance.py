@@ -57,8 +57,6 @@ PRIOR_VARIANCES = np.repeat([_TERMS.unfixed_m2, _TERMS.unfixed_rad2], 3)
 _STANDS_STILL = 1e-9
 # Grid of weights of the first pose on which covariance intersection searches for the minimum.
 _WEIGHTS = np.linspace(0.0, 1.0, 11)
-#: Standard deviations of the errors of a perfect camera.
-EXACT = np.zeros(ERRORS)
 #: Covariance of a pose that the boxes do not determine.
 POSE_UNKNOWN = np.diag(PRIOR_VARIANCES)
 # The following are not in calibration.yaml, because the input of a filter affects no decision
@@ -180,10 +178,9 @@ class _Fit(NamedTuple):
 
 
 def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDArray[np.float64],
-                       instants: NDArray[np.int64], shared: NDArray[np.float64] | None = None,
-                       wrong_share: float = _TERMS.wrong_share,
-                       mount_deviation: tuple[float, float] = (0.0, 0.0),
-                       camera_deviations: NDArray[np.float64] = EXACT) -> NDArray[np.float64]:
+                       instants: NDArray[np.int64], shared: NDArray[np.float64],
+                       wrong_share: float, mount_deviation: tuple[float, float],
+                       camera_deviations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the covariance (6, 6) of a pose that was refined on its inliers.
 
     Parameters
@@ -193,7 +190,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     instants : ndarray (F,)
         Number of the instant of each frame, in the order of odometry: greater for later instants,
         equal for several cameras at one instant.
-    shared : ndarray (L, 2), optional
+    shared : ndarray (L, 2)
         Standard deviations of the common displacement and turn of each landmark and its neighbours
         [m] [rad].
     wrong_share : float
@@ -227,9 +224,8 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     matched = _sandwich(information, noise)
     # errors common to all objects, which remain if an object is left out
     common = _calibration_noise(fit.calibrations, instants, camera_deviations)
-    if shared is not None:
-        deviations = np.repeat(shared[fit.numbers], 3, axis=1)
-        common += _squared((of_objects * deviations[:, None, :]).sum(axis=0))
+    deviations = np.repeat(shared[fit.numbers], 3, axis=1)
+    common += _squared((of_objects * deviations[:, None, :]).sum(axis=0))
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
                       fit.objects, len(fit.sigmas))
     wrong = _change_without_each(information - of_objects, noise - noise_of_objects, gradients,

@@ -179,14 +179,12 @@ class ImageFeatures:
     def __init__(self, read_rgb: Callable[[], NDArray[np.uint8]], camera: Camera,
                  kind: FeatureKind = SIFT) -> None:
         self._read_rgb, self.camera, self._kind = read_rgb, camera, kind
-        self._found: dict[bool, tuple[Features, float]] = {}
+        self._found: dict[bool, Features] = {}
 
-    def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
-        """Return the features of a pass, and the time of their extraction [ms]."""
+    def of_pass(self, is_thorough: bool) -> Features:
+        """Return the features of a pass."""
         if is_thorough not in self._found:
-            image_rgb, begin = self._read_rgb(), time.perf_counter()
-            features = query_features(image_rgb, self._kind, is_thorough)
-            self._found[is_thorough] = features, 1e3 * (time.perf_counter() - begin)
+            self._found[is_thorough] = query_features(self._read_rgb(), self._kind, is_thorough)
         return self._found[is_thorough]
 
 
@@ -285,9 +283,14 @@ class KeyframeLocalizer:
             matched = matched.join(self._match(descriptors, more, deadline))
             first = _place(matched, look)
         if first is None or first.agreed < LEAST_INLIERS:
-            near = self._search_further(descriptors, look, ranks[_SIMILAR + _MORE:], deadline)
-            matched = matched.join(self._match(descriptors, near, deadline))
-            first = _place(matched, look)
+            # search less similar keyframes for a pose, and match the keyframes near it
+            further = _place(self._match(descriptors[:_STRONGEST], ranks[_SIMILAR + _MORE:][
+                :_FURTHER], deadline), look, _RIVAL_ITERATIONS)
+            if further is not None and further.agreed >= _CLEAR:
+                near = keyframes_near(self.layer.map_from_camera, further.map_from_camera
+                                      )[:_MORE].tolist()
+                matched = matched.join(self._match(descriptors, near, deadline))
+                first = _place(matched, look)
         return first, matched
 
     def _search_thoroughly(self, descriptors: NDArray[np.float32], look: _Look,
@@ -358,15 +361,6 @@ class KeyframeLocalizer:
         """Return the keyframes with inliers, in decreasing order, and the inliers (K,) of each."""
         counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
         return np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)], counts
-
-    def _search_further(self, descriptors: NDArray[np.float32], look: _Look, ranks: Sequence[int],
-                        deadline: float) -> list[int]:
-        """Search less similar keyframes for a pose; return the keyframes near it, or none."""
-        matched = self._match(descriptors[:_STRONGEST], ranks[:_FURTHER], deadline)
-        place = _place(matched, look, _RIVAL_ITERATIONS)
-        if place is None or place.agreed < _CLEAR:
-            return []
-        return keyframes_near(self.layer.map_from_camera, place.map_from_camera)[:_MORE].tolist()
 
     def coverage(self, map_from_camera: NDArray[np.float64], camera: Camera) -> float:
         """Return the share of an image that the layer covers at a pose (4, 4).
@@ -572,8 +566,6 @@ class ImageRecognizer:
         self._may_be_thorough = may_be_thorough
         self._known: tuple[set[int], Recognition] | None = None
         self._fast: Recognition | None = None
-        #: Total time of recognition [ms], including features.
-        self.spent_ms = 0.0
 
     def begin_thorough(self) -> bool:
         """Switch to the thorough pass; False if already in it, not allowed, or out of time."""
@@ -590,13 +582,9 @@ class ImageRecognizer:
             self._keyframes.layer.map_from_camera, guess)[:PROPOSED].tolist()}
         if self._known is None or not near <= self._known[0]:
             self._begin_stage('keyframes')
-            features, features_ms = self._features.of_pass(self._fast is not None)
-            if self._known is None:
-                self.spent_ms += features_ms
-            begin = time.perf_counter()
             self._known = near, self._keyframes.localize_features(
-                features, self._features.camera, guesses, self.deadline, constraint, self._fast)
-            self.spent_ms += 1e3 * (time.perf_counter() - begin)
+                self._features.of_pass(self._fast is not None), self._features.camera, guesses,
+                self.deadline, constraint, self._fast)
             self._begin_stage('search')
         return self._known[1]
 
