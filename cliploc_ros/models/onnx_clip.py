@@ -10,8 +10,7 @@ The meaning of inputs and outputs is read from the files and the configurations 
 import contextlib
 import html
 import os
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -126,7 +125,7 @@ class OnnxTower:
     def __init__(self, weights: ClipWeights, cache_dir: str) -> None:
         network = OnnxNetwork(weights.image_tower, cache_dir, None)
         self._network, self._input = network, network.image_input()
-        self.prepare = CropPreparation(read_preparation(weights.folder, self._input.shape[2:]))
+        self.prepare = CropPreparation(weights.folder, self._input.shape[2:])
         probe = self.prepare(np.zeros((32, 32, 3), dtype=np.uint8))[None]
         self._output = _embedding(network, self._run(probe), weights)
 
@@ -140,67 +139,59 @@ class OnnxTower:
         return self._network(**{self._input.name: batch.astype(self._input.type, copy=False)})
 
 
-def read_preparation(folder: Path, fixed: Sequence[int]) -> dict[str, Any]:
-    """Read the preparation of crops, in the format of `CropPreparation`.
-
-    ``fixed`` has height and width of the network's input, ANY where they vary. ModelError: the
-    configuration is missing, incomplete, or from another network.
-    """
-    file = folder / PREPROCESSOR
-    if (folder / PREPROCESS).exists():  # the format of open_clip
-        file = folder / PREPROCESS
-    about = read_config(file, 'it defines the preparation of images')
-    size = about.get('size')
-    squashes = not about.get('do_center_crop', isinstance(size, dict) and 'shortest_edge' in size)
-    found = {'size': about.get('crop_size') if not squashes else size,
-             'resize_mode': 'squash' if squashes else 'shortest',
-             'interpolation': _FILTERS.get(about.get('resample', 3), 'bicubic'),
-             'mean': about.get('image_mean'), 'std': about.get('image_std')}
-    if file.name != PREPROCESSOR:
-        found = about
-    elif not about.get('do_normalize', True):
-        found |= {'mean': [0.0] * 3, 'std': [1.0] * 3}
-    size = found.get('size')
-    if isinstance(size, dict):
-        size = size.get('shortest_edge', (size.get('height'), size.get('width')))
-    try:
-        height, width = map(int, (size, size) if isinstance(size, int) else tuple(size))  # type: ignore[arg-type]
-        mean, std = (np.array(found[name], np.float32).reshape(3) for name in ('mean', 'std'))
-        if not (0 < height <= _MOST_PX and 0 < width <= _MOST_PX and np.isfinite(mean).all()
-                and np.isfinite(std).all() and (std > 0.0).all()):
-            raise ValueError('a number is out of range')
-    except (LookupError, ValueError, TypeError, OverflowError) as error:
-        raise ModelError(f'{file} does not define the preparation of images: expected a size up '
-                         f'to {_MOST_PX} x {_MOST_PX}, and a mean and a standard deviation of '
-                         'three numbers each') from error
-    if (height, width) != tuple(want if want != ANY else has for want, has in
-                                zip(fixed, (height, width), strict=True)):
-        raise ModelError(f'{file} has an image size of {height} x {width}, but the network takes '
-                         f'{fixed[0]} x {fixed[1]}: they are not from the same CLIP')
-    return found | {'size': (height, width), 'mean': mean.tolist(), 'std': std.tolist()}
-
-
 class CropPreparation:
     """Scales crops to the input of a tower, as in open_clip.
 
-    ``config`` is open_clip's ``PreprocessCfg``: size, mean, std, interpolation, resize_mode
-    ('shortest', 'longest' or 'squash') and fill_color.
+    The configuration is that of transformers or open_clip's ``PreprocessCfg``: size, mean, std,
+    interpolation, resize_mode ('shortest', 'longest' or 'squash') and fill_color. ``fixed`` has
+    height and width of the network's input, ANY where they vary. ModelError: the configuration is
+    missing, incomplete, or from another network.
     """
 
-    def __init__(self, config: Mapping[str, Any]) -> None:
-        size = config['size']
-        self._height, self._width = map(int, (size, size) if isinstance(size, int) else size)
-        self._mode = config.get('resize_mode') or 'shortest'
-        self._filter = (Image.Resampling.BILINEAR if config.get('interpolation') == 'bilinear'
+    def __init__(self, folder: Path, fixed: Sequence[int]) -> None:
+        file = folder / PREPROCESS
+        if file.exists():  # the format of open_clip
+            about = read_config(file, 'it defines the preparation of images')
+        else:
+            file = folder / PREPROCESSOR
+            about = _in_the_form_of_open_clip(
+                read_config(file, 'it defines the preparation of images'))
+        size = about.get('size')
+        if isinstance(size, dict):
+            size = size.get('shortest_edge', (size.get('height'), size.get('width')))
+        try:
+            height, width = map(int, (size, size) if isinstance(size, int) else tuple(size))  # type: ignore[arg-type]
+            mean, std = (np.array(about[name], np.float32).reshape(3, 1, 1)
+                         for name in ('mean', 'std'))
+            if not (0 < height <= _MOST_PX and 0 < width <= _MOST_PX and np.isfinite(mean).all()
+                    and np.isfinite(std).all() and (std > 0.0).all()):
+                raise ValueError('a number is out of range')
+        except (LookupError, ValueError, TypeError, OverflowError) as error:
+            raise ModelError(f'{file} does not define the preparation of images: expected a size '
+                             f'up to {_MOST_PX} x {_MOST_PX}, and a mean and a standard deviation '
+                             'of three numbers each') from error
+        if any(want not in (ANY, has) for want, has in zip(fixed, (height, width), strict=True)):
+            raise ModelError(f'{file} has an image size of {height} x {width}, but the network '
+                             f'takes {fixed[0]} x {fixed[1]}: they are not from the same CLIP')
+        self._height, self._width, self._mean, self._std = height, width, mean, std
+        self._mode = about.get('resize_mode') or 'shortest'
+        self._filter = (Image.Resampling.BILINEAR if about.get('interpolation') == 'bilinear'
                         else Image.Resampling.BICUBIC)
-        self._fill = config.get('fill_color') or 0
-        self._mean, self._std = (np.float32(config[name]).reshape(-1, 1, 1)
-                                 for name in ('mean', 'std'))
-        self._max_aspect = _MAX_ASPECT if self._mode == 'shortest' else sys.maxsize
+        self._fill = about.get('fill_color') or 0
 
     def __call__(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Convert a crop (h, w, 3) to the input (3, H, W) of the tower."""
-        image = Image.fromarray(np.ascontiguousarray(self._cut(crop_rgb)))
+        """Convert a crop (h, w, 3) to the input (3, H, W) of the tower.
+
+        A very long crop is first cut to its middle: the short side is scaled to the tower's input
+        before the central square is cut out, and a crop of 1 x 2000 pixels would become an image
+        of 224 x 448,000.
+        """
+        if self._mode == 'shortest':
+            height, width = crop_rgb.shape[:2]
+            longest = _MAX_ASPECT * min(height, width)
+            cut_x, cut_y = max(width - longest, 0) // 2, max(height - longest, 0) // 2
+            crop_rgb = crop_rgb[cut_y:height - cut_y, cut_x:width - cut_x]
+        image = Image.fromarray(np.ascontiguousarray(crop_rgb))
         image = image.resize(self._scaled(*image.size), self._filter)
         left, top = (round((has - wants) / 2.0) for has, wants in
                      zip(image.size, (self._width, self._height), strict=True))
@@ -225,16 +216,16 @@ class CropPreparation:
         ratio = max(ratios) if self._mode == 'longest' else min(ratios)
         return round(width / ratio), round(height / ratio)
 
-    def _cut(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Cut a very long crop to its middle.
 
-        The short side is scaled to the tower's input before the central square is cut out. A crop
-        of 1 x 2000 pixels would first become an image of 224 x 448,000.
-        """
-        height, width = crop_rgb.shape[:2]
-        longest = self._max_aspect * min(height, width)
-        cut_x, cut_y = max(width - longest, 0) // 2, max(height - longest, 0) // 2
-        return crop_rgb[cut_y:height - cut_y, cut_x:width - cut_x]
+def _in_the_form_of_open_clip(about: dict[str, Any]) -> dict[str, Any]:
+    size = about.get('size')
+    squashes = not about.get('do_center_crop', isinstance(size, dict) and 'shortest_edge' in size)
+    is_scaled = about.get('do_normalize', True)
+    return {'size': about.get('crop_size') if not squashes else size,
+            'resize_mode': 'squash' if squashes else 'shortest',
+            'interpolation': _FILTERS.get(about.get('resample', 3), 'bicubic'),
+            'mean': about.get('image_mean') if is_scaled else [0.0] * 3,
+            'std': about.get('image_std') if is_scaled else [1.0] * 3}
 
 
 class OnnxTextTower:
