@@ -17,7 +17,7 @@ from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT, Features, extract
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognition
-from cliploc_ros.core.keyframes.point_pose import LEAST_INLIERS, find_pose, free_focal, refine
+from cliploc_ros.core.keyframes.point_pose import find_pose, free_focal, refine
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
 from cliploc_ros.offline.recording.keyframe_layer import PosedFeatures, triangulate
@@ -327,31 +327,6 @@ def test_a_constraint_excludes_by_height_and_tilt_and_tells_how_far_the_vertical
     assert known.tilt_error(tilted(0.0), covariance) == pytest.approx(0.0)
 
 
-MANY, WEAK = np.arange(40), np.tile(np.arange(LEAST_INLIERS - 2), 2)
-
-
-def rooms_of(*rows):
-    """Return the places of equal rooms at given positions [m], with some matched points each."""
-    pose, points, bearings = look(np.random.default_rng(9), len(MANY))
-    rooms = [points[some] + np.array([10.0 * number, 0.0, 0.0])
-             for number, some in enumerate(rows)]
-    found = places_of(bearings, np.concatenate(rows), np.concatenate(rooms), list(map(len, rows)))
-    return found, sorted(np.round([place.map_from_camera[0, 3] - pose[0, 3] for place in found]))
-
-
-def test_of_equal_rooms_each_is_a_place_of_its_own():
-    found, at_m = rooms_of(MANY, MANY, MANY)
-    assert at_m == [0.0, 10.0, 20.0]
-    assert [place.agreed for place in found] == [40, 40, 40]
-    most = localization.MOST_PLACES
-    assert len(rooms_of(*[MANY] * (most + 2))[0]) == most
-
-
-def test_few_features_are_a_place_where_there_is_no_other():
-    """Points of two keyframes count once."""
-    assert [place.agreed for place in rooms_of(WEAK)[0]] == [LEAST_INLIERS - 2]
-    assert rooms_of(MANY, WEAK)[1] == [0.0]
-    assert rooms_of(MANY, MANY[:LEAST_INLIERS + 2])[1] == [0.0, 10.0]
 
 
 def test_rays_of_equal_features_meet_in_their_point():
@@ -383,11 +358,3 @@ def test_features_are_found_in_any_image():
     for empty in (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8),
                   np.full((1, 1, 3), 255, np.uint8), np.full((2, 3000, 3), 90, np.uint8)):
         assert extract(empty, 300).pixels.shape == (0, 2)
-
-
-@pytest.mark.parametrize('shape', [(1, 1), (2, 2000), (2000, 2)])
-def test_an_image_of_any_shape_is_searched_for_features(shape, rng):
-    image = rng.integers(0, 255, (*shape, 3), dtype=np.uint8)
-    features = extract(image, 100, 400)
-    assert len(features) <= 100
-    assert ((features.pixels > -1.0) & (features.pixels < shape[::-1])).all()

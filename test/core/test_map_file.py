@@ -149,12 +149,11 @@ def test_a_nearly_unit_quaternion_is_normalized(tmp_path):
     ({'center': [1e300, 0.0, 0.0]}, 'center: .*beyond'), ({'center': [0.0, 0.0]}, 'center: .*3'),
     ({'center': [True, 0.0, 0.0]}, 'center: .*3'), ({'semi_axes': [0.1, -1.0, 0.1]}, 'semi_axes'),
     ({'orientation': [0.0] * 4}, 'orientation: .*0'), ({'class_id': None}, 'class_id'),
-    ({'colour': 'red'}, '.*colour'), ({'center': [10**400, 0, 0]}, 'center: .*not finite'),
+    ({'colour': 'red'}, '.*colour'),
     ({'labels': []}, 'labels: is empty'),
     ({'labels': {'text': ['a'], 'weight': [1.0, 2.0]}}, 'labels: .*equal length'),
     ({'labels': [{'text': 'a', 'weight': 0.0}]}, 'labels: .*above 0'),
     ({'class_weights': ['cup']}, 'class_weights'), ({'seen_ratio': -0.5}, 'seen_ratio: -0.5'),
-    ({'position_sigma': float('nan')}, 'position_sigma: nan'),
     ({'seen_ratio': 10**400}, 'seen_ratio: 10'), ({'class_id': 1001 * 'x'}, 'class_id: longer')])
 def test_bad_fields_are_named_with_file_and_landmark(change, message):
     with pytest.raises(MapError, match=f"here: landmark 'cup_1': {message}"):

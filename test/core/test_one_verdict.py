@@ -170,16 +170,6 @@ def test_a_dozen_points_do_not_override_what_objects_lack(cause):
     assert not found.accepted, found
 
 
-def test_keyframes_alone_must_meet_the_rule_of_successive_looks():
-    seen = Observation(CAMERA, SEEN.select(np.arange(0)), stamp_ns=10, odom_from_camera=np.eye(4))
-    looks = Looks()
-    for stamp_ns in range(4):
-        looks = looks.with_look(Look(replace(seen, stamp_ns=stamp_ns), moved(9.0), 0.1))
-    relocalizer = Relocalizer(ROOM, OPTIONS)
-    found = relocalizer.locate([relocalizer.search(seen)], looks=looks, recognizer=Says(place()))
-    assert found.refusal_kind == RefusalKind.FRAMES_DISAGREE
-
-
 def test_a_place_that_moves_otherwise_than_odometry_says_is_no_room():
     first = Observation(CAMERA, SEEN.select(np.arange(0)), odom_from_camera=np.eye(4))
     second = replace(first, stamp_ns=10, odom_from_camera=moved(0.3, np.eye(4)))

@@ -22,7 +22,6 @@ from cliploc_ros.core.fit.refinement import (
 )
 from cliploc_ros.core.fit.verification import make_rig, verify_rig
 from cliploc_ros.core.geometry.transforms import (
-    SAME_PLACE,
     invert_transform,
     make_transform,
     pose_difference,
@@ -297,21 +296,3 @@ def test_a_map_states_what_its_landmarks_share():
                                rtol=0.1)
 
 
-def pose_at(x_m, yaw_deg=0.0):
-    rotation = Rotation.from_euler('z', yaw_deg, degrees=True).as_matrix()
-    return make_transform(rotation, np.array([x_m, 0.0, 0.0]))
-
-
-FOUND = np.array([pose_at(0.0), pose_at(0.3), pose_at(2.0), pose_at(0.0, 30.0),
-                  pose_at(2.1, 5.0)])
-
-
-def distinct(order, most=None):
-    return [order[row] for row in SAME_PLACE.distinct(FOUND[np.array(order, dtype=int)], most)]
-
-
-def test_the_first_in_the_given_order_stands_for_its_place():
-    assert distinct([0, 1, 2, 3, 4]) == [0, 2, 3]
-    assert distinct([4, 1, 3, 2, 0]) == [4, 1, 3]
-    assert distinct([2, 0, 3], 2) == [2, 0]
-    assert distinct([], 2) == []

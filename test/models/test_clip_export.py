@@ -13,7 +13,6 @@ import numpy as np
 import open_clip
 import pytest
 import torch
-from open_clip.model import convert_to_custom_text_state_dict
 from PIL import Image
 from safetensors.torch import save_file
 
@@ -122,14 +121,10 @@ def write_torchscript(model, file):
 @pytest.mark.parametrize(('write', 'suffix'), [
     (lambda model, file: torch.save({'epoch': 3, 'state_dict': {
         f'module.{name}': tensor for name, tensor in model.state_dict().items()}}, file), '.pt'),
-    (lambda model, file: torch.save(model.state_dict(), file,
-                                    _use_new_zipfile_serialization=False), '.pt'),
     (lambda model, file: save_file({
         name: tensor.contiguous() for name, tensor in model.state_dict().items()}, file),
      '.safetensors'),
-    (lambda model, file: torch.save(convert_to_custom_text_state_dict(model.state_dict()), file),
-     '.bin'),
-    (write_torchscript, '.ts')], ids=['training', 'old', 'safetensors', 'custom', 'openai'])
+    (write_torchscript, '.ts')], ids=['training', 'safetensors', 'openai'])
 def test_forms_of_checkpoints(small_clip, tmp_path, image_rgb, write, suffix):
     file, expected = tmp_path / f'weights{suffix}', small_clip
     write(small_clip.model, file)
@@ -212,7 +207,6 @@ def test_an_export_that_gives_other_results_is_refused(small_clip, tmp_path):
 
 @pytest.mark.parametrize(('content', 'message'), [
     (b'', 'is empty'),
-    (b'version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n', 'git lfs pull'),
     (b'\n<!DOCTYPE html><html><body>Sign in</body></html>', 'is a web page'),
     (b'just text', 'holds no weights'), (b'PK\x03\x04' + bytes(1000), 'truncated'),
     (b'\x80\x02garbage', 'not a checkpoint')])

@@ -19,7 +19,7 @@ from tokenizers import Tokenizer, models, pre_tokenizers, processors
 from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
 from cliploc_ros.models.exports import describe_export
-from cliploc_ros.models.onnx_clip import OnnxTextTower, names_onnx, resolve_clip_weights
+from cliploc_ros.models.onnx_clip import names_onnx, resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions
 from demo import ASSETS
 
@@ -114,15 +114,6 @@ def test_both_layouts_give_the_embeddings_of_their_towers(layout, cache, request
     np.testing.assert_allclose(labels, unit(OF_TOKEN[rows].mean(axis=1)), atol=1e-4)
 
 
-def test_labels_have_the_tokens_of_clip(published, cache):
-    weights = resolve_clip_weights(ClipOptions(pretrained=str(published)))
-    tower = OnnxTextTower(weights, cache)
-    found, mask = tower.tokens(list(TOKENS))
-    for row, inside, tokens in zip(found, mask, TOKENS.values(), strict=True):
-        assert row[inside == 1].tolist() == [START, *tokens, END]
-    assert tower.count('very ' * 90) == 92
-
-
 def test_a_changed_export_has_another_key(exported, cache, tmp_path):
     changed = Path(shutil.copytree(exported, tmp_path / 'changed'))
     network = onnx.load(changed / 'visual/model.onnx')
@@ -153,15 +144,12 @@ def other_words(file: Path) -> None:
 
 @pytest.mark.parametrize(('change', 'named'), [
     (lambda folder: (folder / 'config.json').unlink(), 'config.json is missing'),
-    (lambda folder: text_of(folder / 'config.json', projection_dim='x'), "'projection_dim'"),
     (lambda folder: text_of(folder / 'config.json', projection_dim=True), "'projection_dim'"),
     (lambda folder: text_of(folder / 'config.json', projection_dim=99), 'expected one output'),
     (lambda folder: (folder / 'preprocessor_config.json').unlink(), 'preprocessor_config.json is'),
     (lambda folder: text_of(folder / 'preprocessor_config.json', image_mean=[1]), 'standard dev'),
     (lambda folder: text_of(folder / 'preprocessor_config.json', crop_size=256), '256 x 256'),
-    (lambda folder: text_of(folder / 'preprocessor_config.json', crop_size=10**9), 'up to 2048'),
     (lambda folder: text_of(folder / 'preprocessor_config.json', image_std=[0, 1, 1]), 'deviat'),
-    (lambda folder: (folder / 'onnx/vision_model.onnx').unlink(), 'vision_model.onnx'),
     (lambda folder: (folder / 'onnx/text_model.onnx').unlink(), 'text_model.onnx'),
     (lambda folder: (folder / 'tokenizer.json').unlink(), 'tokenizer.json is missing'),
     (lambda folder: (folder / 'tokenizer.json').write_text('{}'), 'not a tokenizer of a CLIP'),

@@ -17,7 +17,7 @@ from demo import ASSETS
 pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
-WAKE_UPS = 8
+WAKE_UPS = 5
 #: Prints the demo's poses (4, 4), null for a refusal.
 POSES = """
 import json, sys
@@ -67,15 +67,23 @@ def localize(networks: tuple, cache: Path, environment: dict[str, str]
         cwd=PROJECT, env=environment, capture_output=True, text=True, timeout=300, check=False)
 
 
-def test_weights_are_exported_once_and_then_need_no_pytorch(tmp_path):
+@pytest.fixture
+def hidden(tmp_path):
     (tmp_path / 'hidden').mkdir()
-    hidden, cache = hide_pytorch(tmp_path / 'hidden'), tmp_path / 'cache'
-    for networks, named in ((WEIGHTS, '--no-clip'), ((WEIGHTS[0], *ONNX[1:]), 'yolo.pt')):
-        done = localize(networks, tmp_path / 'empty', hidden)
-        assert done.returncode == 1 and 'Traceback' not in done.stderr
-        assert 'is not installed' in done.stderr and 'export_network' in done.stderr
-        assert 'script/setup models' in done.stderr and named in done.stderr
-    found = []
+    return hide_pytorch(tmp_path / 'hidden')
+
+
+@pytest.mark.parametrize(('networks', 'named'), [
+    (WEIGHTS, '--no-clip'), ((WEIGHTS[0], *ONNX[1:]), 'yolo.pt')])
+def test_without_pytorch_weights_are_refused_with_what_to_do(networks, named, hidden, tmp_path):
+    done = localize(networks, tmp_path / 'empty', hidden)
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    assert 'is not installed' in done.stderr and 'export_network' in done.stderr
+    assert 'script/setup models' in done.stderr and named in done.stderr
+
+
+def test_weights_are_exported_once_and_then_need_no_pytorch(hidden, tmp_path):
+    cache, found = tmp_path / 'cache', []
     for networks, environment in ((ONNX, hidden), (WEIGHTS, dict(os.environ)), (WEIGHTS, hidden)):
         done = localize(networks, cache, environment)
         assert done.returncode == 0, done.stderr

@@ -14,7 +14,6 @@ import numpy as np
 import openvino
 import pytest
 
-from cliploc_ros.cli import evaluate
 from cliploc_ros.cli.build_map import make_parser
 from cliploc_ros.cli.map_layer import layer_options, read_layer
 from cliploc_ros.cli.sources import read_frames
@@ -189,7 +188,7 @@ def test_only_the_published_file_is_kept_of_a_download(published, tmp_path, monk
     assert (tmp_path / 'weights' / FILE_NAME).read_bytes() == published.read_bytes()
 
 
-def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch, run_here):
+def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch):
     monkeypatch.setenv('XDG_CACHE_HOME', str(cache_dir.parent))
     shutil.copy(ASSETS / 'map.yaml', tmp_path)
     landmark_map = LandmarkMap.from_file(tmp_path / 'map.yaml')
@@ -198,12 +197,4 @@ def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch,
         '--out', str(tmp_path / 'map.yaml')])
     save_layer(layer_path(options.out), build_layer(read_frames(options), landmark_map,
                                                     layer_options(options)[0]))
-    layer = read_layer(options.out, landmark_map, wanted=True)
-    assert layer.kind.dimensions == 64
-    asked = run_here(evaluate.main, '--tum', ASSETS / 'sequence', '--every', 24, '--map',
-                     options.out, '--model', ASSETS / 'yolo.onnx', '--no-clip', '--methods',
-                     'auto', '--trials', 1, '--sweep', '--no-figures', '--workers', 1,
-                     '--keyframes', '--out', tmp_path / 'out')
-    assert asked.returncode == 0, asked.stderr
-    assert '"source": "keyframes"' in (tmp_path / 'out' / 'results.json').read_text() or \
-        '"source": "both"' in (tmp_path / 'out' / 'results.json').read_text()
+    assert read_layer(options.out, landmark_map, wanted=True).kind.dimensions == 64

@@ -71,7 +71,7 @@ def by_ultralytics(model, image_rgb, **changes):
 
 
 @pytest.mark.parametrize('settings', [
-    None, {'dynamic': True}, {}, {'nms': True, 'conf': 0.1, 'iou': 0.7, 'agnostic_nms': False}])
+    None, {'nms': True, 'conf': 0.1, 'iou': 0.7, 'agnostic_nms': False}])
 def test_boxes_in_real_images_equal_those_of_pytorch(settings, weights, office_rgb, cache,
                                                      tmp_path):
     """Without settings, the weights are exported at their first use; else by ultralytics."""
