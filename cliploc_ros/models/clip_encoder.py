@@ -180,8 +180,8 @@ class ClipEncoder:
                      ) -> NDArray[np.float32]:
         """Return embeddings (n, d) of unit length for the boxes of an image (h, w, 3).
 
-        The boxes (n, 4) are left, top, right, bottom [px]; `visible_boxes` finds those that can be
-        cropped. A crop contains all pixels that its box touches.
+        The boxes (n, 4) are left, top, right, bottom [px]. A crop contains all pixels that its box
+        touches, see `crop_bounds`.
 
         ImageError: the image has another shape or type, or no pixels. CliplocError: a box is not
         finite, empty or outside the image. ModelError: embeddings are not finite.

@@ -175,8 +175,8 @@ def export_detector(file: Path, options: DetectorOptions, folder: Path, half: bo
     describe_export(folder, 'detector')
 
 
-def set_prompts(model: Any, options: DetectorOptions) -> str:
-    """Set the options' prompts in a network of ultralytics; return the key of the text tower.
+def set_prompts(model: Any, options: DetectorOptions) -> None:
+    """Set the options' prompts in a network of ultralytics.
 
     Raises
     ------
@@ -206,7 +206,6 @@ def set_prompts(model: Any, options: DetectorOptions) -> str:
             network.set_classes(texts, head.get_tpe(embedded))
     else:  # as in WorldModel.set_classes, which would load its own text tower
         network.txt_feats, head.nc, network.names = embedded, len(texts), dict(enumerate(texts))
-    return key
 
 
 def _tower(name: str, options: DetectorOptions

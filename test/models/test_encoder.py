@@ -22,7 +22,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
     embeddings_path,
     save_landmark_embeddings,
 )
-from cliploc_ros.core.map.map_file import write_map
+from cliploc_ros.core.map.landmark_map import write_map
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import (
@@ -34,7 +34,7 @@ from cliploc_ros.models.clip_encoder import (
     mixed_rows,
 )
 from cliploc_ros.models.files import fingerprint_file
-from cliploc_ros.models.images import crop_bounds, visible_boxes
+from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.observer import Observer
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions
@@ -201,7 +201,6 @@ nan, inf = float('nan'), float('inf')
     ([0.0, 0.0, inf, 20.0], None)])
 def test_box(bbox, bounds):
     bboxes = np.array([bbox])
-    assert visible_boxes(bboxes, 64, 48).tolist() == [bounds is not None]
     if bounds is not None:
         assert crop_bounds(bboxes, 64, 48).tolist() == [bounds]
     else:
