@@ -22,7 +22,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
     embeddings_path,
     save_landmark_embeddings,
 )
-from cliploc_ros.core.map.landmark_map import write_map
+from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import (
