@@ -52,6 +52,12 @@ def test_a_layer_comes_back_as_it_was(file):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name
 
 
+def test_an_edited_map_keeps_its_layer(file):
+    fewer = ROOM.select(range(1, len(ROOM)))
+    moved = replace(fewer, centers=fewer.centers + np.eye(len(fewer))[:, :1] * 3.0)
+    assert len(load_layer_of_map(file, moved)) == KEYFRAMES
+
+
 @pytest.fixture
 def corridor():
     """Return twenty keyframes 10 m apart, each with forty points in the middle of the image."""
