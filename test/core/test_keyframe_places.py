@@ -335,6 +335,26 @@ def test_a_constraint_excludes_by_height_and_tilt_and_tells_how_far_the_vertical
 
 
 
+MANY = np.arange(40)
+
+
+def rooms_of(*rows):
+    """Return the places of equal rooms at given positions [m], with some matched points each."""
+    pose, points, bearings = look(np.random.default_rng(9), len(MANY))
+    rooms = [points[some] + np.array([10.0 * number, 0.0, 0.0])
+             for number, some in enumerate(rows)]
+    found = places_of(bearings, np.concatenate(rows), np.concatenate(rooms), list(map(len, rows)))
+    return found, sorted(np.round([place.map_from_camera[0, 3] - pose[0, 3] for place in found]))
+
+
+def test_of_equal_rooms_each_is_a_place_of_its_own():
+    found, at_m = rooms_of(MANY, MANY, MANY)
+    assert at_m == [0.0, 10.0, 20.0]
+    assert [place.agreed for place in found] == [40, 40, 40]
+    most = localization.MOST_PLACES
+    assert len(rooms_of(*[MANY] * (most + 2))[0]) == most
+
+
 def test_rays_of_equal_features_meet_in_their_point():
     rng = np.random.default_rng(4)
     points = rng.uniform((-1, -1, 2), (1, 1, 4), (50, 3))
@@ -364,3 +384,11 @@ def test_features_are_found_in_any_image():
     for empty in (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8),
                   np.full((1, 1, 3), 255, np.uint8), np.full((2, 3000, 3), 90, np.uint8)):
         assert extract(empty, 300).pixels.shape == (0, 2)
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (2, 2000), (2000, 2)])
+def test_an_image_of_any_shape_is_searched_for_features(shape, rng):
+    image = rng.integers(0, 255, (*shape, 3), dtype=np.uint8)
+    features = extract(image, 100, 400)
+    assert len(features) <= 100
+    assert ((features.pixels > -1.0) & (features.pixels < shape[::-1])).all()

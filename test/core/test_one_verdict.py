@@ -150,6 +150,12 @@ def test_a_small_group_takes_nothing_from_points(monkeypatch):
     assert likely[0][0] == likely[1][0] and likely[0][1] > likely[1][1]
 
 
+def test_points_that_agree_by_chance_change_nothing():
+    likely = {ask(Says(place(inliers=inliers, confirmed=0.0)), objects=3).evidence.likely
+              for inliers in (6, 7, 8)}
+    assert len(likely) == 1 and likely.pop() < 0.9
+
+
 @pytest.mark.parametrize('cause', ['too few objects', 'a search cut short', 'earlier looks'])
 def test_a_dozen_points_do_not_override_what_objects_lack(cause):
     objects, options, looks = 12, OPTIONS, Looks()

@@ -10,6 +10,7 @@ from cameras import MAP, MOUNTS, NAMES, look
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
@@ -96,6 +97,18 @@ def test_a_camera_that_contradicts_the_others_is_named(rng, turned_deg, objects,
         assert found.accepted
         assert pose_error(found.map_from_camera, MOUNTS[-1])[0] < 0.3
     assert localizer.cameras.wrong_mounts == wrong
+
+
+@pytest.mark.parametrize(('instants', 'objects', 'matched', 'others', 'wrong'), [
+    (5, 4, 1, 4, ['left']), (4, 4, 1, 4, []), (5, 2, 0, 2, []), (5, 4, 2, 4, []),
+    (5, 4, 1, 2, [])])
+def test_a_mount_is_judged_by_what_the_other_cameras_match(rng, instants, objects, matched, others,
+                                                           wrong):
+    """Too few instants or objects, half of the objects matched, or other cameras miss half too."""
+    check = CameraCheck()
+    for _ in range(instants):
+        check.add_instant(look(rng), [objects] * 4, [others, matched, others, others])
+    assert check.wrong_mounts == wrong
 
 
 def test_a_map_that_is_out_of_date_is_not_blamed_on_a_mount(rng):

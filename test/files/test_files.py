@@ -69,6 +69,15 @@ def test_a_damaged_line_ends_the_entries(path, line):
     assert write(path, 'four') == (['one', 'four'], False)
 
 
+def test_restart_and_remove(path):
+    write(path, 'one', 'second')
+    with open_log(path) as log:
+        log.restart(['other'])
+        assert log.read() == (['other'], False)
+        log.remove()
+    assert not path.exists()
+
+
 def test_one_process_at_a_time(path):
     with open_log(path), pytest.raises(DatasetError, match='open in another studio'):
         open_log(path)
@@ -179,6 +188,11 @@ def test_tasks_are_taken_as_workers_become_free():
 def test_the_death_of_a_worker_is_an_error_that_names_the_remedy():
     with pytest.raises(WorkersError, match=r'out of memory; .* fewer workers'):
         results(Square(5), workers=2)
+
+
+def test_an_error_of_a_task_is_not_that_of_a_worker():
+    with pytest.raises(TypeError):
+        dict(run_tasks(Square(), ['text'], workers=2))
 
 
 def test_without_dask(monkeypatch):
