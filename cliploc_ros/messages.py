@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults, check_faults
-from cliploc_ros.core.geometry.depth_image import (
+from cliploc_ros.core.geometry.depth import (
     PLAUSIBLE_DEPTH_M,
     DepthCamera,
     DepthImage,

@@ -9,9 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.map_rows import embed_map
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.clip_encoder import embed_map
+from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import load_observations

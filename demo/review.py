@@ -17,7 +17,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
-from cliploc_ros.models.clip_weights import ClipOptions
+from cliploc_ros.models.protocols import ClipOptions
 from cliploc_ros.offline.datasets.parsing import find_camera, parse_stamp_ns
 from cliploc_ros.offline.datasets.tum import TumSequence
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -116,7 +116,7 @@ class Reviewer:
         self._localizer = Localizer(self._relocalizer)
         self._observer = None
         if self._options.needs_similarities:
-            from cliploc_ros.models.map_rows import load_encoder_for_map
+            from cliploc_ros.models.clip_encoder import load_encoder_for_map
             from cliploc_ros.models.observer import Observer
             self._observer = Observer(*load_encoder_for_map(
                 ClipOptions(model=values.clip_model, pretrained=values.clip_pretrained),
@@ -157,11 +157,10 @@ class Reviewer:
         image_rgb = np.ascontiguousarray(pixels_bgr[..., ::-1], dtype=np.uint8)
         detections = wake_up.detections[name].usable(camera.width, camera.height,
                                                      self._values.max_detections)
-        observation = Observation(camera, detections, stamp_ns=stamp_ns) \
-            if self._observer is None else self._observer.observe(image_rgb, camera, detections,
-                                                                  stamp_ns)
-        return image_rgb, replace(observation, camera_name=name,
-                                  odom_from_camera=self._mounts[name])
+        similarities = None if self._observer is None else self._observer.crops(
+            image_rgb, detections.bboxes_xyxy, {}).compare(np.arange(len(detections)))
+        return image_rgb, Observation(camera, detections, similarities, stamp_ns, name,
+                                      odom_from_camera=self._mounts[name])
 
     def _search(self, localizer: Localizer, first: Observation, others: Sequence[Observation]
                 ) -> Relocalization:

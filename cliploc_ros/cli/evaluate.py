@@ -230,7 +230,7 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
     from cliploc_ros.cli.sources import clip_options, detector_options, source_of
     from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_embeddings import embeddings_path
-    from cliploc_ros.models.clip_weights import names_onnx
+    from cliploc_ros.models.onnx_clip import names_onnx
 
     files = [options.queries or source_of(options), *options.map,
              *(word for word in options.methods if word.endswith(('.yaml', '.yml'))),
@@ -304,7 +304,7 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     from cliploc_ros.core.localizer import Localizer, repeat
     from cliploc_ros.core.query import read_case
     from cliploc_ros.core.relocalizer import Relocalizer
-    from cliploc_ros.models.map_rows import load_encoder_for_map
+    from cliploc_ros.models.clip_encoder import load_encoder_for_map
     from cliploc_ros.models.observer import Observer
 
     case, observer = read_case(options.bag), None

@@ -65,9 +65,9 @@ def export_network(options: argparse.Namespace) -> int:
     make_folder(out.parent)
     # The imports take seconds.
     from cliploc_ros.cli.sources import clip_options, detector_options
-    from cliploc_ros.models.clip_weights import names_onnx
     from cliploc_ros.models.export import export_clip
     from cliploc_ros.models.exports import DETECTOR, run_export
+    from cliploc_ros.models.onnx_clip import names_onnx
     from cliploc_ros.models.yolo_weights import export_detector, resolve_published
 
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_export_') as desk:

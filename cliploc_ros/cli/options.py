@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from cliploc_ros.command import finite, not_negative, option, positive, positive_int, within
 from cliploc_ros.errors import MapError, ModelError, OptionsError
-from cliploc_ros.models.profiles import PROFILE_NAMES
+from cliploc_ros.models.protocols import PROFILE_NAMES
 
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer

@@ -13,14 +13,18 @@ from numpy.typing import NDArray
 
 from cliploc_ros.cli.options import check_folder_options, folder_of
 from cliploc_ros.command import positive
-from cliploc_ros.core.geometry.depth_image import DepthCamera
+from cliploc_ros.core.geometry.depth import DepthCamera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
-from cliploc_ros.models.profiles import with_detector, with_encoder
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.protocols import (
+    ClipOptions,
+    DetectorOptions,
+    prompts_of_map,
+    prompts_of_names,
+    with_detector,
+    with_encoder,
+)
 from cliploc_ros.offline.datasets import bag_frames, bag_poses
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import (

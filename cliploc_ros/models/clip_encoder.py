@@ -1,69 +1,150 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Encode crops and labels with CLIP as embeddings of unit length."""
+"""Encode crops, labels and maps with CLIP as embeddings of unit length.
 
+Crops are compared with the labels of a map, its images, or both. Label embeddings are cached, so
+that CLIP starts without its text tower.
+"""
+
+import contextlib
+import hashlib
+import json
 import logging
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
+from cliploc_ros.core.map.joined_map import JoinedMap, parts_of
 from cliploc_ros.core.map.landmark_details import WeightedLabels
+from cliploc_ros.core.map.landmark_embeddings import (
+    LandmarkEmbeddings,
+    concatenated,
+    embeddings_path,
+    load_embeddings_of_map,
+    with_images,
+)
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import LabelEmbeddings
-from cliploc_ros.errors import ModelError
-from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_weights import ClipWeights, resolve_clip_weights
+from cliploc_ros.errors import MapError, ModelError
+from cliploc_ros.files.arrays import Check, Field, Schema
+from cliploc_ros.files.storage import replace_file, resolve_cache_dir, warn_not_kept
+from cliploc_ros.models.files import remove_unused
 from cliploc_ros.models.images import check_image_rgb, crop_bounds
-from cliploc_ros.models.label_embeddings import LabelCache, mixed_rows
-from cliploc_ros.models.onnx_clip import OnnxTextTower, OnnxTower
+from cliploc_ros.models.onnx_clip import (
+    ClipWeights,
+    OnnxTextTower,
+    OnnxTower,
+    resolve_clip_weights,
+)
 from cliploc_ros.models.onnx_network import free_memory
 from cliploc_ros.models.protocols import ClipOptions
 
-Label = str | WeightedLabels
-
 # Greatest number of crops or labels that are encoded at once; it limits the memory.
 _BATCH = 64
+#: Greatest number of labels encoded, cached and held at once: 134 MB with 512 numbers each.
+PART = 65_536
+_FORMAT = 1
+# A map of 1,000 labels takes 3 MB with ViT-L-14.
+_MOST_FILES = 32
+# L labels, d numbers, t bytes that identify labels and encoder.
+_SCHEMA = Schema('file of label embeddings', {
+    'identity': Field('uint8', ('t',)),
+    'embeddings': Field('float32', ('L', 'd'), (Check('is not of unit length', lambda rows: ~(
+        np.abs(np.einsum('ij,ij->i', rows, rows) - 1.0) <= 2e-3)),)),
+}, ModelError)
 
 logger = logging.getLogger(__name__)
 
 
-class LoadedEncoder(NamedTuple):
-    """An encoder for crops, and the embeddings (L, d) of a map's labels."""
-
-    encoder: 'ClipEncoder'
-    label_embeddings: LabelEmbeddings
-
-
-def load_encoder(options: ClipOptions, labels: Sequence[Label]) -> LoadedEncoder:
-    """Load CLIP for a map: encode its labels and keep only the image tower.
+def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
+                         map_files: Sequence[str], compare: str
+                         ) -> tuple['ClipEncoder', LabelEmbeddings]:
+    """Load CLIP and the embeddings that crops are compared with, see embed_map.
 
     If the cache has the embeddings for model, weights and labels, the text tower is not loaded.
-    Otherwise the text tower is loaded first, and freed before the image tower is loaded. Labels
-    may be repeated.
+    Otherwise the text tower is loaded first, and freed before the image tower is loaded.
 
     ModelError: the weights cannot be found or loaded.
     """
     started = time.monotonic()
+    embeddings = embed_map(options, landmark_map, map_files, compare)
     weights = resolve_clip_weights(options)
-    embeddings = embed_labels(weights, options, labels)
     encoder = ClipEncoder(weights, options)
     logger.info('CLIP %s is ready after %.1f s', weights.model, time.monotonic() - started)
-    return LoadedEncoder(encoder, embeddings)
+    return encoder, embeddings
 
 
-def embed_labels(weights: ClipWeights, options: ClipOptions, labels: Sequence[Label]
-                 ) -> LabelEmbeddings:
-    """Return the embeddings of labels, without an encoder for crops; see `load_encoder`."""
-    described = [((label, 1.0),) if isinstance(label, str) else label for label in labels]
+def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequence[str],
+              compare: str) -> LabelEmbeddings:
+    """Return the embeddings that crops are compared with, without an encoder for crops.
+
+    ``map_files`` are the files of the maps, with image embeddings next to them; empty: no image
+    embeddings. ``compare`` is one of COMPARED. If a map has no image embeddings of this encoder,
+    only labels are compared, because similarities to images and to labels are not comparable
+    between maps.
+
+    ModelError: the weights cannot be found or loaded.
+    """
+    weights = resolve_clip_weights(options)
     # Unique and sorted, so that moving or reordering landmarks needs no new embeddings.
-    unique = sorted(set(described))
-    embeddings = mixed_rows(unique, partial(_encoded_once, weights, options), weights.embed_dim)
+    unique = sorted(set(landmark_map.weighted_labels))
     rows = {description: row for row, description in enumerate(unique)}
-    return LabelEmbeddings(embeddings, np.array([rows[description] for description in described],
-                                                dtype=np.int64))
+    labels = LabelEmbeddings(
+        mixed_rows(unique, partial(_encoded_once, weights, options), weights.embed_dim),
+        np.array([rows[description] for description in landmark_map.weighted_labels],
+                 dtype=np.int64))
+    images = None if compare == 'text' else _images_of_all(weights, landmark_map, map_files)
+    if images is not None:
+        labels = with_images(labels, images, compare)
+    if isinstance(landmark_map, JoinedMap):
+        return labels.in_parts([len(part.landmark_map) for part in landmark_map.parts])
+    return labels
+
+
+def _images_of_all(weights: ClipWeights, landmark_map: LandmarkMap, map_files: Sequence[str]
+                   ) -> LandmarkEmbeddings | None:
+    """Return the image embeddings of all maps; None unless each map has some of this encoder."""
+    parts = parts_of(landmark_map)
+    if len(map_files) != len(parts):
+        return None
+    found = {file: _images(weights, part.landmark_map, file)
+             for part, file in zip(parts, map_files, strict=True)}
+    known = [images for images in found.values() if images is not None]
+    if len(known) < len(parts):
+        if known:
+            without = next(file for file, images in found.items() if images is None)
+            logger.warning('only labels are compared: %s has no image embeddings of this encoder, '
+                           'unlike other maps; build it again with its images', without)
+        return None
+    for file, images in zip(map_files, known, strict=True):
+        logger.info('%s: images of %d of %d landmarks', embeddings_path(file),
+                    int(images.is_known.sum()), len(images))
+    return concatenated(known, landmark_map.landmark_ids)
+
+
+def _images(weights: ClipWeights, landmark_map: LandmarkMap, map_file: str
+            ) -> LandmarkEmbeddings | None:
+    """Return the image embeddings of a map by this encoder; None if there are none."""
+    try:
+        images = load_embeddings_of_map(map_file, landmark_map.landmark_ids,
+                                        landmark_map.map_set)
+    except MapError as error:
+        logger.warning('only labels are compared: %s', error)
+        return None
+    if images is None or not images.is_known.any():
+        return None
+    if (images.encoder_key, images.means.shape[1]) != (weights.key, weights.embed_dim):
+        logger.warning('only labels are compared: %s was made with the encoder %s, not %s; build '
+                       'the map again with this encoder', embeddings_path(map_file),
+                       images.encoder_key, weights.key)
+        return None
+    return images
 
 
 def _encoded_once(weights: ClipWeights, options: ClipOptions, labels: Sequence[str]
@@ -88,7 +169,6 @@ class ClipEncoder:
 
     def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
         self._weights = weights
-        self._options = options
         self._tower = OnnxTower(weights, options.cache_dir)
         #: Equal keys (model and weights) give equal label embeddings.
         self.key = weights.key
@@ -100,8 +180,8 @@ class ClipEncoder:
                      ) -> NDArray[np.float32]:
         """Return embeddings (n, d) of unit length for the boxes of an image (h, w, 3).
 
-        The boxes (n, 4) are left, top, right, bottom [px]; `visible_boxes` finds those that can be
-        cropped. A crop contains all pixels that its box touches.
+        The boxes (n, 4) are left, top, right, bottom [px]. A crop contains all pixels that its box
+        touches, see `crop_bounds`.
 
         ImageError: the image has another shape or type, or no pixels. CliplocError: a box is not
         finite, empty or outside the image. ModelError: embeddings are not finite.
@@ -115,10 +195,6 @@ class ClipEncoder:
                 for left, top, right, bottom in
                 bounds[start:start + _BATCH].tolist()])))
         return _unit_rows(features, self._weights)
-
-    def encode_labels(self, labels: Sequence[str]) -> NDArray[np.float32]:
-        """Return the embeddings (L, d) of labels; loads and frees the text tower."""
-        return encode_labels(self._weights, labels, self._options)
 
 
 def encode_labels(weights: ClipWeights, labels: Sequence[str], options: ClipOptions
@@ -150,3 +226,95 @@ def _unit_rows(features: Sequence[NDArray[np.float32]], weights: ClipWeights
         raise ModelError(f'the embeddings of {weights.folder} are not finite: the weights are '
                          'corrupt')
     return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+
+
+class LabelCache:
+    """A folder of label embeddings, one ``.npz`` for each model and set of labels.
+
+    The name of a file is the hash of the encoder's key (model, activation, fingerprint of the
+    weights) and of the labels. The file also contains both, to detect foreign and damaged files. A
+    file holds a whole set of labels, not a single label, so that embeddings never depend on
+    earlier batches; a changed map costs one slow start. Files are written under another name and
+    renamed, so that any number of processes can share the folder. Reading a file marks it as used.
+    Beyond ``most_files``, the least recently used files are removed. The first write makes the
+    folder.
+    """
+
+    def __init__(self, folder: Path, most_files: int = _MOST_FILES) -> None:
+        self._folder = folder
+        self._most_files = most_files
+
+    def load(self, key: str, labels: Sequence[str], embed_dim: int) -> NDArray[np.float32] | None:
+        """Return the embeddings (L, embed_dim) of L labels; None if they are not in the cache."""
+        file = self._file(key, labels)
+        if not file.exists():
+            return None
+        try:
+            arrays = _SCHEMA.read(file)
+        except ModelError as error:
+            return self._ignore(file, error)
+        embeddings = arrays['embeddings']
+        if bytes(arrays['identity']) != _identity(key, labels):
+            return self._ignore(file, 'it is for other weights or labels')
+        if embeddings.shape != (len(labels), embed_dim):
+            return self._ignore(file, 'its embeddings are not of the expected shape')
+        with contextlib.suppress(OSError):  # a read-only cache works too
+            os.utime(file)
+        return embeddings
+
+    def store(self, key: str, labels: Sequence[str], embeddings: NDArray[np.float32]) -> None:
+        """Write the embeddings of labels; a failure causes only a warning."""
+        file = self._file(key, labels)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            remove_unused(self._folder.glob('labels-*.npz'),
+                          self._folder.glob('.*.labels-*.npz'), self._most_files - 1)
+            with replace_file(file) as partial:
+                np.savez(partial, embeddings=embeddings,
+                         identity=np.frombuffer(_identity(key, labels), dtype=np.uint8))
+        except OSError as error:
+            warn_not_kept('label embeddings are not cached and the next start is slow again: '
+                          f'cannot write {file} ({error.strerror or error}); make room, or '
+                          'choose a writable cache_dir')
+
+    def _file(self, key: str, labels: Sequence[str]) -> Path:
+        digest = hashlib.sha256(_identity(key, labels)).hexdigest()
+        return self._folder / f'labels-{digest[:32]}.npz'
+
+    @staticmethod
+    def _ignore(file: Path, reason: object) -> None:
+        logger.warning('label embeddings in %s cannot be used (%s): encoding the labels again',
+                       file, reason)
+
+
+def _identity(key: str, labels: Sequence[str]) -> bytes:
+    return json.dumps([_FORMAT, key, list(labels)]).encode()
+
+
+def mixed_rows(descriptions: Sequence[WeightedLabels],
+               encode: Callable[[Sequence[str]], NDArray[np.float32]], embed_dim: int
+               ) -> NDArray[np.float32]:
+    """Return the embeddings (R, embed_dim) of R descriptions.
+
+    The embedding of a description is the weighted mean of the embeddings of its labels, scaled to
+    unit length. That of a single label is unchanged. ``encode`` returns the embeddings (m,
+    embed_dim) of m labels, as unit rows. It is called with sorted labels, at most PART at once.
+    """
+    labels = sorted({label for description in descriptions for label, _ in description})
+    # the share of each label in each description, a sparse matrix (R, U)
+    columns = {label: column for column, label in enumerate(labels)}
+    ends = np.cumsum([0, *map(len, descriptions)])
+    shares = np.array([weight for description in descriptions for _, weight in description],
+                      dtype=np.float32)
+    owners = np.repeat(np.arange(len(descriptions)), np.diff(ends))
+    shares /= np.bincount(owners, shares, len(descriptions)).astype(np.float32)[owners]
+    weights = csr_matrix(
+        (shares, [columns[label] for description in descriptions for label, _ in description],
+         ends), shape=(len(descriptions), len(labels)))
+    rows = np.zeros((len(descriptions), embed_dim), dtype=np.float32)
+    for start in range(0, len(labels), PART):
+        part = slice(start, start + PART)
+        rows += weights[:, part] @ encode(labels[part])
+    lengths = np.maximum(np.sqrt(np.einsum('ij,ij->i', rows, rows)), 1e-12)
+    rows /= np.where(np.diff(weights.indptr) > 1, lengths, 1.0)[:, None]
+    return rows

@@ -1,19 +1,23 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of weights: checks, fingerprints and downloads; folders of a cache."""
+"""Files of weights: checks, fingerprints, downloads, networks of the hub; folders of a cache."""
 
 import errno
 import hashlib
+import json
 import logging
+import os
+import re
 import shutil
 import struct
 import time
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.files.storage import open_file
+from cliploc_ros.files.storage import open_file, read_file, replace_file, resolve_cache_dir
 
 _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
@@ -23,6 +27,10 @@ _HEADS = (b'PK', b'\x80', b'\x93NUMPY')
 _ONNX_HEAD = b'\x08'
 # Partial files older than this are from killed writers [s].
 _STALE_S = 24 * 3600.0
+# OWNER/NAME[@REVISION][:FILE]; the revision is a branch, tag or commit.
+_NAME = re.compile(r'([\w-][\w.-]*/[\w-][\w.-]*)(?:@([\w][\w.-]*))?(?::([\w][\w./-]*\.onnx))?')
+# Time-out of the first request, in case a firewall drops its packets [s].
+_PATIENCE_S = 10.0
 
 logger = logging.getLogger(__name__)
 
@@ -128,3 +136,107 @@ def first_line(error: Exception) -> str:
     """Return the first line of an error in ASCII, without emojis and colours."""
     lines = str(error).encode('ascii', 'ignore').decode().strip().splitlines()
     return lines[0].strip() if lines else type(error).__name__
+
+
+def is_hub_name(name: str) -> bool:
+    """Return whether a name is OWNER/NAME[@REVISION][:FILE], and not a local file or folder."""
+    return (not Path(name).expanduser().exists() and _NAME.fullmatch(name) is not None
+            and Path(name).suffix not in ('.pt', '.ts', '.safetensors', '.bin', '.json'))
+
+
+def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequence[str],
+                   cache_dir: str) -> Path:
+    """Return a folder with networks and the files next to them; download it if necessary.
+
+    A complete download is marked, and no further request is sent. Each file is compared with the
+    digest given by the hub, and interrupted downloads are continued. Proxy, mirror and offline
+    mode are those of huggingface_hub: HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE.
+
+    ModelError: the name is neither a folder nor a name on the hub, or the download fails.
+
+    Parameters
+    ----------
+    name : str
+        A folder, or OWNER/NAME[@REVISION][:FILE].
+    networks : sequence of sequences of str
+        For each network, the patterns of its ONNX file. The first file that exists is used, with
+        its file of weights. A FILE in the name replaces the patterns of the first network.
+    beside : sequence of str
+        Patterns of all other files.
+    """
+    folder = Path(name).expanduser().absolute()
+    if folder.is_dir():
+        return folder
+    match = _NAME.fullmatch(name)
+    if match is None:
+        raise ModelError(f'{folder} does not exist: check the path of the network')
+    repository, revision, file = match.groups()
+    wanted = [[file], *networks[1:]] if file else list(networks)
+    own = resolve_cache_dir(cache_dir) / 'weights'
+    request = json.dumps([repository, revision, [*map(list, wanted)], list(beside)])
+    digest = hashlib.sha256(request.encode()).hexdigest()
+    marker = own / f'{repository.replace("/", "--")}-{digest[:16]}.json'
+    try:
+        found = own / str(json.loads(read_file(marker)))
+    except (OSError, ValueError):
+        found = own / 'missing'
+    if found.is_dir():
+        return found
+
+    def fetch() -> Path:
+        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
+        import huggingface_hub
+
+        info = huggingface_hub.HfApi().model_info(repository, revision=revision,
+                                                  timeout=_PATIENCE_S)
+        files = [sibling.rfilename for sibling in info.siblings or ()]
+        chosen = [file for file in files if any(fnmatch(file, pattern) for pattern in beside)]
+        for patterns in wanted:
+            main = next((file for pattern in patterns for file in files
+                         if fnmatch(file, pattern)), None)
+            if main is None:
+                raise ModelError(f'{name} has none of {", ".join(patterns)}: it has '
+                                 f'{", ".join(files)}')
+            chosen += [file for file in files if file.startswith(main)]
+        for file in chosen:
+            path = Path(huggingface_hub.hf_hub_download(
+                repository, file, revision=info.sha, cache_dir=own))
+            _check_content(path)
+        snapshot = Path(str(path)[:-len(file)])
+        with replace_file(marker) as partial:
+            partial.write_text(json.dumps(str(snapshot.relative_to(own))))
+        return snapshot
+
+    listed = ', '.join([*(patterns[0] for patterns in wanted), *beside])
+    return download(f"the network '{name}'", own, (
+        f'Without a network: download {listed} from https://huggingface.co/{repository} on '
+        'another machine into a folder, and give the path of that folder'), fetch)
+
+
+def find_network(folder: Path, name: str, networks: Sequence[str]) -> Path:
+    """Return the ONNX file in a folder of `resolve_folder`; ModelError: there is none."""
+    match = _NAME.fullmatch(name)
+    if match is not None and match[3] and (folder / match[3]).is_file():
+        return folder / match[3]
+    for pattern in networks:
+        for file in sorted(folder.glob(pattern)):
+            return file
+    raise ModelError(f'{folder} has none of {", ".join(networks)}: put an ONNX file there')
+
+
+def _check_content(file: Path) -> None:
+    """Compare a file with its digest on the hub; ValueError: it differs, and was removed.
+
+    The hub's cache names each file after its digest: SHA-256 for large files, otherwise git's
+    SHA-1.
+    """
+    blob = file.resolve()
+    content = hashlib.sha256 if len(blob.name) == 64 else hashlib.sha1
+    head = b'' if len(blob.name) == 64 else b'blob %d\0' % blob.stat().st_size
+    digest = content(head, usedforsecurity=False)
+    with blob.open('rb') as opened:
+        while block := opened.read(2**20):
+            digest.update(block)
+    if len(blob.name) in (40, 64) and digest.hexdigest() != blob.name:
+        blob.unlink()
+        raise ValueError(f'the digest of {file.name} differs from that on the hub')

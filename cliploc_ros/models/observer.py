@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Make an observation from an image and its detections: compare crops with labels."""
+"""Compare the crops of an image with labels."""
 
 import time
 from collections import deque
@@ -11,9 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
-from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.protocols import ImageTextEncoder
 
@@ -119,12 +117,6 @@ class Observer:
         if count < 1:
             self._crop_s *= _FADING
         return max(0, count)
-
-    def observe(self, image_rgb: NDArray[np.uint8], camera: Camera, detections: Detections,
-                stamp_ns: int) -> Observation:
-        """Make an observation: all detections with their similarities to all labels."""
-        crops = self._encoder.encode_crops(image_rgb, detections.bboxes_xyxy)
-        return Observation(camera, detections, CropSimilarities(crops, self._labels), stamp_ns)
 
     def crops(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64],
               known: Mapping[int, NDArray[np.float32]] | None = None) -> 'ObservedCrops':

@@ -1,14 +1,18 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The towers of a CLIP in ONNX files, with the tokenizer and the preparation of crops.
+"""The CLIP named by the options: a folder with its two towers as ONNX files.
+
+Beside them are the tokenizer and the preparation of crops.
 
 The meaning of inputs and outputs is read from the files and the configurations next to them.
 """
 
 import contextlib
 import html
-import sys
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +22,27 @@ from PIL import Image
 
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import parse_json, read_file
-from cliploc_ros.models.clip_weights import ClipWeights
-from cliploc_ros.models.exports import CONFIG, PREPROCESS, PREPROCESSOR, TOKENIZER
-from cliploc_ros.models.files import first_line
+from cliploc_ros.models.exports import (
+    BESIDE,
+    CONFIG,
+    IMAGE_TOWERS,
+    PREPROCESS,
+    PREPROCESSOR,
+    TEXT_TOWERS,
+    TOKENIZER,
+    WITHOUT_CLIP,
+    export_key,
+    exported,
+)
+from cliploc_ros.models.files import (
+    find_network,
+    fingerprint_file,
+    first_line,
+    is_hub_name,
+    resolve_folder,
+)
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
+from cliploc_ros.models.protocols import ClipOptions
 
 # Pillow's numbers of filters, as written by transformers.
 _FILTERS = {2: 'bilinear', 3: 'bicubic'}
@@ -36,6 +57,65 @@ _EMBEDDINGS = ('image_embeds', 'text_embeds', 'embedding')
 _MAX_ASPECT = 16
 
 
+@dataclass(frozen=True)
+class ClipWeights:
+    """The weights of a CLIP in ONNX files."""
+
+    model: str  #: For messages: the architecture, or the name of the folder
+    folder: Path
+    image_tower: Path
+    text_tower: Path
+    embed_dim: int  #: Length of an embedding
+    key: str  #: Identifies model and weights
+
+
+def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
+    """Find the weights named by the options; download and export them if necessary.
+
+    After the weights have been exported, neither PyTorch nor the file of a tag is needed.
+    ModelError: the model or tag is unknown (the message lists similar names), a file is missing or
+    damaged, or the download or export failed.
+    """
+    named = options.checkpoint_path or options.pretrained
+    if names_onnx(options):
+        name, folder = named, resolve_folder(named, [IMAGE_TOWERS, TEXT_TOWERS], BESIDE,
+                                             options.cache_dir)
+    else:
+        given, config = Path(named).expanduser().absolute(), ''
+        name = options.model.replace('/', '-')  # OpenAI's spelling is ViT-L/14
+        if name.endswith('.json') and (file := Path(options.model).expanduser()).is_file():
+            name, config = file.stem, fingerprint_file(file)
+        tag = options.pretrained if options.checkpoint_path or not given.is_file() else ''
+
+        from cliploc_ros.models.export import export_clip
+        folder = exported(options.cache_dir, name, f'CLIP {name}', (
+            'CLIP', name, config, tag, fingerprint_file(given) if given.is_file() else ''),
+            partial(export_clip, options), WITHOUT_CLIP)
+    image_tower = find_network(folder, named, IMAGE_TOWERS)
+    text_tower = find_network(folder, '', TEXT_TOWERS)
+    about = read_config(folder / CONFIG, 'it has the length of an embedding')
+    vision = about.get('vision_config')
+    embed_dim = (about.get('projection_dim') or about.get('embed_dim')
+                 or (vision.get('hidden_size') if isinstance(vision, dict) else None))
+    if type(embed_dim) is not int or not 0 < embed_dim < 2**16:  # a boolean is an int, too
+        raise ModelError(f"{folder / CONFIG} has the length of an embedding neither in "
+                         "'projection_dim' nor in 'embed_dim': add it")
+    key = export_key(folder) or (
+        f'onnx:{fingerprint_file(image_tower)}:{fingerprint_file(text_tower)}')
+    return ClipWeights(name, folder, image_tower, text_tower, embed_dim, key)
+
+
+def names_onnx(options: ClipOptions) -> bool:
+    """Return whether the options name ONNX files: a folder, or OWNER/NAME of the hub.
+
+    A folder with the name of a tag, such as 'openai', is only used if it contains the files.
+    """
+    named = options.checkpoint_path or options.pretrained
+    folder = Path(named).expanduser()
+    return bool(named) and (is_hub_name(named) or (folder.is_dir() and (
+        os.sep in named or any((folder / file).exists() for file in IMAGE_TOWERS))))
+
+
 class OnnxTower:
     """An image tower in OpenVINO on a CPU, for batches of any size.
 
@@ -45,7 +125,7 @@ class OnnxTower:
     def __init__(self, weights: ClipWeights, cache_dir: str) -> None:
         network = OnnxNetwork(weights.image_tower, cache_dir, None)
         self._network, self._input = network, network.image_input()
-        self.prepare = CropPreparation(read_preparation(weights.folder, self._input.shape[2:]))
+        self.prepare = CropPreparation(weights.folder, self._input.shape[2:])
         probe = self.prepare(np.zeros((32, 32, 3), dtype=np.uint8))[None]
         self._output = _embedding(network, self._run(probe), weights)
 
@@ -59,67 +139,59 @@ class OnnxTower:
         return self._network(**{self._input.name: batch.astype(self._input.type, copy=False)})
 
 
-def read_preparation(folder: Path, fixed: Sequence[int]) -> dict[str, Any]:
-    """Read the preparation of crops, in the format of `CropPreparation`.
-
-    ``fixed`` has height and width of the network's input, ANY where they vary. ModelError: the
-    configuration is missing, incomplete, or from another network.
-    """
-    file = folder / PREPROCESSOR
-    if (folder / PREPROCESS).exists():  # the format of open_clip
-        file = folder / PREPROCESS
-    about = read_config(file, 'it defines the preparation of images')
-    size = about.get('size')
-    squashes = not about.get('do_center_crop', isinstance(size, dict) and 'shortest_edge' in size)
-    found = {'size': about.get('crop_size') if not squashes else size,
-             'resize_mode': 'squash' if squashes else 'shortest',
-             'interpolation': _FILTERS.get(about.get('resample', 3), 'bicubic'),
-             'mean': about.get('image_mean'), 'std': about.get('image_std')}
-    if file.name != PREPROCESSOR:
-        found = about
-    elif not about.get('do_normalize', True):
-        found |= {'mean': [0.0] * 3, 'std': [1.0] * 3}
-    size = found.get('size')
-    if isinstance(size, dict):
-        size = size.get('shortest_edge', (size.get('height'), size.get('width')))
-    try:
-        height, width = map(int, (size, size) if isinstance(size, int) else tuple(size))  # type: ignore[arg-type]
-        mean, std = (np.array(found[name], np.float32).reshape(3) for name in ('mean', 'std'))
-        if not (0 < height <= _MOST_PX and 0 < width <= _MOST_PX and np.isfinite(mean).all()
-                and np.isfinite(std).all() and (std > 0.0).all()):
-            raise ValueError('a number is out of range')
-    except (LookupError, ValueError, TypeError, OverflowError) as error:
-        raise ModelError(f'{file} does not define the preparation of images: expected a size up '
-                         f'to {_MOST_PX} x {_MOST_PX}, and a mean and a standard deviation of '
-                         'three numbers each') from error
-    if (height, width) != tuple(want if want != ANY else has for want, has in
-                                zip(fixed, (height, width), strict=True)):
-        raise ModelError(f'{file} has an image size of {height} x {width}, but the network takes '
-                         f'{fixed[0]} x {fixed[1]}: they are not from the same CLIP')
-    return found | {'size': (height, width), 'mean': mean.tolist(), 'std': std.tolist()}
-
-
 class CropPreparation:
     """Scales crops to the input of a tower, as in open_clip.
 
-    ``config`` is open_clip's ``PreprocessCfg``: size, mean, std, interpolation, resize_mode
-    ('shortest', 'longest' or 'squash') and fill_color.
+    The configuration is that of transformers or open_clip's ``PreprocessCfg``: size, mean, std,
+    interpolation, resize_mode ('shortest', 'longest' or 'squash') and fill_color. ``fixed`` has
+    height and width of the network's input, ANY where they vary. ModelError: the configuration is
+    missing, incomplete, or from another network.
     """
 
-    def __init__(self, config: Mapping[str, Any]) -> None:
-        size = config['size']
-        self._height, self._width = map(int, (size, size) if isinstance(size, int) else size)
-        self._mode = config.get('resize_mode') or 'shortest'
-        self._filter = (Image.Resampling.BILINEAR if config.get('interpolation') == 'bilinear'
+    def __init__(self, folder: Path, fixed: Sequence[int]) -> None:
+        file = folder / PREPROCESS
+        if file.exists():  # the format of open_clip
+            about = read_config(file, 'it defines the preparation of images')
+        else:
+            file = folder / PREPROCESSOR
+            about = _in_the_form_of_open_clip(
+                read_config(file, 'it defines the preparation of images'))
+        size = about.get('size')
+        if isinstance(size, dict):
+            size = size.get('shortest_edge', (size.get('height'), size.get('width')))
+        try:
+            height, width = map(int, (size, size) if isinstance(size, int) else tuple(size))  # type: ignore[arg-type]
+            mean, std = (np.array(about[name], np.float32).reshape(3, 1, 1)
+                         for name in ('mean', 'std'))
+            if not (0 < height <= _MOST_PX and 0 < width <= _MOST_PX and np.isfinite(mean).all()
+                    and np.isfinite(std).all() and (std > 0.0).all()):
+                raise ValueError('a number is out of range')
+        except (LookupError, ValueError, TypeError, OverflowError) as error:
+            raise ModelError(f'{file} does not define the preparation of images: expected a size '
+                             f'up to {_MOST_PX} x {_MOST_PX}, and a mean and a standard deviation '
+                             'of three numbers each') from error
+        if any(want not in (ANY, has) for want, has in zip(fixed, (height, width), strict=True)):
+            raise ModelError(f'{file} has an image size of {height} x {width}, but the network '
+                             f'takes {fixed[0]} x {fixed[1]}: they are not from the same CLIP')
+        self._height, self._width, self._mean, self._std = height, width, mean, std
+        self._mode = about.get('resize_mode') or 'shortest'
+        self._filter = (Image.Resampling.BILINEAR if about.get('interpolation') == 'bilinear'
                         else Image.Resampling.BICUBIC)
-        self._fill = config.get('fill_color') or 0
-        self._mean, self._std = (np.float32(config[name]).reshape(-1, 1, 1)
-                                 for name in ('mean', 'std'))
-        self._max_aspect = _MAX_ASPECT if self._mode == 'shortest' else sys.maxsize
+        self._fill = about.get('fill_color') or 0
 
     def __call__(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Convert a crop (h, w, 3) to the input (3, H, W) of the tower."""
-        image = Image.fromarray(np.ascontiguousarray(self._cut(crop_rgb)))
+        """Convert a crop (h, w, 3) to the input (3, H, W) of the tower.
+
+        A very long crop is first cut to its middle: the short side is scaled to the tower's input
+        before the central square is cut out, and a crop of 1 x 2000 pixels would become an image
+        of 224 x 448,000.
+        """
+        if self._mode == 'shortest':
+            height, width = crop_rgb.shape[:2]
+            longest = _MAX_ASPECT * min(height, width)
+            cut_x, cut_y = max(width - longest, 0) // 2, max(height - longest, 0) // 2
+            crop_rgb = crop_rgb[cut_y:height - cut_y, cut_x:width - cut_x]
+        image = Image.fromarray(np.ascontiguousarray(crop_rgb))
         image = image.resize(self._scaled(*image.size), self._filter)
         left, top = (round((has - wants) / 2.0) for has, wants in
                      zip(image.size, (self._width, self._height), strict=True))
@@ -144,16 +216,16 @@ class CropPreparation:
         ratio = max(ratios) if self._mode == 'longest' else min(ratios)
         return round(width / ratio), round(height / ratio)
 
-    def _cut(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Cut a very long crop to its middle.
 
-        The short side is scaled to the tower's input before the central square is cut out. A crop
-        of 1 x 2000 pixels would first become an image of 224 x 448,000.
-        """
-        height, width = crop_rgb.shape[:2]
-        longest = self._max_aspect * min(height, width)
-        cut_x, cut_y = max(width - longest, 0) // 2, max(height - longest, 0) // 2
-        return crop_rgb[cut_y:height - cut_y, cut_x:width - cut_x]
+def _in_the_form_of_open_clip(about: dict[str, Any]) -> dict[str, Any]:
+    size = about.get('size')
+    squashes = not about.get('do_center_crop', isinstance(size, dict) and 'shortest_edge' in size)
+    is_scaled = about.get('do_normalize', True)
+    return {'size': about.get('crop_size') if not squashes else size,
+            'resize_mode': 'squash' if squashes else 'shortest',
+            'interpolation': _FILTERS.get(about.get('resample', 3), 'bicubic'),
+            'mean': about.get('image_mean') if is_scaled else [0.0] * 3,
+            'std': about.get('image_std') if is_scaled else [1.0] * 3}
 
 
 class OnnxTextTower:

@@ -6,7 +6,9 @@ The meaning of the outputs is read from the metadata of the file and the configu
 """
 
 import ast
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,11 +19,16 @@ from PIL import Image
 
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import ModelError, OptionsError
-from cliploc_ros.models.files import first_line
-from cliploc_ros.models.hub import find_network, resolve_folder
+from cliploc_ros.models.files import (
+    find_network,
+    fingerprint_file,
+    first_line,
+    is_hub_name,
+    resolve_folder,
+)
 from cliploc_ros.models.images import check_image_rgb
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 
 _CONFIG, _PREPROCESSOR = 'config.json', 'preprocessor_config.json'
 #: The files of a published detector; of the networks, the first that exists is used.
@@ -61,7 +68,10 @@ class OnnxDetector:
         if options.prompts:
             raise OptionsError(f'{options.model} has fixed classes: a vocabulary needs the .pt '
                                'file of a YOLO-World or YOLOE')
-        file = _resolve(options)
+        file = Path(options.model).expanduser().absolute()
+        if file.suffix != '.onnx' and not file.is_file():
+            file = find_network(resolve_folder(options.model, [NETWORKS], BESIDE,
+                                               options.cache_dir), options.model, NETWORKS)
         network = OnnxNetwork(file, options.cache_dir)
         self._head: _Head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs)
                              else YoloHead)(network)
@@ -100,13 +110,32 @@ class OnnxDetector:
                           scores=rows[:, 4].astype(np.float64))
 
 
-def _resolve(options: DetectorOptions) -> Path:
-    """Return the ONNX file named by the options; download it if necessary."""
-    path = Path(options.model).expanduser().absolute()
-    if path.suffix == '.onnx' or path.is_file():
-        return path
-    return find_network(resolve_folder(options.model, [NETWORKS], BESIDE, options.cache_dir),
-                        options.model, NETWORKS)
+def load_detector(options: DetectorOptions) -> ObjectDetector:
+    """Load a detector; weights of ultralytics are exported to ONNX at their first use.
+
+    Raises
+    ------
+    ModelError
+        The weights are missing or damaged, are not those of a detection model, or cannot be
+        exported, for example without PyTorch.
+    OptionsError
+        The options name prompts for a network with fixed classes.
+    """
+    path = Path(options.model).expanduser()
+    if path.suffix == '.onnx' or path.is_dir() or is_hub_name(options.model):
+        return OnnxDetector(options)
+    from cliploc_ros.models.exports import DETECTOR, exported
+    from cliploc_ros.models.yolo_weights import export_detector, resolve_published
+
+    file = resolve_published(options.model, options.cache_dir, 'model')
+    identity = [fingerprint_file(file)]
+    if options.prompts:
+        tower = Path(options.text_model).expanduser()
+        identity += [fingerprint_file(tower) if tower.is_file() else options.text_model,
+                     json.dumps(options.prompts)]
+    folder = exported(options.cache_dir, 'YOLO', str(file), identity,
+                      partial(export_detector, file, options))
+    return OnnxDetector(replace(options, model=str(folder / DETECTOR), prompts=()))
 
 
 class YoloHead:

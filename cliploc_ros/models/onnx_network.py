@@ -113,7 +113,10 @@ class OnnxNetwork:
                                first_line(error), file.name)
             compiled, self.metadata = _compile(file, stored, precision)
         self._network = CompiledNetwork(compiled)
-        self.inputs = tuple(_described(port) for port in compiled.inputs)
+        self.inputs = tuple(Input(
+            _name_of(port),
+            tuple(ANY if size.is_dynamic else size.get_length() for size in port.partial_shape),
+            _TYPES.get(port.element_type.get_type_name())) for port in compiled.inputs)
         self.outputs = tuple(_name_of(port) for port in compiled.outputs)
 
     def __call__(self, **inputs: NDArray[Any]) -> dict[str, NDArray[np.float32]]:
@@ -269,11 +272,6 @@ def _unreadable(file: Path, reason: str) -> ModelError:
     lines = [line.strip() for line in reason.splitlines() if line.strip()]
     return ModelError(f'OpenVINO cannot read {file}: {" ".join(lines[-2:])[:300]}; update '
                       'OpenVINO, or export the network with an opset of 11 to 21')
-
-
-def _described(port: Any) -> Input:
-    shape = tuple(ANY if size.is_dynamic else size.get_length() for size in port.partial_shape)
-    return Input(_name_of(port), shape, _TYPES.get(port.element_type.get_type_name()))
 
 
 def _name_of(port: Any) -> str:

@@ -1,21 +1,29 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Protocols and options of detectors and encoders, independent of their networks."""
+"""Detectors and encoders, independent of their networks: protocols, options, prompts, profiles."""
 
+import logging
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 from cliploc_ros.errors import OptionsError
 
-if TYPE_CHECKING:  # not at run time, for a fast --help of the programs
+# not at run time, for a fast --help: nodes need the names of profiles before loading networks
+if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.core.observation import Detections
 
 #: Texts that a detector looks for, each with the class that it reports.
 Prompts = tuple[tuple[str, str], ...]
+#: Greatest number of texts of a vocabulary (not measured): LVIS has 1,203 classes, a room dozens.
+MOST_TEXTS = 300
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -71,7 +79,7 @@ class ClipOptions:
 
 
 class ImageTextEncoder(Protocol):
-    """Embeds image crops and text labels in a common space, with cosine similarity."""
+    """Embeds image crops in the space of label embeddings, with cosine similarity."""
 
     key: str  #: Identifies model and weights: equal keys give equal embeddings
 
@@ -82,9 +90,6 @@ class ImageTextEncoder(Protocol):
         The boxes (n, 4) are left, top, right, bottom [px]; each must overlap the image. The
         embeddings have unit length.
         """
-
-    def encode_labels(self, labels: Sequence[str]) -> 'NDArray[np.float32]':
-        """Return the embeddings (L, d) of L labels, float32 rows of unit length."""
 
 
 class ObjectDetector(Protocol):
@@ -101,3 +106,92 @@ class ObjectDetector(Protocol):
         Boxes are in pixels of that image. ImageError: the image has another shape or type, or no
         pixels.
         """
+
+
+def prompts_of_names(names: str) -> Prompts:
+    """Return the prompts of a list of names, such as 'mug, office chair'.
+
+    OptionsError: there are no names, or too many.
+    """
+    texts = dict.fromkeys(filter(None, map(str.strip, names.split(','))))
+    return _checked([(text, text) for text in texts], 'the vocabulary')
+
+
+def prompts_of_map(landmark_map: 'LandmarkMap', source: str) -> Prompts:
+    """Return the prompts of a map: its classes, and its labels with the class of their landmarks.
+
+    A label shared by landmarks of several classes gets the most frequent class. If there are too
+    many labels, the prompts are only the classes. OptionsError: there are no classes, or too many.
+    """
+    found = [(name, name) for name in dict.fromkeys(landmark_map.class_ids) if name.strip()]
+    classes = {name for name, _ in found}
+    owners: dict[str, Counter[str]] = {}
+    for name, labels in zip(landmark_map.class_ids, landmark_map.weighted_labels, strict=True):
+        for text, _ in labels:
+            if name in classes and text.strip() and text not in classes:
+                owners.setdefault(text, Counter())[name] += 1
+    if len(found) + len(owners) <= MOST_TEXTS:
+        found += [(text, names.most_common(1)[0][0]) for text, names in owners.items()]
+    else:
+        logger.warning('%s has %d classes and %d other labels, more than %d texts: the detector '
+                       'looks only for the classes', source, len(found), len(owners), MOST_TEXTS)
+    return _checked(found, source)
+
+
+def _checked(prompts: Sequence[tuple[str, str]], source: str) -> Prompts:
+    if not prompts:
+        raise OptionsError(f'{source} names no class for the detector')
+    if len(prompts) > MOST_TEXTS:
+        raise OptionsError(f'{source} has {len(prompts)} classes for the detector, expected at '
+                           f'most {MOST_TEXTS}: name the important ones in vocabulary')
+    return tuple(prompts)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A detector and an encoder."""
+
+    detector: str  #: See DetectorOptions.model
+    #: See ClipOptions; an ONNX network needs no model
+    clip_model: str
+    clip_pretrained: str
+
+
+# OpenAI's ViT-B-32.
+_CLIP = 'Xenova/clip-vit-base-patch32'
+#: doc/install.md has their accuracy, time, memory and licences.
+PROFILES = {
+    'accurate': Profile('yolov8x.pt', 'ViT-L-14', 'openai'),  # the paper's
+    'balanced': Profile('onnx-community/dfine_m_obj365-ONNX', '', _CLIP),
+    'fast': Profile('onnx-community/dfine_n_coco-ONNX', '', _CLIP),
+}
+PROFILE_NAMES = tuple(PROFILES)
+
+
+def _profile(name: str) -> Profile:
+    if name not in PROFILES:
+        raise OptionsError(f"profile '{name}' is not one of {', '.join(PROFILES)}")
+    return PROFILES[name]
+
+
+def with_detector(options: DetectorOptions, profile: str) -> DetectorOptions:
+    """Return options that name a detector: that of the profile if the model is ''.
+
+    OptionsError: the profile is unknown.
+    """
+    return options if options.model else replace(options, model=_profile(profile).detector)
+
+
+def with_encoder(options: ClipOptions, profile: str) -> ClipOptions:
+    """Return options that name an encoder: that of the profile if they do not name one.
+
+    If the options name a model, weights or a file, the missing ones are the defaults of
+    ClipOptions, not those of the profile, because weights belong to a model. OptionsError: the
+    profile is unknown.
+    """
+    if options.model or options.pretrained or options.checkpoint_path:
+        defaults = type(options)
+        return replace(options, model=options.model or defaults.model,
+                       pretrained=options.pretrained or defaults.pretrained)
+    chosen = _profile(profile)
+    return replace(options, model=chosen.clip_model, pretrained=chosen.clip_pretrained)

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_encoder import encode_labels
-from cliploc_ros.models.clip_weights import resolve_clip_weights
+from cliploc_ros.models.clip_encoder import LabelCache, encode_labels
 from cliploc_ros.models.export import OPSET, compare, halve, quiet_export
 from cliploc_ros.models.exports import (
     CHECKPOINT,
@@ -36,7 +35,7 @@ from cliploc_ros.models.exports import (
     needs_pytorch,
 )
 from cliploc_ros.models.files import check_weights_file, download, fingerprint_file, first_line
-from cliploc_ros.models.label_embeddings import LabelCache
+from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 
 # Sides of an input must be multiples of the stride.
@@ -176,8 +175,8 @@ def export_detector(file: Path, options: DetectorOptions, folder: Path, half: bo
     describe_export(folder, 'detector')
 
 
-def set_prompts(model: Any, options: DetectorOptions) -> str:
-    """Set the options' prompts in a network of ultralytics; return the key of the text tower.
+def set_prompts(model: Any, options: DetectorOptions) -> None:
+    """Set the options' prompts in a network of ultralytics.
 
     Raises
     ------
@@ -207,7 +206,6 @@ def set_prompts(model: Any, options: DetectorOptions) -> str:
             network.set_classes(texts, head.get_tpe(embedded))
     else:  # as in WorldModel.set_classes, which would load its own text tower
         network.txt_feats, head.nc, network.names = embedded, len(texts), dict(enumerate(texts))
-    return key
 
 
 def _tower(name: str, options: DetectorOptions

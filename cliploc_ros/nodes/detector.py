@@ -16,9 +16,15 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import image_from_msg
-from cliploc_ros.models.open_vocabulary import prompts_of_map, prompts_of_names
-from cliploc_ros.models.profiles import load_detector, with_detector
-from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector, Prompts
+from cliploc_ros.models.onnx_detector import load_detector
+from cliploc_ros.models.protocols import (
+    DetectorOptions,
+    ObjectDetector,
+    Prompts,
+    prompts_of_map,
+    prompts_of_names,
+    with_detector,
+)
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg, of_camera, stamp_ns
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes

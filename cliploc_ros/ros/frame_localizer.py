@@ -28,7 +28,7 @@ from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch, WatchReport
 from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.storage import read_file, resolve_cache_dir
-from cliploc_ros.models.profiles import with_encoder
+from cliploc_ros.models.protocols import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.instants import Instants
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
@@ -215,9 +215,9 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
         raise MapError('the map has neither landmarks nor keyframes next to it: rebuild it')
     observer = None
     if options.needs_similarities and len(landmark_map):
-        from cliploc_ros.models.clip_weights import ClipOptions
-        from cliploc_ros.models.map_rows import embed_map, load_encoder_for_map
+        from cliploc_ros.models.clip_encoder import embed_map, load_encoder_for_map
         from cliploc_ros.models.observer import Observer
+        from cliploc_ros.models.protocols import ClipOptions
         named = ClipOptions(
             model=parameters.clip_model, pretrained=parameters.clip_pretrained,
             checkpoint_path=parameters.clip_checkpoint_path, cache_dir=parameters.cache_dir)

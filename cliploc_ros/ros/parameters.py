@@ -15,7 +15,7 @@ from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.options import ALGORITHMS, COMPARED, CROPS, MATCHINGS, RelocalizerOptions
 from cliploc_ros.errors import MapError, OptionsError
 from cliploc_ros.messages import parse_class_map
-from cliploc_ros.models.profiles import PROFILE_NAMES
+from cliploc_ros.models.protocols import PROFILE_NAMES
 from cliploc_ros.ros.conversions import DETECTION_TYPES
 from cliploc_ros.ros.node.parameters import Parameters, parameter
 

@@ -20,10 +20,9 @@ from cliploc_ros.core.geometry.ellipsoid import box_ious
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.files.storage import make_folder
-from cliploc_ros.models.clip_encoder import load_encoder
-from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.profiles import load_detector
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.clip_encoder import load_encoder_for_map
+from cliploc_ros.models.onnx_detector import load_detector
+from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from cliploc_ros.models.yolo_weights import import_ultralytics
 from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions
@@ -43,7 +42,7 @@ def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Querie
     detector = load_detector(DetectorOptions(model=str(ASSETS / 'yolo.pt')))
     clip = ClipOptions(model=str(ASSETS / 'clip.json'), cache_dir=str(cache_dir),
                        pretrained=str(ASSETS / 'clip.safetensors'))
-    encoder, labels = load_encoder(clip, landmark_map.weighted_labels)
+    encoder, labels = load_encoder_for_map(clip, landmark_map, [], 'text')
     frames = read_folder(sequence, FolderOptions(layout='tum'))
     recorded = record_every_frame(frames, RunNetworks(detector.detect, encoder))
     return make_queries_of(recorded, landmark_map, labels)

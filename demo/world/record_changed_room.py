@@ -18,8 +18,7 @@ import numpy as np
 
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, save_landmark_embeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import save_observations

@@ -21,8 +21,8 @@ from cliploc_ros.core.keyframes.localization import (
     ImageFeatures,
     ImageRecognizer,
     KeyframeLocalizer,
+    Recognition,
 )
-from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -180,10 +180,10 @@ class _Features(ImageFeatures):
         super().__init__(lambda: image, camera)
         self._looker, self._most = looker, most
 
-    def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
-        """Return the features of a pass, with a time of 0."""
+    def of_pass(self, is_thorough: bool) -> Features:
+        """Return the features of a pass."""
         found = self._looker.features(self._read_rgb(), is_thorough)
-        return Features(*(column[:self._most] for column in vars(found).values())), 0.0
+        return Features(*(column[:self._most] for column in vars(found).values()))
 
 
 def _ask(number: int, case: Case, query: Query, landmark_map: LandmarkMap,

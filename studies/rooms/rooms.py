@@ -25,7 +25,7 @@ from cliploc_ros.core.keyframes.localization import ImageFeatures, query_feature
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.storage import make_folder, write_file
-from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder
 from cliploc_ros.offline.datasets.frames import (
@@ -96,9 +96,9 @@ class KeptFeatures(ImageFeatures):
         super().__init__(lambda: raw.color()[0], raw.color()[1])
         self._looker = looker
 
-    def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
-        """Return the features of a pass, with a time of 0."""
-        return self._looker.features(self._read_rgb(), is_thorough), 0.0
+    def of_pass(self, is_thorough: bool) -> Features:
+        """Return the features of a pass."""
+        return self._looker.features(self._read_rgb(), is_thorough)
 
 
 def keep(path: Path, what: Any) -> None:

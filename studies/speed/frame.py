@@ -35,12 +35,18 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.clip_encoder import ClipEncoder, load_encoder_for_map
 from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.onnx_clip import resolve_clip_weights
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.onnx_network import free_memory
-from cliploc_ros.models.profiles import PROFILES, Profile, load_detector
-from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
+from cliploc_ros.models.protocols import (
+    PROFILES,
+    ClipOptions,
+    DetectorOptions,
+    ObjectDetector,
+    Profile,
+)
 from cliploc_ros.models.yolo_weights import import_ultralytics
 from demo import ASSETS
 from studies.reports import table
@@ -158,8 +164,10 @@ def _demo_frame(crops: int, folder: str) -> tuple[NDArray[np.uint8], Observation
             break
     clip = ClipOptions(pretrained=str(ASSETS / 'clip'), cache_dir=folder)
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
-    observer = Observer(*load_encoder(clip, landmark_map.weighted_labels))
-    return image_rgb, observer.observe(image_rgb, camera, detections, 0)
+    observer = Observer(*load_encoder_for_map(clip, landmark_map, [], 'text'))
+    observed = observer.crops(image_rgb, detections.bboxes_xyxy, {})
+    return image_rgb, Observation(camera, detections,
+                                  observed.compare(np.arange(len(detections))))
 
 
 def _resident_mib() -> float:

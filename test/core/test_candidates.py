@@ -286,14 +286,6 @@ def test_a_rare_class_makes_no_candidate(share, is_candidate):
     assert len(scene.pairs) == (len(ROOM)**2 if is_candidate else 0)
 
 
-def test_a_landmark_has_its_own_class_even_if_its_weights_lack_it():
-    landmark_map = replace(ROOM, details=(LandmarkDetails(class_weights=(('z', 1.0),)),
-                                          *[LandmarkDetails()] * (len(ROOM) - 1)))
-    scene, _ = match_frame(landmark_map, see([*'az', *'q' * (len(ROOM) - 2)]), BY_CLASS)
-    own = [row for row, name in enumerate(ROOM.class_ids) if name == 'a']
-    assert sorted(scene.pairs.tolist()) == [[0, row] for row in own] + [[1, 0]]
-
-
 def test_a_class_that_a_landmark_is_only_taken_for_is_not_expected():
     """A person walking through the view does not count against the pose."""
     seen = see_room(ROOM)

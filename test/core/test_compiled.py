@@ -23,7 +23,7 @@ from cliploc_ros.core.geometry.ellipse import unit_circle_overlap
 warm_up(lambda: unit_circle_overlap(0.0, 0.0, 1.0, 1.0))
 print(COUNTS['missing'], unit_circle_overlap(0.0, 0.0, 1.0, 1.0))
 """
-KERNELS = 5
+KERNELS = 4
 
 
 def run(*within, package=PROJECT, program=PROGRAM, **environment):

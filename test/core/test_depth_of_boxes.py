@@ -10,12 +10,13 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 
 from cliploc_ros.core.acceptance.depth_check import DepthCheck, DepthScale
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth import centre_depth, half_chord
-from cliploc_ros.core.geometry.depth_image import (
+from cliploc_ros.core.geometry.depth import (
     DepthCamera,
     DepthImage,
+    centre_depth,
     depth_from_counts,
     depths_of_boxes,
+    half_chord,
 )
 from cliploc_ros.core.geometry.ellipsoid import shape_matrices
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error

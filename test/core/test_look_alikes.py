@@ -122,13 +122,6 @@ PILE = np.array([[0.0, 0.0, 0.2 * row] for row in range(6)])
 RING = 3.5 * np.array([[np.cos(angle), np.sin(angle), 0.0] for angle in np.arange(6) * np.pi / 3])
 
 
-@pytest.mark.parametrize(('count', 'pairs'), [(1, 0), (2, 2), (3, 6), (11, 110), (13, 130)])
-def test_each_landmark_makes_pairs_with_its_nearest_ten(count, pairs):
-    angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-    ring = 1.4 * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles])
-    assert len(make_map(ring, 'a' * count).pairs.keys) == pairs
-
-
 @pytest.mark.parametrize(('place', 'turn_deg'), [(PILE, 0.0), (RING, 90.0)])
 def test_poses_that_a_search_met_are_compared_too(place, turn_deg):
     """Landmarks above each other have no pairs with a direction; distant ones have no pairs."""

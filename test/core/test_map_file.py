@@ -3,7 +3,7 @@
 """Maps, their embeddings and several maps in one: reading, writing and refusing."""
 
 import os
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,7 +22,6 @@ from cliploc_ros.core.map.landmark_embeddings import (
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.core.map.parameter_file import parse_written_map, read_parameter_file
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer, in_its_map
@@ -43,7 +42,8 @@ def read(fields):
 
 def test_a_written_map_is_read_back(tmp_path):
     room = make_room()
-    room = replace(room, labels=('yes: "quoted" \\ #1 \U0001f600', *room.labels[1:]),
+    odd = ('yes: "quoted" \\ #1: [\U0001f600]', 'tab\tand\nline', '\x7f', '\\ud83d', 'a\u2028"\\')
+    room = replace(room, labels=(*odd, *room.labels[len(odd):]),
                    details=(FULL,) + (LandmarkDetails(support=3),) * (len(room) - 1))
     write_map(tmp_path / 'map.yaml', room, ['two\nlines become one'])
     loaded = LandmarkMap.from_file(tmp_path / 'map.yaml')
@@ -53,31 +53,6 @@ def test_a_written_map_is_read_back(tmp_path):
     assert loaded.centers == pytest.approx(room.centers, abs=1e-5)
     assert loaded.semi_axes == pytest.approx(room.semi_axes, abs=1e-5)
     assert loaded.quats_xyzw == pytest.approx(room.quats_xyzw, abs=2e-5)
-
-
-def test_the_old_map_stays_when_the_new_one_cannot_be_written(tmp_path):
-    path = tmp_path / 'map.yaml'
-    path.write_text('old')
-    broken = replace(make_room(), centers=np.full((12, 3), 'x', dtype=object))
-    with pytest.raises(ValueError):
-        write_map(path, broken)
-    assert path.read_text() == 'old'
-    assert [file.name for file in tmp_path.iterdir()] == ['map.yaml']
-    with pytest.raises(MapError, match='cannot be written'):
-        write_map(tmp_path / 'missing' / 'map.yaml', make_room())
-
-
-def test_a_link_stays_and_the_file_it_leads_to_keeps_its_mode(tmp_path):
-    (tmp_path / 'maps').mkdir()
-    there, link = tmp_path / 'maps/office.yaml', tmp_path / 'map.yaml'
-    link.symlink_to('maps/office.yaml')
-    write_map(link, make_room())  # a link may lead to a file that does not exist yet
-    there.chmod(0o640)
-    there.write_text('old')
-    write_map(link, make_room())
-    assert link.is_symlink() and there.stat().st_mode & 0o777 == 0o640
-    assert LandmarkMap.from_file(there).landmark_ids == make_room().landmark_ids
-    assert sorted(file.name for file in tmp_path.rglob('*')) == ['map.yaml', 'maps', 'office.yaml']
 
 
 def test_image_embeddings_belong_to_one_map(tmp_path):
@@ -109,59 +84,6 @@ def test_a_thing_that_was_two_landmarks_has_the_labels_of_both_by_their_frames()
     often, once = (LandmarkDetails(support=count) for count in (3, 1))
     joined = join_details([('a mug', 'cup', often), ('a bowl', 'cup', once)])
     assert joined.labels == (('a mug', 0.75), ('a bowl', 0.25))
-
-
-def by_yaml(path):
-    tree = read_parameter_file(path)['/**']['ros__parameters']['map']
-    return LandmarkMap.from_mapping(tree, str(path))
-
-
-def equal(one, other):
-    return all(np.array_equal(getattr(one, field.name), getattr(other, field.name))
-               if field.name in ('centers', 'semi_axes', 'quats_xyzw')
-               else getattr(one, field.name) == getattr(other, field.name)
-               for field in fields(LandmarkMap) if field.name != 'map_set')
-
-
-@pytest.mark.parametrize('details', [
-    (), (FULL,) * 12, (LandmarkDetails(), FULL) * 6,
-    (LandmarkDetails(shared_sigma=0.02, shared_sigma_deg=0.5, support=3, last_seen=5.0),) * 12])
-@pytest.mark.parametrize('label', ['a mug', 'caf\u00e9 "x" \\ #1: [a]', 'tab\tand\nline', '\x7f',
-                                   '\\ud83d\\ude00', 'a\u2028b "\\'])
-def test_what_was_written_is_read_as_yaml_reads_it(tmp_path, details, label):
-    path, room = tmp_path / 'map.yaml', make_room()
-    # ROS refuses arrays that mix integers and floats
-    write_map(path, replace(room, details=details, labels=(label, *room.labels[1:]),
-                            centers=np.ones((12, 3))), ['h\u00f6'])
-    assert parse_written_map(path.read_text(encoding='utf-8')) is not None
-    assert equal(LandmarkMap.from_file(path), by_yaml(path))
-    assert by_yaml(path).labels[0] == label
-
-
-@pytest.mark.parametrize(('before', 'after'), [
-    ('center: [', 'center: [0'), ('0.', '.'), ('label: "', 'label: '),
-    ('center: [', 'center: [9999999'),
-    ('semi_axes: [0', 'semi_axes: [-0'), ('semi_axes: [0', 'semi_axes: [1e9'),
-    ('support: 37', 'support: 37.5'), ('support: 37', 'support: -37'), ('"cup": ', '"c\\ud83d": '),
-    ('position_sigma: 0.0125', 'position_sigma: .nan'), ('    text: [', '    text: ["one more", '),
-    ('0.7500', '0.0000'), ('source: "build', 'source: "  " #'), ('label: "', 'label: "\\x41'),
-    ('frame_id: "', 'frame_id: "" #'), ('orientation: [', 'orientation: [9'), ('\n', '\r\n'),
-    ('          label', '\t  label'), ('landmarks:', 'landmarks: # all'),
-    ('class_id: "', "class_id: '"), ('"thing_1":', '"thing_0":'), ('"wine glass":', '"cup":')])
-def test_a_changed_file_is_read_or_refused_as_by_yaml(tmp_path, before, after):
-    path = tmp_path / 'map.yaml'
-    write_map(path, replace(make_room(), details=(FULL,) * 12))
-    text = path.read_bytes().decode()
-    assert before in text
-    path.write_bytes(text.replace(before, after, 1).encode())
-    try:
-        expected = by_yaml(path)
-    except MapError as error:
-        with pytest.raises(MapError) as raised:
-            LandmarkMap.from_file(path)
-        assert str(raised.value) == str(error)
-    else:
-        assert equal(LandmarkMap.from_file(path), expected)
 
 
 WITH_LABEL = CUP | {'label': 'a red cup'}
@@ -202,12 +124,11 @@ def test_a_nearly_unit_quaternion_is_normalized(tmp_path):
     ({'center': [1e300, 0.0, 0.0]}, 'center: .*beyond'), ({'center': [0.0, 0.0]}, 'center: .*3'),
     ({'center': [True, 0.0, 0.0]}, 'center: .*3'), ({'semi_axes': [0.1, -1.0, 0.1]}, 'semi_axes'),
     ({'orientation': [0.0] * 4}, 'orientation: .*0'), ({'class_id': None}, 'class_id'),
-    ({'colour': 'red'}, '.*colour'), ({'center': [10**400, 0, 0]}, 'center: .*not finite'),
+    ({'colour': 'red'}, '.*colour'),
     ({'labels': []}, 'labels: is empty'),
     ({'labels': {'text': ['a'], 'weight': [1.0, 2.0]}}, 'labels: .*equal length'),
     ({'labels': [{'text': 'a', 'weight': 0.0}]}, 'labels: .*above 0'),
     ({'class_weights': ['cup']}, 'class_weights'), ({'seen_ratio': -0.5}, 'seen_ratio: -0.5'),
-    ({'position_sigma': float('nan')}, 'position_sigma: nan'),
     ({'seen_ratio': 10**400}, 'seen_ratio: 10'), ({'class_id': 1001 * 'x'}, 'class_id: longer')])
 def test_bad_fields_are_named_with_file_and_landmark(change, message):
     with pytest.raises(MapError, match=f"here: landmark 'cup_1': {message}"):

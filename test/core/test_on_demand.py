@@ -79,15 +79,6 @@ def test_each_stage_has_more_crops_and_the_last_one_all():
         assert np.array_equal(stage.compared[rows[rows >= 0]], np.nonzero(rows >= 0)[0])
 
 
-def test_crops_end_when_there_is_no_room():
-    rooms = iter([3, 0])
-    stages = searches(Crops(lambda rows: SURE[rows], room=lambda: next(rooms)))
-    assert [len(stage.compared) for stage in stages] == [0, 3]
-    none = Observation(CAMERA, SEEN.select(np.array([], dtype=np.int64)))
-    (stage,) = searches(Crops(lambda rows: SURE[rows]), none)
-    assert len(stage.compared) == 0
-
-
 @pytest.mark.parametrize('embedded', [False, True])
 def test_no_crop_is_class_matching_and_all_crops_are_hybrid(embedded):
     """Similarities are those of an array, or of embeddings."""

@@ -24,7 +24,6 @@ from cliploc_ros.core.acceptance.confidence import (
     confidences,
     none_right,
     objects_utility,
-    one_thing,
     support,
     tilt_handicaps,
     utilities,
@@ -34,12 +33,11 @@ from cliploc_ros.core.acceptance.look_alikes import lead_over_twin, turned_about
 from cliploc_ros.core.acceptance.looks import EarlierLook
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
 from cliploc_ros.core.calibration import CALIBRATION, FILE
-from cliploc_ros.core.fit.covariance import share_within
+from cliploc_ros.core.fit.covariance import share_within, succeed
 from cliploc_ros.core.fit.finalists import Match
-from cliploc_ros.core.fit.succession import succeed
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform, pose_difference
-from cliploc_ros.core.keyframes.places import RecognizedPlace
+from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform
+from cliploc_ros.core.keyframes.localization import RecognizedPlace
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -61,21 +59,25 @@ def looks(*confidences, doubted=0.0, same_view=0.0):
     return tuple(EarlierLook(confidence, doubted, same_view) for confidence in confidences)
 
 
-# Factors that reduce the confidence, and the kind of refusal that names them.
+# What the evidence lacks, and the kind of refusal that names it; None: the pose is accepted.
 WEAK = {
     'rival': ({'likely': 0.5, 'rival': Rival(0.49, (9.0, 9.0, 9.0))}, RefusalKind.AMBIGUOUS),
+    'weak rival': ({'likely': 0.5, 'rival': Rival(0.1, (9.0, 9.0, 9.0))}, RefusalKind.UNEXPLAINED),
     'other source': ({'likely': 0.5, 'rival': Rival(0.49, (9.0, 9.0, 9.0), '', True)},
                      RefusalKind.CONTRADICTION),
     'unexplained': ({'likely': 0.5, 'unexplained': 12.0}, RefusalKind.UNEXPLAINED),
-    'distinct': ({'distinct': 0.5, 'twin': (2.3, 2.3, 1.2)},
-                 RefusalKind.LOOK_ALIKE),
+    'distinct': ({'distinct': 0.5, 'twin': (2.3, 2.3, 1.2)}, RefusalKind.LOOK_ALIKE),
     'near': ({'near': 0.5, 'deviation_m': 1.23}, RefusalKind.UNCERTAIN_POSITION),
     'genuine': ({'signs': SMALL, 'recognized': RECOGNIZED}, RefusalKind.CHANGED),
     'mirror': ({'not_mirrored': 0.5}, RefusalKind.AMBIGUOUS),
     'keyframes': ({'uncontradicted': 0.1, 'rival': Rival(0.01, (9.0, 9.0, 9.0))},
                   RefusalKind.CONTRADICTION),
     'found': ({'meetings': 0.1, 'coverage': 0.5, 'tried': 700}, RefusalKind.SEARCH_CUT_SHORT),
+    'tried': ({'coverage': 0.5, 'tried': 499}, RefusalKind.SEARCH_CUT_SHORT),
+    'enough tried': ({'coverage': 0.5, 'tried': 500}, None),
     'looks': ({'earlier': looks(*[0.1] * 9)}, RefusalKind.FRAMES_DISAGREE),
+    'one good look': ({'earlier': looks(0.0, 0.99, 0.0)}, RefusalKind.FRAMES_DISAGREE),
+    'a bad look': ({'earlier': looks(0.0, 0.99)}, None),
     'same view': ({'earlier': looks(0.9, 0.9, doubted=0.6, same_view=1.0)},
                   RefusalKind.FRAMES_DISAGREE),
     'linked': ({'linked': 0.5}, RefusalKind.FRAMES_DISAGREE),
@@ -92,8 +94,24 @@ def test_sure_evidence_is_accepted():
 def test_a_refusal_names_the_evidence_that_decided(what):
     fields, kind = WEAK[what]
     refused = refusal(replace(SURE, **fields), OPTIONS)
-    assert refused.kind == kind
-    assert len(f'refused: {refused.reason}') <= 120, 'answers of services have one line'
+    assert (refused and refused.kind) == kind
+    assert not refused or len(f'refused: {refused.reason}') <= 120, 'a service answers in one line'
+
+
+@pytest.mark.parametrize(('fields', 'options', 'kind'), [
+    ({'inliers': 3}, {'min_inliers': 4}, RefusalKind.TOO_FEW_OBJECTS), ({'inliers': 3}, {}, None),
+    ({'likely': 0.98}, {'min_confidence': 0.99}, RefusalKind.UNEXPLAINED),
+    ({'coverage': 0.5, 'tried': 5000}, {'algorithm': 'bf'}, RefusalKind.SEARCH_CUT_SHORT),
+    ({'meetings': 0.1}, {'algorithm': 'ransac'}, RefusalKind.SEARCH_CUT_SHORT),
+    ({}, {'iterations': 499, 'algorithm': 'b-prosac'}, RefusalKind.SEARCH_CUT_SHORT)])
+def test_options_decide_what_a_pose_needs(fields, options, kind):
+    refused = refusal(replace(SURE, **fields), RelocalizerOptions(**options))
+    assert (refused and refused.kind) == kind
+
+
+def test_a_confidence_is_rounded_down():
+    reason = refusal(Evidence(8, 0.98999), RelocalizerOptions(min_confidence=0.99)).reason
+    assert reason.startswith('confidence 0.98 < 0.99; ')
 
 
 def test_keyframes_that_are_sure_replace_what_objects_lack():
@@ -132,22 +150,6 @@ def office_queries(shared_data):
     return landmark_map, make_queries(recorded, landmark_map, True)
 
 
-@pytest.mark.parametrize('knows_vertical', [False, True])
-def test_no_pose_is_its_own_look_alike(office_queries, knows_vertical):
-    """Frames 12, 14 and, with a vertical, 3 once failed: refinement moved the twin back."""
-    landmark_map, queries = office_queries
-    relocalizer = Relocalizer(landmark_map, OPTIONS)
-    for number in (3, 12, 14):
-        query = queries[number]
-        observation = query.observation if not knows_vertical else replace(
-            query.observation, up_in_camera=query.map_from_camera[2, :3].copy())
-        found = relocalizer.relocalize([observation])
-        if found.refusal_kind == RefusalKind.LOOK_ALIKE:
-            one, other = (np.array([*map(float, place.split(','))]) for place in
-                          re.findall(r'\(([-\d., ]+)\)', found.reason)[:2])
-            assert np.linalg.norm(one - other) > 0.9
-
-
 def mirrored(observation):
     seen, camera = observation.detections, observation.camera
     boxes = seen.bboxes_xyxy[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (camera.width, 0) * 2
@@ -169,15 +171,6 @@ def test_the_true_pose_of_a_mirrored_image_is_a_rival(office_queries, algorithm)
         wrong = relocalizer.relocalize([mirrored(observation)])
         assert wrong.evidence.likely > 0.9
         assert wrong.evidence.not_mirrored < 0.4
-
-
-@pytest.mark.full
-def test_mirror_images_are_refused(office_queries):
-    landmark_map, queries = office_queries
-    relocalizer = Relocalizer(landmark_map, replace(OPTIONS, matching='class'))
-    accepted = [relocalizer.relocalize([mirrored(query.observation)]).accepted
-                for query in queries[::4]]
-    assert sum(accepted) <= 1, f'of {len(accepted)}'
 
 
 def test_each_number_states_its_unit_and_meaning_and_the_command_that_fits_it():
@@ -285,16 +278,13 @@ def measure(office_map):
     return partial(support, office_map)
 
 
-def test_several_boxes_on_one_landmark_count_once(measure, compared, queries):
-    found = measure([compared], queries[0].map_from_camera[None],
-                    [[Match(0, 3, 0.5), Match(1, 3, 0.7), Match(2, 4, 0.6)]])
-    assert (found.inliers, found.score) == (2, pytest.approx(1.3))
-
-
-def test_several_landmarks_behind_one_box_count_once(measure, compared, queries):
-    found = measure([compared], queries[0].map_from_camera[None],
-                    [[Match(2, 1, 0.5), Match(3, 2, 0.7), Match(0, 3, 0.6)]])
-    assert (found.inliers, found.score) == (2, pytest.approx(1.2))
+@pytest.mark.parametrize(('matches', 'score'), [
+    ((Match(0, 3, 0.5), Match(1, 3, 0.7), Match(2, 4, 0.6)), 1.3),
+    ((Match(2, 1, 0.5), Match(3, 2, 0.7), Match(0, 3, 0.6)), 1.2)])
+def test_boxes_on_one_landmark_and_landmarks_behind_one_box_count_once(
+        measure, compared, queries, matches, score):
+    found = measure([compared], queries[0].map_from_camera[None], [matches])
+    assert (found.inliers, found.score) == (2, pytest.approx(score))
 
 
 def test_what_no_landmark_explains_counts_against_a_pose(measure, compared, queries,
@@ -341,8 +331,7 @@ def poses_at(*positions):
     return poses
 
 
-STRONG, LITTLE = Support(7, 5.0, 10.0, 14.0, 14.0), Support(3, 1.5, 10.0, 2.0, 4.0)
-FORTY, ORIGIN = Setting(40), (0.0, 0.0, 0.0)
+STRONG, FORTY = Support(7, 5.0, 10.0, 14.0, 14.0), Setting(40)
 
 
 def share(supports, poses, setting):
@@ -376,64 +365,11 @@ def test_a_large_map_takes_confidence_and_a_known_vertical_gives_some():
             == share([fair], poses_at(0), Setting(2000, 0.5)))
 
 
-def test_little_support_is_little_confidence():
-    weak, rival = share([LITTLE, LITTLE], poses_at(0, 5), FORTY)
-    assert weak + rival < 0.3
-    assert share([Support()], poses_at(0), FORTY)[0] < 0.01
-
-
-def test_confidences_of_poses_that_differ_add_up_to_one_at_most(rng):
-    highest = 0.0
-    for _ in range(200):
-        count = rng.integers(1, 9)
-        supports = [Support(int(rng.integers(0, 9)), rng.uniform(0, 9), rng.uniform(0, 30),
-                            rng.uniform(0, 20)) for _ in range(count)]
-        found = share(supports, poses_at(*5.0 * np.arange(count)), FORTY)
-        # no landmark is more certain than .9999, so none is less likely than .0001
-        assert (found >= 0).all() and found.sum() <= 1.0 + 1e-4 * count
-        highest = max(highest, found.sum())
-    assert highest > 0.99, 'some of them are nearly certain'
-
-
-@pytest.mark.parametrize(('evidence', 'options', 'reason'), [
-    (Evidence(3, 0.995), {'min_inliers': 4}, '3 objects matched < 4; turn the camera'),
-    (Evidence(3, 0.995), {}, ''),
-    (Evidence(5, 0.5, rival=Rival(0.3, ORIGIN)), {},
-     'confidence 0.50 < 0.99; ambiguous: another pose has probability 0.3; '),
-    (Evidence(5, 0.5, rival=Rival(0.1, ORIGIN)), {},
-     'confidence 0.50 < 0.99; 5 objects matched, 0 unexplained; '),
-    (Evidence(8, 0.95), {'min_confidence': 0.9}, ''),
-    (Evidence(8, 0.98999), {}, 'confidence 0.98 < 0.99; 8 objects matched'),
-    (Evidence(8, 0.29), {}, 'confidence 0.29 < 0.99; 8 objects matched'),
-    (Evidence(5, 0.995, coverage=0.5), {'algorithm': 'bf'},
-     'search stopped after 50 % of the samples'),
-    (Evidence(5, 0.995, coverage=0.5, tried=100), {},
-     'search stopped after 100 < 500 hypotheses'),
-    (Evidence(5, 0.995, coverage=0.5, tried=5000), {}, ''),
-    (Evidence(5, 0.995, coverage=0.5, tried=5000, meetings=2), {},
-     'confidence 0.91 < 0.99; pose found only 2 times in 5000 samples; raise iterations'),
-    (Evidence(5, 0.995, meetings=1), {'algorithm': 'ransac'},
-     'confidence 0.77 < 0.99; pose found'),
-    (Evidence(5, 0.995), {'iterations': 100, 'algorithm': 'b-prosac'}, 'iterations 100 < 500'),
-    (Evidence(5, 0.995, earlier=looks(*[0.0] * 6)), {},
-     'mean confidence 0.14 < 0.5 in this pose over the last 7 frames'),
-    (Evidence(5, 0.995, earlier=looks(0.0, 0.99, 0.0)), {}, 'mean confidence 0.49 < 0.5'),
-    (Evidence(5, 0.995, earlier=looks(0.0, 0.99)), {}, '')])
-def test_refusal_names_its_reason(evidence, options, reason):
-    refused = refusal(evidence, RelocalizerOptions(**{'min_confidence': 0.99} | options))
-    answer = refused.reason if refused else ''
-    assert answer.startswith(reason)
-    assert bool(answer) == bool(reason)
-    assert len(f'refused: {answer}') <= 120
-
-
 def garbage(rng, kind):
-    """Return ten garbage boxes: random, nearly equal, five of them twice, or the whole image."""
+    """Return ten garbage boxes: random, five of them twice, or the whole image."""
     corners = rng.uniform((0, 0), (600, 440), (10, 2))
     boxes = np.concatenate([corners, corners + rng.uniform(10, 200, (10, 2))], axis=1)
-    if kind == 'nearly one box':
-        boxes = boxes[:1] + rng.normal(0, 2, (10, 4))
-    elif kind == 'repeated boxes':
+    if kind == 'repeated boxes':
         boxes = np.repeat(boxes[:5], 2, axis=0)
     elif kind == 'the whole image':
         boxes = np.array([[0.0, 0.0, 640.0, 480.0]]) + rng.normal(0, 5, (10, 4))
@@ -441,8 +377,7 @@ def garbage(rng, kind):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize('kind', ['random boxes', 'nearly one box', 'repeated boxes',
-                                  'the whole image'])
+@pytest.mark.parametrize('kind', ['random boxes', 'repeated boxes', 'the whole image'])
 def test_garbage_is_never_accepted(kind, office_map, rng):
     relocalizer = Relocalizer(office_map, RelocalizerOptions(matching='class',
                                                              algorithm='ransac'))
@@ -501,18 +436,6 @@ def test_a_contradiction_makes_both_answers_less_certain():
     np.testing.assert_allclose(just_agreeing[0], agreeing[0], rtol=1e-9)
 
 
-@pytest.mark.parametrize('answers', [1, 20])
-def test_an_outlier_hardly_moves_the_filter_and_a_misled_one_recovers(answers):
-    known = None
-    for _ in range(answers):
-        _, known = succeed(known, at(), at(), 0.01 * OWN)
-    _, misled = succeed(known, at(), at(0.4), 0.01 * OWN)
-    assert np.linalg.norm(pose_difference(at(), misled.map_from_camera)[:3]) < 0.25
-    for _ in range(10):
-        _, misled = succeed(misled, at(), at(), 0.01 * OWN)
-    assert np.linalg.norm(pose_difference(at(), misled.map_from_camera)[:3]) < 0.1
-
-
 ROOM = make_room()
 UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # looks along y, z is up
 
@@ -527,13 +450,6 @@ def support_of(landmark_map, detections):
     found = Relocalizer(landmark_map, RelocalizerOptions(matching='class')).relocalize(
         [Observation(CAMERA, detections)])
     return found.hypotheses[0].support
-
-
-def test_boxes_that_overlap_show_one_thing():
-    boxes = np.array([[0, 0, 100, 100], [0, 0, 100, 100], [0, 0, 60, 100], [0, 0, 30, 100],
-                      [40, 40, 60, 60]], dtype=float)
-    np.testing.assert_allclose(one_thing(boxes)[0], [1.0, 1.0, 0.5, 0.0, 0.0])
-    assert one_thing(np.empty((0, 4))).shape == (0, 0)
 
 
 def test_one_thing_under_two_class_names_counts_once():
@@ -630,9 +546,6 @@ def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng, 
     groups = [ask(see_room(replace(desk, centers=desk.centers + shift), camera))[0]
               for shift in shifts]
     assert min(groups) >= terms.unmapped and np.sum(np.array(groups) > 1.0) >= 3
-    against = [confidence._of_group(OFFICE.centers[:4], things, terms.fits * things + misfit)
-               for things, misfit in ((4.0, 0.0), (4.5, 0.0), (4.0, 1.0))]
-    assert against == pytest.approx(terms.unmapped + np.array([0.0, -0.15, terms.misfit]))
     most = CALIBRATION.keyframes.most_objects
     assert objects_utility(Support(99.0)) == objects_utility(Support(most))
     monkeypatch.setattr(confidence, '_of_group', lambda *_: 0.0)

@@ -35,7 +35,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError, DatasetError, MappingError
-from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets import agreement
 from cliploc_ros.offline.datasets.folders import AXES, check_axes, find_layout, read_folder

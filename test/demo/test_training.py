@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from cliploc_ros.models.clip_encoder import load_encoder
-from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.profiles import load_detector
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
+from cliploc_ros.models.onnx_clip import resolve_clip_weights
+from cliploc_ros.models.onnx_detector import load_detector
+from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from demo.world import train_clip, train_detector
 from demo.world.appearance import CLASSES
 
@@ -40,9 +40,9 @@ def test_it_learns_and_is_saved_as_any_clip(worlds, tmp_path, capsys):
     file = tmp_path / 'clip.safetensors'
     train_clip.save(model, file)
     labels = ('a red mug', 'a blue box with white dots')
-    encoder, embeddings = load_encoder(
-        ClipOptions(model=str(train_clip.CONFIG), pretrained=str(file),
-                    cache_dir=str(tmp_path)), labels)
+    clip = ClipOptions(model=str(train_clip.CONFIG), pretrained=str(file), cache_dir=str(tmp_path))
+    weights = resolve_clip_weights(clip)
+    encoder, embeddings = ClipEncoder(weights, clip), encode_labels(weights, labels, clip)
     model.eval()
     with torch.no_grad():
         wanted = model.encode_text(tokenizer(list(labels)), normalize=True).numpy()

@@ -24,8 +24,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import set_digest, write_map
-from cliploc_ros.errors import DatasetError, MapError, OptionsError
-from cliploc_ros.files.storage import replace_file
+from cliploc_ros.errors import DatasetError, MapError
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording, recording_path
 from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
 from cliploc_ros.offline.studio.document import Document
@@ -170,13 +169,6 @@ def test_files_of_a_set_stay_private_and_links_stay_links(path, tmp_path):
     assert embeddings_path(path).is_symlink() and not stored.is_symlink()
 
 
-def test_a_folder_in_the_place_of_a_file_of_a_set_is_named(path):
-    layer_path(path).unlink()
-    layer_path(path).mkdir()
-    with pytest.raises(OptionsError, match=r'a\.keyframes\.npz: '):
-        write_set(path, 1)
-
-
 def test_sets_of_keyframes_alone_are_told_apart(path):
     """Their maps are equal: both are empty. Objects may be drawn into the map later."""
     empty, digests = LandmarkMap.empty('map'), set()
@@ -191,15 +183,6 @@ def test_sets_of_keyframes_alone_are_told_apart(path):
     layer_path(path).replace(layer_path(place))
     with pytest.raises(MapError, match='is of the set'):
         load_layer_of_map(layer_path(place), LandmarkMap.from_file(place))
-
-
-def test_processes_of_one_number_share_a_folder(tmp_path):
-    """As in two containers: the name of an unfinished file has no number of a process."""
-    with replace_file(tmp_path / 'a') as one, replace_file(tmp_path / 'a') as other:
-        one.write_text('one')
-        other.write_text('other')
-    assert (tmp_path / 'a').read_text() == 'one'
-    assert [entry.name for entry in tmp_path.iterdir()] == ['a']
 
 
 def test_a_file_whose_names_have_no_ending_misses_its_arrays(path):

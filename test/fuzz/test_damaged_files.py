@@ -27,7 +27,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays, read_case
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.models.label_embeddings import LabelCache
+from cliploc_ros.models.clip_encoder import LabelCache
 from cliploc_ros.offline.datasets.given_map import read_table
 from cliploc_ros.offline.datasets.map_recording import load_recording
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations

@@ -13,18 +13,16 @@ import numpy as np
 import open_clip
 import pytest
 import torch
-from open_clip.model import convert_to_custom_text_state_dict
 from PIL import Image
 from safetensors.torch import save_file
 
 from cliploc_ros.cli.export_network import main as export_network
 from cliploc_ros.errors import ModelError
-from cliploc_ros.models.clip_encoder import ClipEncoder
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
+from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
 from cliploc_ros.models.images import crop_bounds
-from cliploc_ros.models.onnx_clip import OnnxTextTower
-from cliploc_ros.models.profiles import load_detector
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.onnx_clip import OnnxTextTower, resolve_clip_weights
+from cliploc_ros.models.onnx_detector import load_detector
+from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from demo import ASSETS
 
 pytestmark = pytest.mark.full
@@ -86,15 +84,20 @@ def image_rgb() -> np.ndarray:
     return (127 + 50 * waves + noise).clip(0, 255).astype(np.uint8)
 
 
-def load(clip: Reference | Path, cache: Path, file: Path | None = None) -> ClipEncoder:
-    options = (ClipOptions(pretrained=str(clip), cache_dir=str(cache)) if isinstance(clip, Path)
-               else ClipOptions(str(clip.config), str(file or clip.file), cache_dir=str(cache)))
+def options_of(clip: Reference | Path, cache: Path, file: Path | None = None) -> ClipOptions:
+    return (ClipOptions(pretrained=str(clip), cache_dir=str(cache)) if isinstance(clip, Path)
+            else ClipOptions(str(clip.config), str(file or clip.file), cache_dir=str(cache)))
+
+
+def load(*clip: Any) -> ClipEncoder:
+    options = options_of(*clip)
     return ClipEncoder(resolve_clip_weights(options), options)
 
 
-def least_cosines(encoder: ClipEncoder, expected: Reference, image_rgb: np.ndarray
-                  ) -> list[float]:
-    found = encoder.encode_crops(image_rgb, BBOXES), encoder.encode_labels(LABELS)
+def least_cosines(options: ClipOptions, expected: Reference, image_rgb: np.ndarray) -> list[float]:
+    weights = resolve_clip_weights(options)
+    found = (ClipEncoder(weights, options).encode_crops(image_rgb, BBOXES),
+             encode_labels(weights, LABELS, options))
     assert all(rows.dtype == np.float32 for rows in found)
     return [float((rows * wanted).sum(axis=1).min())
             for rows, wanted in zip(found, expected.embed(image_rgb), strict=True)]
@@ -118,14 +121,10 @@ def write_torchscript(model, file):
 @pytest.mark.parametrize(('write', 'suffix'), [
     (lambda model, file: torch.save({'epoch': 3, 'state_dict': {
         f'module.{name}': tensor for name, tensor in model.state_dict().items()}}, file), '.pt'),
-    (lambda model, file: torch.save(model.state_dict(), file,
-                                    _use_new_zipfile_serialization=False), '.pt'),
     (lambda model, file: save_file({
         name: tensor.contiguous() for name, tensor in model.state_dict().items()}, file),
      '.safetensors'),
-    (lambda model, file: torch.save(convert_to_custom_text_state_dict(model.state_dict()), file),
-     '.bin'),
-    (write_torchscript, '.ts')], ids=['training', 'old', 'safetensors', 'custom', 'openai'])
+    (write_torchscript, '.ts')], ids=['training', 'safetensors', 'openai'])
 def test_forms_of_checkpoints(small_clip, tmp_path, image_rgb, write, suffix):
     file, expected = tmp_path / f'weights{suffix}', small_clip
     write(small_clip.model, file)
@@ -134,7 +133,7 @@ def test_forms_of_checkpoints(small_clip, tmp_path, image_rgb, write, suffix):
         other = (expected.embed(image_rgb)[0] * small_clip.embed(image_rgb)[0]).sum(axis=1)
         assert other.min() < 0.99999, 'the two activations differ'
     encoder = load(small_clip, tmp_path, file)
-    cosines = least_cosines(encoder, expected, image_rgb)
+    cosines = least_cosines(options_of(small_clip, tmp_path, file), expected, image_rgb)
     print(f'\nleast cosine to open_clip: {cosines}')
     assert cosines[0] > 0.9999 and cosines[1] > 0.999999  # crops may be encoded in bf16
     # the batch size has no influence
@@ -156,7 +155,7 @@ def test_export_network_gives_the_embeddings_of_open_clip(exported, small_clip, 
                                                           image_rgb, caplog):
     assert exported.stat().st_mode & 0o055 == 0o055, 'other users may read it'
     encoder = load(exported, tmp_path)
-    assert min(least_cosines(encoder, small_clip, image_rgb)) > 0.999
+    assert min(least_cosines(options_of(exported, tmp_path), small_clip, image_rgb)) > 0.999
     # embeddings that were made with the weights themselves stay valid
     assert encoder.key == load(small_clip, tmp_path).key
     caplog.clear()
@@ -191,12 +190,6 @@ def test_a_damaged_export_is_made_again(small_clip, tmp_path, image_rgb, caplog,
     assert [*(tmp_path / 'onnx').iterdir()] == [folder]
 
 
-def test_an_export_that_cannot_be_written(small_clip, tmp_path):
-    (tmp_path / 'onnx').touch()
-    with pytest.raises(ModelError, match=r'cannot be written to .*onnx.*: File exists; make room'):
-        load(small_clip, tmp_path)
-
-
 def refusal(model: object, file: object, cache: Path) -> str:
     with pytest.raises(ModelError) as caught:
         resolve_clip_weights(ClipOptions(str(model), str(file), cache_dir=str(cache)))
@@ -214,7 +207,6 @@ def test_an_export_that_gives_other_results_is_refused(small_clip, tmp_path):
 
 @pytest.mark.parametrize(('content', 'message'), [
     (b'', 'is empty'),
-    (b'version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n', 'git lfs pull'),
     (b'\n<!DOCTYPE html><html><body>Sign in</body></html>', 'is a web page'),
     (b'just text', 'holds no weights'), (b'PK\x03\x04' + bytes(1000), 'truncated'),
     (b'\x80\x02garbage', 'not a checkpoint')])

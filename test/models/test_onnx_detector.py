@@ -13,8 +13,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from cliploc_ros.errors import ImageError, ModelError, OptionsError
-from cliploc_ros.models.hub import is_hub_name
-from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.files import is_hub_name
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 from demo import ASSETS
 

@@ -17,22 +17,23 @@ from demo import ASSETS
 pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
-WAKE_UPS = 8
+WAKE_UPS = 5
 #: Prints the demo's poses (4, 4), null for a refusal.
 POSES = """
 import json, sys
 import cv2, numpy as np
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import ModelError
 from cliploc_ros.offline.datasets.parsing import find_camera
 from cliploc_ros.offline.datasets.tum import read_tum
 from demo import ASSETS
-from cliploc_ros.models.clip_weights import ClipOptions
-from cliploc_ros.models.map_rows import load_encoder_for_map
+from cliploc_ros.models.protocols import ClipOptions
+from cliploc_ros.models.clip_encoder import load_encoder_for_map
 from cliploc_ros.models.observer import Observer
-from cliploc_ros.models.profiles import load_detector
+from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import DetectorOptions
 
 model, clip_model, pretrained, cache, wake_ups = sys.argv[1:]
@@ -49,7 +50,8 @@ found = []
 for file in read_tum(ASSETS / 'sequence').image_paths[::5][:int(wake_ups)]:
     image = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
     boxes = detector.detect(image).usable(camera.width, camera.height, 50)
-    pose = relocalizer.relocalize([observer.observe(image, camera, boxes, 0)])
+    crops = observer.crops(image, boxes.bboxes_xyxy, {}).compare(np.arange(len(boxes)))
+    pose = relocalizer.relocalize([Observation(camera, boxes, crops)])
     found.append(np.asarray(pose.map_from_camera).tolist() if pose.accepted else None)
 print(json.dumps({'poses': found,
                   'loaded': sorted({'torch', 'ultralytics', 'open_clip'} & set(sys.modules))}))
@@ -65,15 +67,23 @@ def localize(networks: tuple, cache: Path, environment: dict[str, str]
         cwd=PROJECT, env=environment, capture_output=True, text=True, timeout=300, check=False)
 
 
-def test_weights_are_exported_once_and_then_need_no_pytorch(tmp_path):
+@pytest.fixture
+def hidden(tmp_path):
     (tmp_path / 'hidden').mkdir()
-    hidden, cache = hide_pytorch(tmp_path / 'hidden'), tmp_path / 'cache'
-    for networks, named in ((WEIGHTS, '--no-clip'), ((WEIGHTS[0], *ONNX[1:]), 'yolo.pt')):
-        done = localize(networks, tmp_path / 'empty', hidden)
-        assert done.returncode == 1 and 'Traceback' not in done.stderr
-        assert 'is not installed' in done.stderr and 'export_network' in done.stderr
-        assert 'script/setup models' in done.stderr and named in done.stderr
-    found = []
+    return hide_pytorch(tmp_path / 'hidden')
+
+
+@pytest.mark.parametrize(('networks', 'named'), [
+    (WEIGHTS, '--no-clip'), ((WEIGHTS[0], *ONNX[1:]), 'yolo.pt')])
+def test_without_pytorch_weights_are_refused_with_what_to_do(networks, named, hidden, tmp_path):
+    done = localize(networks, tmp_path / 'empty', hidden)
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    assert 'is not installed' in done.stderr and 'export_network' in done.stderr
+    assert 'script/setup models' in done.stderr and named in done.stderr
+
+
+def test_weights_are_exported_once_and_then_need_no_pytorch(hidden, tmp_path):
+    cache, found = tmp_path / 'cache', []
     for networks, environment in ((ONNX, hidden), (WEIGHTS, dict(os.environ)), (WEIGHTS, hidden)):
         done = localize(networks, cache, environment)
         assert done.returncode == 0, done.stderr

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth_image import DepthImage
+from cliploc_ros.core.geometry.depth import DepthImage
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, load_layer_of_map, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError

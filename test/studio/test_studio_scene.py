@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from studio_map import demo_studio
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth_image import DepthImage
+from cliploc_ros.core.geometry.depth import DepthImage
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import MapError
 from cliploc_ros.offline.datasets.frames import RawFrame

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The best hypotheses of a search, refined and distinct, with their inliers and covariances."""
+"""The best hypotheses of a search, refined and distinct, with their inliers."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.fit.covariance import EXACT, POSE_UNKNOWN, refined_covariance
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import Rig, scores_of, verify_rig
 from cliploc_ros.core.geometry.transforms import (
@@ -154,24 +153,6 @@ def meetings_of(frames: Sequence[SearchedFrame], pose: Finalist,
             tried = frame.samples[:round(progress.coverage * len(frame.samples))]
             meetings += int((is_inlier[tried].all(axis=1) & (tried[:, 0] >= 0)).sum())
     return meetings
-
-
-def covariance_of(frames: Sequence[SearchedFrame], rig: Rig, pose: Finalist,
-                  shared: NDArray[np.float64] | None = None,
-                  mount_deviation: tuple[float, float] = (0.0, 0.0),
-                  camera_deviations: NDArray[np.float64] = EXACT) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of a pose from its inliers.
-
-    Parameters
-    ----------
-    shared, mount_deviation, camera_deviations
-        See refined_covariance.
-    """
-    if pose.information is not None and not pose.information.any():
-        return POSE_UNKNOWN
-    return refined_covariance(rig, pose.rotation, pose.translation, instants_of(frames), shared,
-                              mount_deviation=mount_deviation,
-                              camera_deviations=camera_deviations)
 
 
 def instants_of(frames: Sequence[SearchedFrame]) -> NDArray[np.int64]:

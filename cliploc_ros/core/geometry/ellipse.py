@@ -72,7 +72,10 @@ def unit_circle_overlap(h: float, k: float, p: float, q: float) -> float:
     ellipse_area = pi * p * q
     cuts1, cuts2 = abs(e1) < 1.0, abs(e2) < 1.0
     if not (cuts1 or cuts2):
-        return _nested_or_apart(h, k, a, b, ellipse_area)
+        # the outlines do not meet
+        if ellipse_area < pi:
+            return ellipse_area if h * h + k * k < 1.0 else 0.0
+        return pi if a * h * h + b * k * k < 1.0 else 0.0
     # Outward means away from the other chord, whose midpoint on a line n.x + e = 0 is -e n. If
     # both lines coincide because the outlines touch twice, their outward sides are opposite.
     along = r * r - s * s
@@ -105,14 +108,6 @@ def _root_between(a: float, b: float, c: float, ah2: float, bk2: float) -> float
         else:
             high = root
     return 0.5 * (low + high)
-
-
-@compiled
-def _nested_or_apart(h: float, k: float, a: float, b: float, ellipse_area: float) -> float:
-    """Return the area shared by the unit disc and an ellipse with outlines that do not meet."""
-    if ellipse_area < pi:
-        return ellipse_area if h * h + k * k < 1.0 else 0.0
-    return pi if a * h * h + b * k * k < 1.0 else 0.0
 
 
 @compiled

@@ -85,9 +85,11 @@ def p3p(bearings, points, rotations, translations):
     int
         Number of poses, 0 to 4.
     """
-    m12, m13, m23 = _cosine(bearings, 0, 1), _cosine(bearings, 0, 2), _cosine(bearings, 1, 2)
-    a12, a13, a23 = (_squared_distance(points, 0, 1), _squared_distance(points, 0, 2),
-                     _squared_distance(points, 1, 2))
+    b1, b2, b3 = _row(bearings, 0), _row(bearings, 1), _row(bearings, 2)
+    m12, m13, m23 = _dot(b1, b2), _dot(b1, b3), _dot(b2, b3)
+    x1, x2, x3 = _row(points, 0), _row(points, 1), _row(points, 2)
+    e12, e13, e23 = _minus(x1, x2), _minus(x1, x3), _minus(x2, x3)
+    a12, a13, a23 = _dot(e12, e12), _dot(e13, e13), _dot(e23, e23)
     longest = max(a12, a13, a23)
     if not min(a12, a13, a23) > _MIN_SINE * _MIN_SINE * longest:
         return 0
@@ -124,16 +126,29 @@ def p3p(bearings, points, rotations, translations):
 
 
 @compiled
-def _cosine(vectors, i, j):
-    return (vectors[i, 0] * vectors[j, 0] + vectors[i, 1] * vectors[j, 1]
-            + vectors[i, 2] * vectors[j, 2])
+def _row(rows, i):
+    """Return a row of an array (n, 3) as a vector: a tuple of three numbers."""
+    return rows[i, 0], rows[i, 1], rows[i, 2]
 
 
 @compiled
-def _squared_distance(points, i, j):
-    x, y, z = (points[i, 0] - points[j, 0], points[i, 1] - points[j, 1],
-               points[i, 2] - points[j, 2])
-    return x * x + y * y + z * z
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
+def _minus(a, b):
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@compiled
+def _times(s, a):
+    return s * a[0], s * a[1], s * a[2]
 
 
 @compiled
@@ -200,9 +215,7 @@ def _split_lines(c):
 
 @compiled
 def _longest(a, b, c):
-    na = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
-    nb = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
-    nc = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
+    na, nb, nc = _dot(a, a), _dot(b, b), _dot(c, c)
     if na >= nb and na >= nc:
         return a
     return b if nb >= nc else c
@@ -276,43 +289,29 @@ def _inverse_triangle_frame(points):
 
     Also returns whether the inverse exists: it does not if the points lie on a line.
     """
-    u0, u1, u2 = (points[0, 0] - points[1, 0], points[0, 1] - points[1, 1],
-                  points[0, 2] - points[1, 2])
-    v0, v1, v2 = (points[0, 0] - points[2, 0], points[0, 1] - points[2, 1],
-                  points[0, 2] - points[2, 2])
-    w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-    square = w0 * w0 + w1 * w1 + w2 * w2
-    sides = (u0 * u0 + u1 * u1 + u2 * u2) * (v0 * v0 + v1 * v1 + v2 * v2)
-    sound = square > _MIN_SINE * _MIN_SINE * sides
+    u, v = _minus(_row(points, 0), _row(points, 1)), _minus(_row(points, 0), _row(points, 2))
+    w = _cross(u, v)
+    square = _dot(w, w)
+    sound = square > _MIN_SINE * _MIN_SINE * (_dot(u, u) * _dot(v, v))
     scale = 1.0 / square if sound else 0.0
-    return (((v1 * w2 - v2 * w1) * scale, (v2 * w0 - v0 * w2) * scale,
-             (v0 * w1 - v1 * w0) * scale),
-            ((w1 * u2 - w2 * u1) * scale, (w2 * u0 - w0 * u2) * scale,
-             (w0 * u1 - w1 * u0) * scale),
-            (w0 * scale, w1 * scale, w2 * scale)), sound
+    return (_times(scale, _cross(v, w)), _times(scale, _cross(w, u)), _times(scale, w)), sound
 
 
 @compiled
 def _pose_from_depths(d1, d2, d3, bearings, points, inverse, rotations, translations, which):
     """Write camera_from_map, whose rotation maps the triangle in the map to that in the camera."""
-    y0, y1, y2 = d1 * bearings[0, 0], d1 * bearings[0, 1], d1 * bearings[0, 2]
-    u0, u1, u2 = (y0 - d2 * bearings[1, 0], y1 - d2 * bearings[1, 1], y2 - d2 * bearings[1, 2])
-    v0, v1, v2 = (y0 - d3 * bearings[2, 0], y1 - d3 * bearings[2, 1], y2 - d3 * bearings[2, 2])
-    w0, w1, w2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-    p0, p1, p2 = points[0, 0], points[0, 1], points[0, 2]
+    first = _times(d1, _row(bearings, 0))
+    u = _minus(first, _times(d2, _row(bearings, 1)))
+    v = _minus(first, _times(d3, _row(bearings, 2)))
+    w = _cross(u, v)
     i, j, k = inverse
-    r0, r1, r2 = (u0 * i[0] + v0 * j[0] + w0 * k[0], u0 * i[1] + v0 * j[1] + w0 * k[1],
-                  u0 * i[2] + v0 * j[2] + w0 * k[2])
-    rotations[which, 0, 0], rotations[which, 0, 1], rotations[which, 0, 2] = r0, r1, r2
-    translations[which, 0] = y0 - (r0 * p0 + r1 * p1 + r2 * p2)
-    r0, r1, r2 = (u1 * i[0] + v1 * j[0] + w1 * k[0], u1 * i[1] + v1 * j[1] + w1 * k[1],
-                  u1 * i[2] + v1 * j[2] + w1 * k[2])
-    rotations[which, 1, 0], rotations[which, 1, 1], rotations[which, 1, 2] = r0, r1, r2
-    translations[which, 1] = y1 - (r0 * p0 + r1 * p1 + r2 * p2)
-    r0, r1, r2 = (u2 * i[0] + v2 * j[0] + w2 * k[0], u2 * i[1] + v2 * j[1] + w2 * k[1],
-                  u2 * i[2] + v2 * j[2] + w2 * k[2])
-    rotations[which, 2, 0], rotations[which, 2, 1], rotations[which, 2, 2] = r0, r1, r2
-    translations[which, 2] = y2 - (r0 * p0 + r1 * p1 + r2 * p2)
+    for row in range(3):
+        for column in range(3):
+            rotations[which, row, column] = (u[row] * i[column] + v[row] * j[column]
+                                             + w[row] * k[column])
+        translations[which, row] = first[row] - (rotations[which, row, 0] * points[0, 0]
+                                                 + rotations[which, row, 1] * points[0, 1]
+                                                 + rotations[which, row, 2] * points[0, 2])
 
 
 @compiled
@@ -333,20 +332,15 @@ def two_point(bearings, points, verticals, rotations, translations):
     int
         Number of poses, 0 to 2.
     """
-    b10, b11, b12 = bearings[0, 0], bearings[0, 1], bearings[0, 2]
-    b20, b21, b22 = bearings[1, 0], bearings[1, 1], bearings[1, 2]
-    u0, u1, u2 = verticals[0], verticals[1], verticals[2]
-    w0, w1, w2 = verticals[3], verticals[4], verticals[5]
-    e0, e1, e2 = (points[1, 0] - points[0, 0], points[1, 1] - points[0, 1],
-                  points[1, 2] - points[0, 2])
-    square = e0 * e0 + e1 * e1 + e2 * e2
-    height = e0 * w0 + e1 * w1 + e2 * w2
-    level_square = square - height * height
-    if not level_square > _MIN_SINE * square:
+    first, second = _row(bearings, 0), _row(bearings, 1)
+    up_in_camera = verticals[0], verticals[1], verticals[2]
+    up_in_map = verticals[3], verticals[4], verticals[5]
+    baseline = _minus(_row(points, 1), _row(points, 0))
+    square, height = _dot(baseline, baseline), _dot(baseline, up_in_map)
+    if not square - height * height > _MIN_SINE * square:
         return 0  # one point is above the other, so the yaw is undetermined
-    rise1 = b10 * u0 + b11 * u1 + b12 * u2
-    rise2 = b20 * u0 + b21 * u1 + b22 * u2
-    cosine = b10 * b20 + b11 * b21 + b12 * b22
+    rise1, rise2 = _dot(first, up_in_camera), _dot(second, up_in_camera)
+    cosine = _dot(first, second)
     # The line d2 rise2 - d1 rise1 = height is written as d = base + s direction, where base is its
     # point nearest to zero. The conic d1^2 + d2^2 - 2 d1 d2 cosine = square is quadratic in s.
     steepness = rise1 * rise1 + rise2 * rise2
@@ -369,16 +363,15 @@ def two_point(bearings, points, verticals, rotations, translations):
             break
         s = q / quadratic if which == 0 else constant / q
         d1, d2 = base1 + s * rise2, base2 + s * rise1
-        if d1 > 0.0 and d2 > 0.0:
-            f0, f1, f2 = d2 * b20 - d1 * b10, d2 * b21 - d1 * b11, d2 * b22 - d1 * b12
-            if _upright_rotation((e0, e1, e2), (f0, f1, f2), (u0, u1, u2), (w0, w1, w2),
-                                 rotations, count):
-                for row in range(3):
-                    translations[count, row] = d1 * bearings[0, row] - (
-                        rotations[count, row, 0] * points[0, 0]
-                        + rotations[count, row, 1] * points[0, 1]
-                        + rotations[count, row, 2] * points[0, 2])
-                count += 1
+        if d1 > 0.0 and d2 > 0.0 and _upright_rotation(
+                baseline, _minus(_times(d2, second), _times(d1, first)), up_in_camera, up_in_map,
+                rotations, count):
+            for row in range(3):
+                translations[count, row] = d1 * bearings[0, row] - (
+                    rotations[count, row, 0] * points[0, 0]
+                    + rotations[count, row, 1] * points[0, 1]
+                    + rotations[count, row, 2] * points[0, 2])
+            count += 1
     return count
 
 
@@ -389,30 +382,24 @@ def _upright_rotation(e, f, u, w, rotations, which):
     The unit vectors w and u point up in the map and in the camera. The components of e along w and
     of f along u are equal.
     """
-    e0, e1, e2 = e
-    f0, f1, f2 = f
-    u0, u1, u2 = u
-    w0, w1, w2 = w
     # a and g are the horizontal directions of e and f; c and h are up x a and up x g
-    height = e0 * w0 + e1 * w1 + e2 * w2
-    a0, a1, a2 = e0 - height * w0, e1 - height * w1, e2 - height * w2
-    length = sqrt(a0 * a0 + a1 * a1 + a2 * a2)
-    a0, a1, a2 = a0 / length, a1 / length, a2 / length
-    c0, c1, c2 = w1 * a2 - w2 * a1, w2 * a0 - w0 * a2, w0 * a1 - w1 * a0
-    height = f0 * u0 + f1 * u1 + f2 * u2
-    g0, g1, g2 = f0 - height * u0, f1 - height * u1, f2 - height * u2
-    length = sqrt(g0 * g0 + g1 * g1 + g2 * g2)
-    if not length > 0.0:
+    a = _horizontal(e, w)
+    g = _horizontal(f, u)
+    if not _dot(g, g) > 0.0:
         return False
-    g0, g1, g2 = g0 / length, g1 / length, g2 / length
-    h0, h1, h2 = u1 * g2 - u2 * g1, u2 * g0 - u0 * g2, u0 * g1 - u1 * g0
-    rotations[which, 0, 0] = g0 * a0 + h0 * c0 + u0 * w0
-    rotations[which, 0, 1] = g0 * a1 + h0 * c1 + u0 * w1
-    rotations[which, 0, 2] = g0 * a2 + h0 * c2 + u0 * w2
-    rotations[which, 1, 0] = g1 * a0 + h1 * c0 + u1 * w0
-    rotations[which, 1, 1] = g1 * a1 + h1 * c1 + u1 * w1
-    rotations[which, 1, 2] = g1 * a2 + h1 * c2 + u1 * w2
-    rotations[which, 2, 0] = g2 * a0 + h2 * c0 + u2 * w0
-    rotations[which, 2, 1] = g2 * a1 + h2 * c1 + u2 * w1
-    rotations[which, 2, 2] = g2 * a2 + h2 * c2 + u2 * w2
+    c, h = _cross(w, a), _cross(u, g)
+    for row in range(3):
+        for column in range(3):
+            rotations[which, row, column] = (g[row] * a[column] + h[row] * c[column]
+                                             + u[row] * w[column])
     return True
+
+
+@compiled
+def _horizontal(vector, up):
+    """Return the horizontal direction of a vector, a unit vector; 0 if it is vertical."""
+    x, y, z = _minus(vector, _times(_dot(vector, up), up))
+    length = sqrt(x * x + y * y + z * z)
+    if not length > 0.0:
+        return 0.0, 0.0, 0.0
+    return x / length, y / length, z / length

@@ -15,7 +15,6 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import (
     LEAST_INLIERS,
     agreeing,
@@ -78,6 +77,61 @@ _STRETCHED = (0.005, 0.01)
 _KEYFRAME_M, _KEYFRAME_RAD, PER_RADIAN = 0.012, np.radians(0.45), 0.04
 
 
+class RecognizedPlace(NamedTuple):
+    """A pose found from keyframes, with the evidence for and against it."""
+
+    map_from_camera: NDArray[np.float64]  #: (4, 4)
+    #: (6, 6), (6, 6): in the order of core.fit.covariance; and the part due to errors of the
+    #: keyframes, which all looks at the same keyframes share
+    covariance: NDArray[np.float64]
+    shared: NDArray[np.float64]
+    #: Number of agreeing features, without features that agree with a place found earlier
+    inliers: int
+    #: Share of the comparable cells of the image that contain inliers, 0 to 1
+    confirmed: float
+    #: Expected value of `confirmed` for this number of inliers, 0 to 1
+    expected: float
+    #: Number of confirming and of comparable cells. A cell is comparable if the keyframes predict
+    #: points in it and the image has features there.
+    cells: tuple[int, int] = (0, 0)
+    #: Focal length estimated from the points, as a multiple of the camera's, and its relative
+    #: standard deviation; 1 and inf without an estimate. At right poses the ratio is close to 1.
+    #: Wrong intrinsics, or a picture of the place at another scale, give another ratio.
+    focal_ratio: float = 1.0
+    focal_deviation: float = np.inf
+    #: Root of the aspect of the focal lengths, x to y, estimated the same way: a picture seen from
+    #: the side is narrow
+    aspect_ratio: float = 1.0
+    aspect_deviation: float = np.inf
+    #: Angle to the known vertical in standard deviations, see Constraint.tilt_error. It excludes
+    #: no place: the vertical may be wrong, for example because of a wrong camera mount.
+    tilt_error: float = 0.0
+    #: Keyframes with agreeing points, in decreasing order of points, and the share of each
+    keyframes: tuple[int, ...] = ()
+    shares: tuple[float, ...] = ()
+    #: (k, 2): position of each agreeing point in the original, distorted image [px]
+    pixels: NDArray[np.float64] = np.empty((0, 2))
+    #: (k,): index of each agreeing point in the layer
+    rows: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+    points: NDArray[np.float64] = np.empty((0, 3))  #: (k, 3): its position in the map [m]
+    is_thorough: bool = False  #: Whether the thorough pass found the place
+    #: How far the view of the nearest keyframe with agreeing points is from the pose: the sum of
+    #: distance / 2 m and angle / 40 degrees
+    apart: float = 0.5
+
+
+class Recognition(NamedTuple):
+    """The places where keyframes recognize an image."""
+
+    #: Mutually different places. The place whose points lie in the most cells of the image is
+    #: first: a poster has many points, but shows only a part of its place.
+    places: tuple[RecognizedPlace, ...] = ()
+    #: Whether all chosen keyframes were matched. A search that the deadline stopped returns no
+    #: places: it may have missed rivals.
+    is_complete: bool = True
+    is_thorough: bool = False  #: Whether the thorough pass found the places, see ImageRecognizer
+
+
 class _Matched(NamedTuple):
     """The k matches of an image: features, points in the map, their keyframes and rows.
 
@@ -125,14 +179,12 @@ class ImageFeatures:
     def __init__(self, read_rgb: Callable[[], NDArray[np.uint8]], camera: Camera,
                  kind: FeatureKind = SIFT) -> None:
         self._read_rgb, self.camera, self._kind = read_rgb, camera, kind
-        self._found: dict[bool, tuple[Features, float]] = {}
+        self._found: dict[bool, Features] = {}
 
-    def of_pass(self, is_thorough: bool) -> tuple[Features, float]:
-        """Return the features of a pass, and the time of their extraction [ms]."""
+    def of_pass(self, is_thorough: bool) -> Features:
+        """Return the features of a pass."""
         if is_thorough not in self._found:
-            image_rgb, begin = self._read_rgb(), time.perf_counter()
-            features = query_features(image_rgb, self._kind, is_thorough)
-            self._found[is_thorough] = features, 1e3 * (time.perf_counter() - begin)
+            self._found[is_thorough] = query_features(self._read_rgb(), self._kind, is_thorough)
         return self._found[is_thorough]
 
 
@@ -231,9 +283,14 @@ class KeyframeLocalizer:
             matched = matched.join(self._match(descriptors, more, deadline))
             first = _place(matched, look)
         if first is None or first.agreed < LEAST_INLIERS:
-            near = self._search_further(descriptors, look, ranks[_SIMILAR + _MORE:], deadline)
-            matched = matched.join(self._match(descriptors, near, deadline))
-            first = _place(matched, look)
+            # search less similar keyframes for a pose, and match the keyframes near it
+            further = _place(self._match(descriptors[:_STRONGEST], ranks[_SIMILAR + _MORE:][
+                :_FURTHER], deadline), look, _RIVAL_ITERATIONS)
+            if further is not None and further.agreed >= _CLEAR:
+                near = keyframes_near(self.layer.map_from_camera, further.map_from_camera
+                                      )[:_MORE].tolist()
+                matched = matched.join(self._match(descriptors, near, deadline))
+                first = _place(matched, look)
         return first, matched
 
     def _search_thoroughly(self, descriptors: NDArray[np.float32], look: _Look,
@@ -304,15 +361,6 @@ class KeyframeLocalizer:
         """Return the keyframes with inliers, in decreasing order, and the inliers (K,) of each."""
         counts = np.bincount(place.inliers.keyframes, minlength=len(self.layer))
         return np.argsort(-counts, kind='stable')[:np.count_nonzero(counts)], counts
-
-    def _search_further(self, descriptors: NDArray[np.float32], look: _Look, ranks: Sequence[int],
-                        deadline: float) -> list[int]:
-        """Search less similar keyframes for a pose; return the keyframes near it, or none."""
-        matched = self._match(descriptors[:_STRONGEST], ranks[:_FURTHER], deadline)
-        place = _place(matched, look, _RIVAL_ITERATIONS)
-        if place is None or place.agreed < _CLEAR:
-            return []
-        return keyframes_near(self.layer.map_from_camera, place.map_from_camera)[:_MORE].tolist()
 
     def coverage(self, map_from_camera: NDArray[np.float64], camera: Camera) -> float:
         """Return the share of an image that the layer covers at a pose (4, 4).
@@ -518,8 +566,6 @@ class ImageRecognizer:
         self._may_be_thorough = may_be_thorough
         self._known: tuple[set[int], Recognition] | None = None
         self._fast: Recognition | None = None
-        #: Total time of recognition [ms], including features.
-        self.spent_ms = 0.0
 
     def begin_thorough(self) -> bool:
         """Switch to the thorough pass; False if already in it, not allowed, or out of time."""
@@ -536,13 +582,9 @@ class ImageRecognizer:
             self._keyframes.layer.map_from_camera, guess)[:PROPOSED].tolist()}
         if self._known is None or not near <= self._known[0]:
             self._begin_stage('keyframes')
-            features, features_ms = self._features.of_pass(self._fast is not None)
-            if self._known is None:
-                self.spent_ms += features_ms
-            begin = time.perf_counter()
             self._known = near, self._keyframes.localize_features(
-                features, self._features.camera, guesses, self.deadline, constraint, self._fast)
-            self.spent_ms += 1e3 * (time.perf_counter() - begin)
+                self._features.of_pass(self._fast is not None), self._features.camera, guesses,
+                self.deadline, constraint, self._fast)
             self._begin_stage('search')
         return self._known[1]
 

@@ -10,7 +10,7 @@ landmark_embeddings
 joined_map
     Several maps, searched as one.
 map_file, parameter_file
-    Write a map, read it fast, and read any parameter file without ROS.
+    Write a map, and read any parameter file without ROS.
 similarities, pairs, culling
     Find landmarks by similarity of their labels, by pairs, and by position.
 visibility

@@ -28,14 +28,7 @@ from cliploc_ros.core.map.landmark_details import (
     read_details,
 )
 from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
-from cliploc_ros.core.map.parameter_file import (
-    NO_SET,
-    MapSet,
-    parse_parameters,
-    parse_written_map,
-    read_text,
-    set_of,
-)
+from cliploc_ros.core.map.parameter_file import NO_SET, MapSet, parse_parameters, read_text, set_of
 from cliploc_ros.errors import MapError, did_you_mean
 from cliploc_ros.files.storage import finish_set
 
@@ -108,10 +101,7 @@ class ClassIndex:
     def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
              ) -> NDArray[np.bool_]:
         """Return a mask (p,): the landmark is a member of the class; False for classes below 0."""
-        # a class below 0 gets the key -1, which no member has
-        keys = np.where(classes < 0, -1, landmarks * (len(self.starts) - 1) + classes)
-        return np.asarray((self.of_landmarks[landmarks] == classes)
-                          | np.isin(keys, self._other_keys))
+        return self.shares(landmarks, classes) > 0.0
 
     def shares(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
                ) -> NDArray[np.float64]:
@@ -127,13 +117,6 @@ class ClassIndex:
         """Return the weight of each membership; see weights."""
         return {(row, number): self.weights.get((row, number), 1.0)
                 for row, number in self.members.tolist()}
-
-    @cached_property
-    def _other_keys(self) -> NDArray[np.int64]:
-        """Return a key for each pair of a landmark and a class other than its own."""
-        landmarks, classes = self.members.T
-        other = classes != self.of_landmarks[landmarks]
-        return np.asarray(landmarks[other] * (len(self.starts) - 1) + classes[other])
 
     def classes_of(self, names: Sequence[str]) -> NDArray[np.int64]:
         """Return the number of each class name (n,); -1 for classes that the map lacks."""
@@ -349,10 +332,8 @@ class LandmarkMap:
         text = read_text(path)
         map_set = set_of(text)
         finish_set(Path(path), map_set.digest)
-        found: Any = parse_written_map(text)
-        if found is None:
-            tree = parse_parameters(text, path)
-            found = tree[find_map_node(tree, path)]['ros__parameters']['map']
+        tree = parse_parameters(text, path)
+        found = tree[find_map_node(tree, path)]['ros__parameters']['map']
         return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set)
 
     @staticmethod

@@ -4,15 +4,8 @@
 
 The tree is built from the parser's events, without recursion and without instantiating objects.
 Size and depth are limited, so a hostile file causes an error and not a crash.
-
-PyYAML creates an object for each token of a file: 100,000 landmarks take 10 to 30 s. Files of
-build_map, import_map and the studio have a fixed layout: a regular expression that matches one
-landmark reads them four times faster. It accepts only a small subset of YAML, for which its result
-equals the parser's. For any other file, such as a handwritten or invalid file, parse_written_map
-returns None. The parser then reads the file and reports errors.
 """
 
-import json
 import os
 import re
 from pathlib import Path
@@ -25,7 +18,7 @@ from cliploc_ros.files.storage import read_file
 
 _MAX_DEPTH = 16
 # Maximum number of values, keys and collections; PyYAML takes 3 us for each. A landmark has about
-# 30. Larger maps are expected in the layout of write_map.
+# 30.
 _MAX_EVENTS = 6_000_000
 # Maximum number of collections in a list, such as the labels of a landmark as mappings.
 _MOST_IN_LIST = 1000
@@ -36,19 +29,7 @@ _QUOTED_STYLES = ('"', "'", '|', '>')
 # Longer text is not a measured number; 300 digits would overflow a float.
 _MAX_NUMBER_LENGTH = 40
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-# Quoted text whose escapes have the same meaning in JSON and YAML: surrogates do not. A YAML key
-# has at most 1024 characters.
-_ESCAPE = r'\\(?:["\\nrtbf]|u(?!d[89a-f])[0-9a-f]{4})'
-_TEXT = rf'"(?:[ !#-\[\]-~]|{_ESCAPE})*+"'
-_KEY = rf'"(?:[ !#-\[\]-~]|{_ESCAPE}){{1,150}}+"'
-_FLOAT = r'(?:0|[1-9]\d{0,14})\.\d{1,9}'
-_SIGNED = rf'-?{_FLOAT}'
-_HEAD = re.compile(
-    r'(?:#[ -~\u00a0-\ud7ff]*\n)*+/\*\*:\n  ros__parameters:\n    map:\n'
-    rf'      frame_id: ({_TEXT})\n'
-    r'      landmarks:\n')
 _SET = re.compile(r'(?:#.*\n)*?# set ([0-9a-f]{12}) ([0-9a-f]{12})\n')
-_INDENT = ' ' * 10
 
 
 def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -100,8 +81,8 @@ def _build_tree(text: str) -> Any:
     for number, event in enumerate(yaml.parse(text, Loader=_LOADER)):
         line = event.start_mark.line + 1
         if number > _MAX_EVENTS:
-            raise _TreeError(f'line {line}: more than {_MAX_EVENTS} values; write the map again '
-                             'with import_map or the studio')
+            raise _TreeError(f'line {line}: more than {_MAX_EVENTS} values; divide the map into '
+                             'several maps')
         if isinstance(event, yaml.AliasEvent):
             raise _TreeError(f'line {line}: an alias (*{event.anchor}) is not supported; repeat '
                              'the value')
@@ -157,25 +138,6 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
         text.lower(), text)
 
 
-def _row(count: int) -> str:
-    return rf'\[{_SIGNED}{rf", {_SIGNED}" * (count - 1)}\]'
-
-
-# The landmark of write_map. The groups are JSON, except for class_weights, which is lines of it.
-_LANDMARK = re.compile(''.join([
-    rf'        (?P<id>{_KEY}):\n', *(
-        rf'{_INDENT}{name}: (?P<{name}>{value})\n' for name, value in (
-            ('label', _TEXT), ('class_id', _TEXT), ('center', _row(3)), ('semi_axes', _row(3)),
-            ('orientation', _row(4)))),
-    rf'(?:{_INDENT}labels:\n{_INDENT}  text: (?P<text>\[{_TEXT}(?:, {_TEXT})*+\])\n',
-    rf'{_INDENT}  weight: (?P<weight>\[{_FLOAT}(?:, {_FLOAT})*+\])\n)?+',
-    rf'(?:{_INDENT}class_weights:\n(?P<class_weights>(?:{_INDENT}  {_KEY}: {_FLOAT}\n)++))?+', *(
-        rf'(?:{_INDENT}{name}: (?P<{name}>{value})\n)?+' for name, value in (
-            ('support', r'(?:0|[1-9]\d{0,14})'), ('position_sigma', _FLOAT),
-            ('shared_sigma', _FLOAT), ('shared_sigma_deg', _FLOAT), ('seen_ratio', _FLOAT),
-            ('baseline_deg', _FLOAT), ('last_seen', _FLOAT), ('source', _TEXT)))]))
-
-
 class MapSet(NamedTuple):
     """Identity of a map and the files next to it, from the head of the map; '' if unknown."""
 
@@ -197,24 +159,3 @@ def set_of(text: str) -> MapSet:
     """Read the set of a map file from its text, or from the beginning of its text."""
     found = _SET.match(text)
     return MapSet(found[1], found[2]) if found else NO_SET
-
-
-def parse_written_map(text: str) -> dict[str, Any] | None:
-    """Read the `map` of a text in the layout of write_map as parse_parameters does; else None."""
-    head = _HEAD.match(text)
-    if head is None:
-        return None
-    landmarks, end = dict[str, Any](), head.end()
-    while (found := _LANDMARK.match(text, end)) is not None:
-        end, values = found.end(), found.groupdict()
-        shares = values['class_weights'] or ''
-        values['class_weights'] = shares and f'{{{shares[:-1]}}}'.replace('\n', ',')
-        fields = json.loads('{' + ','.join(f'"{name}":{value}' for name, value in values.items()
-                                           if value) + '}')
-        landmark_id = fields.pop('id')
-        if landmark_id in landmarks or len(fields.get('class_weights', ())) < shares.count('\n'):
-            return None  # a repeated key
-        if 'text' in fields:
-            fields['labels'] = {name: fields.pop(name) for name in ('text', 'weight')}
-        landmarks[landmark_id] = fields
-    return {'frame_id': json.loads(head[1]), 'landmarks': landmarks} if end == len(text) else None

@@ -178,7 +178,9 @@ def _choose_pose(constraint, sample, size, poses, count, least_iou):
                 which = other
         if uppers[which] < max(best_total, least_iou):
             break
-        total = _sampled_iou(boxes, size, outlines, 3 * which)
+        total = 0.0
+        for row in range(size):
+            total += _outline_iou(boxes, row, outlines, 3 * which + row)
         uppers[which] = -1.0
         if total > best_total or (total == best_total and which < best):
             best, best_total = which, total
@@ -209,15 +211,6 @@ def _sampled_bound(boxes, size, outlines, first):
             return -1.0
         upper += _outline_bound(boxes, row, outlines, first + row)
     return upper
-
-
-@compiled
-def _sampled_iou(boxes, size, outlines, first):
-    """Return the sum of IoUs of the sampled pairs."""
-    total = 0.0
-    for row in range(size):
-        total += _outline_iou(boxes, row, outlines, first + row)
-    return total
 
 
 @compiled

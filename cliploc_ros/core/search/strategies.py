@@ -170,10 +170,14 @@ def enumerate_compatible_triples(compatible, cursor, samples):
     """
     count = compatible.shape[0]
     newest, first, second = cursor[0], cursor[1], cursor[2]
-    earlier = np.empty(count, dtype=np.int64)
+    earlier = np.empty(count, dtype=np.int64)  # candidates compatible with the newest
     found, steps = 0, 0
     while newest < count and found < samples.shape[0] and steps < _MAX_STEPS:
-        known = _compatible_before(compatible, newest, earlier)
+        known = 0
+        for candidate in range(newest):
+            if compatible[newest, candidate]:
+                earlier[known] = candidate
+                known += 1
         steps += newest + 1
         for a in range(known):
             if earlier[a] < first:
@@ -193,17 +197,6 @@ def enumerate_compatible_triples(compatible, cursor, samples):
         newest, first, second = newest + 1, 0, 1
     cursor[0], cursor[1], cursor[2] = newest, first, second
     return found
-
-
-@compiled
-def _compatible_before(compatible, newest, earlier):
-    """Write the earlier candidates that are compatible with the newest; return their number."""
-    known = 0
-    for candidate in range(newest):
-        if compatible[newest, candidate]:
-            earlier[known] = candidate
-            known += 1
-    return known
 
 
 @compiled

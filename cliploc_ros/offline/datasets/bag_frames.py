@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cliploc_ros import messages
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import check_faults
-from cliploc_ros.core.geometry.depth_image import DepthCamera, DepthImage, depth_from_counts
+from cliploc_ros.core.geometry.depth import DepthCamera, DepthImage, depth_from_counts
 from cliploc_ros.errors import CameraError, CliplocError, DatasetError
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_agreement

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth_image import MILLIMETRE
+from cliploc_ros.core.geometry.depth import MILLIMETRE
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import frames, parsing

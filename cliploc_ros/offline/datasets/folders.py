@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth_image import MILLIMETRE, TUM_UNIT, DepthCamera
+from cliploc_ros.core.geometry.depth import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import colmap, devices
 from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_agreement, w_first

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import camera_faults
-from cliploc_ros.core.geometry.depth_image import DepthCamera, DepthImage, depth_from_counts
+from cliploc_ros.core.geometry.depth import DepthCamera, DepthImage, depth_from_counts
 from cliploc_ros.core.geometry.transforms import is_rigid, move_poses
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.parsing import MAX_STAMP_S

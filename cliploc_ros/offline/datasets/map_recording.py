@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth_image import DepthImage
+from cliploc_ros.core.geometry.depth import DepthImage
 from cliploc_ros.core.geometry.transforms import is_rigid, make_transform
 from cliploc_ros.core.map.parameter_file import check_set, set_of
 from cliploc_ros.errors import DatasetError

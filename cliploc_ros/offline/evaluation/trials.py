@@ -39,7 +39,7 @@ from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.models.map_rows import embed_map
+from cliploc_ros.models.clip_encoder import embed_map
 from cliploc_ros.offline.datasets.frames import Frames, undistorted
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock

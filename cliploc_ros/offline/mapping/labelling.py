@@ -19,9 +19,9 @@ from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import MOST_MEDOIDS, LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_encoder import encode_labels
-from cliploc_ros.models.clip_weights import ClipOptions, ClipWeights
-from cliploc_ros.models.label_embeddings import LabelCache
+from cliploc_ros.models.clip_encoder import LabelCache, encode_labels
+from cliploc_ros.models.onnx_clip import ClipWeights
+from cliploc_ros.models.protocols import ClipOptions
 from cliploc_ros.offline.mapping.landmarks import classes_of, group_boxes
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.views import number_viewpoints
@@ -125,7 +125,7 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
     The text tower is loaded only if a group is missing in the cache, and only once. Put phrases
     that change together into one group: the cache then keeps the others.
 
-    ModelError, OptionsError: see cliploc_ros.models.clip_encoder.load_encoder.
+    ModelError, OptionsError: see cliploc_ros.models.clip_encoder.embed_map.
     """
     cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'phrases', _MOST_FILES)
     found = {texts: cache.load(weights.key, texts, weights.embed_dim) for texts in phrases}

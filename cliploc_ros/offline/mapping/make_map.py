@@ -16,12 +16,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import load_removed, removed_path, write_landmarks, write_map
 from cliploc_ros.errors import MappingError, ModelError
 from cliploc_ros.files.storage import WriteOfSet
-from cliploc_ros.models.clip_weights import (
-    ClipOptions,
-    ClipWeights,
-    names_onnx,
-    resolve_clip_weights,
-)
+from cliploc_ros.models.onnx_clip import ClipWeights, names_onnx, resolve_clip_weights
+from cliploc_ros.models.protocols import ClipOptions
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.map_recording import MapRecording, recording_path, save_recording
 from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth_image import DepthImage, points_in_color
+from cliploc_ros.core.geometry.depth import DepthImage, points_in_color
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
 from cliploc_ros.core.keyframes.layer import (

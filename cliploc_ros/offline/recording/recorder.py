@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.depth_image import PLAUSIBLE_DEPTH_M, depths_of_boxes
+from cliploc_ros.core.geometry.depth import PLAUSIBLE_DEPTH_M, depths_of_boxes
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
@@ -35,9 +35,9 @@ from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import parse_json
 from cliploc_ros.models.clip_encoder import ClipEncoder
-from cliploc_ros.models.clip_weights import ClipOptions, resolve_clip_weights
-from cliploc_ros.models.profiles import load_detector
-from cliploc_ros.models.protocols import DetectorOptions, ImageTextEncoder
+from cliploc_ros.models.onnx_clip import resolve_clip_weights
+from cliploc_ros.models.onnx_detector import load_detector
+from cliploc_ros.models.protocols import ClipOptions, DetectorOptions, ImageTextEncoder
 from cliploc_ros.offline.datasets.bags import MOST_LEFT_OUT
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
 from cliploc_ros.offline.datasets.observations import (

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.depth_image import points_in_color
+from cliploc_ros.core.geometry.depth import points_in_color
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
