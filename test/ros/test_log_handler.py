@@ -20,8 +20,7 @@ def logger(make_node):
 
 
 @pytest.mark.parametrize(('level', 'word'), [
-    (logging.INFO, 'INFO'), (logging.WARNING, 'WARN'), (logging.ERROR, 'ERROR'),
-    (logging.CRITICAL, 'ERROR')])
+    (logging.INFO, 'INFO'), (logging.WARNING, 'WARN'), (logging.CRITICAL, 'ERROR')])
 def test_records_come_out_of_the_node_at_their_level(logger, capfd, level, word):
     logger.log(level, 'loaded %d of %s', 3, 'cup')
     written = capfd.readouterr()
