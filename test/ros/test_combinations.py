@@ -5,7 +5,6 @@
 import math
 import time
 from dataclasses import asdict, replace
-from itertools import product
 from pathlib import Path
 
 import cv2
@@ -35,8 +34,8 @@ from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 ANY_YAW = 1e3
-KNOWN = ('nothing', 'depth', 'prior', 'keyframes', 'all')
-COMBINATIONS = [*product((1, 4), KNOWN)]
+COMBINATIONS = [(1, 'nothing'), (1, 'depth'), (1, 'prior'), (1, 'keyframes'), (1, 'all'),
+                (4, 'nothing'), (4, 'all')]
 LAYER = make_layer(MAP)
 
 
@@ -182,7 +181,7 @@ def test_continuous_answers_tell_a_filter_only_what_is_new(cameras, known, tmp_p
     equal(drive.repeated(Case(tuple(queries), {}), drive.parameters.options()), found.found)
 
 
-@pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)
+@pytest.mark.parametrize(('cameras', 'known'), [(1, 'nothing'), (4, 'all')])
 @pytest.mark.parametrize(('displaced_m', 'state'), [
     (0.0, WatchState.LOCALIZED), (2.0, WatchState.LOST)])
 def test_the_watch_tells_a_right_pose_from_a_wrong_one(cameras, known, displaced_m, state,

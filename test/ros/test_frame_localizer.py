@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.errors import CameraError, MapError
+from cliploc_ros.errors import CameraError
 from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.frame_source import Frame
@@ -79,27 +79,25 @@ def test_a_rectified_image_is_measured_with_p(localizer, values):
     assert pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
 
 
-@pytest.mark.parametrize('is_level', [True, False])
-def test_a_mount_of_body_axes_is_refused_where_the_pose_contradicts_it(make_node, values, tmp_path,
-                                                                       is_level):
-    """The room is upright, or on its back in front of a camera that looks up."""
-    turn = Rotation.from_euler('x', -90.0 if is_level else 0.0, degrees=True)
-    room = make_room()
+def test_a_mount_of_body_axes_is_refused_where_the_pose_contradicts_it(make_node, values,
+                                                                       tmp_path):
+    """The room is upright, and not on its back in front of a camera that looks up."""
+    assert localize(load_localizer(make_node(), values), make_frame(),
+                    replace(values, base_frame='base_link')).accepted
+    turn, room = Rotation.from_euler('x', -90.0, degrees=True), make_room()
     write_map(replace(room, centers=turn.apply(room.centers), quats_xyzw=(
         turn * Rotation.from_quat(room.quats_xyzw)).as_quat()), tmp_path / 'room.yaml')
     localizer = load_localizer(make_node(), values)
     values = replace(values, base_frame='base_link')
-    if is_level:
-        with pytest.raises(CameraError, match="'camera' has the axes of a body"):
-            localize(localizer, make_frame(), values)
-    else:
-        assert localize(localizer, make_frame(), values).accepted
-    assert [fault.is_certain for fault in localizer.instants.faults] == [is_level]
+    with pytest.raises(CameraError, match="'camera' has the axes of a body"):
+        localize(localizer, make_frame(), values)
+    assert [fault.is_certain for fault in localizer.instants.faults] == [True]
 
 
 def test_options_hold_from_the_next_frame_on(localizer, values):
     assert localize(localizer, make_frame(), values).accepted
-    assert not localize(localizer, make_frame(), replace(values, min_confidence=1.0)).accepted
+    for changes in ({'min_confidence': 1.0}, {'max_detections': 3}):
+        assert not localize(localizer, make_frame(), replace(values, **changes)).accepted
     found = localize(localizer, make_frame(), replace(values, algorithm='ransac'))
     assert found.accepted and localizer.description.endswith('algorithm ransac')
 
@@ -115,15 +113,6 @@ def test_a_camera_of_another_run_of_odometry_is_left_out_and_named(localizer, va
     assert [(frame.camera_name, frame.stamp_ns) for frame in found.query.frames] == [
         ('left', 100_000_000_000), ('front', 100_000_000_000)]
     assert found.left_out == ('right', 'back')
-
-
-def test_a_look_at_a_pose_in_another_frame_names_the_frames(localizer, values):
-    with pytest.raises(MapError, match="'elsewhere'"):
-        localizer.look(make_frame(), values, RobotState(np.eye(4)), 'elsewhere', MAP_FROM_CAMERA)
-
-
-def test_more_detections_than_allowed_are_not_searched(localizer, values):
-    assert not localize(localizer, make_frame(), replace(values, max_detections=3)).accepted
 
 
 def test_depth_of_another_camera_is_registered(localizer, values, caplog):
@@ -146,8 +135,7 @@ def test_depth_of_another_camera_is_registered(localizer, values, caplog):
             (None, left, 'and depth_camera_info is missing'),
             (info, None, 'and tf is missing'),
             (CameraInfo(k=info.k, d=[0.1] * 5, distortion_model='plumb_bob'), left, 'rectified'),
-            (CameraInfo(k=info.k, width=9, height=9), left, 'camera_info is for 9x9 px'),
-            (CameraInfo(), left, 'camera_info: K')):
+            (CameraInfo(k=info.k, width=9, height=9), left, 'camera_info is for 9x9 px')):
         assert depths(wrong, pose) is None
         assert said in caplog.text
 

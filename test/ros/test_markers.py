@@ -10,9 +10,12 @@ from visualization_msgs.msg import Marker
 from cliploc_ros.ros.visualization import class_color, landmark_markers, match_markers
 
 
-def test_every_landmark_is_an_ellipsoid_with_its_label():
+def test_every_landmark_is_an_ellipsoid_with_its_label_and_every_keyframe_a_camera():
     room = make_room()
-    first, *markers = landmark_markers(room).markers
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = 1.0, 2.0, 3.0
+    layer = replace(make_layer(room, keyframes=3), map_from_camera=poses)
+    first, *markers, cameras = landmark_markers(room, layer).markers
     assert first.action == Marker.DELETEALL, 'earlier markers are removed'
     ellipsoids, texts = markers[::2], markers[1::2]
     assert [text.text for text in texts] == list(room.labels)
@@ -29,15 +32,6 @@ def test_every_landmark_is_an_ellipsoid_with_its_label():
         assert text.pose.position.z > room.centers[row][2] + room.semi_axes[row].max()
         assert ellipsoid.color == class_color(room.class_ids[row])
     assert len({(color.r, color.g, color.b) for color in map(class_color, 'abc')}) == 3
-
-
-def test_keyframes_are_cameras_in_a_namespace_of_their_own():
-    room = make_room()
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, 0, 3] = 1.0, 2.0, 3.0
-    layer = replace(make_layer(room, keyframes=3), map_from_camera=poses)
-    *others, cameras = landmark_markers(room, layer).markers
-    assert len(others) == 1 + 2 * len(room)
     assert (cameras.ns, cameras.type, cameras.header.frame_id) == (
         'keyframes', Marker.LINE_LIST, 'map')
     assert len(cameras.points) == 2 * 8 * len(poses)
