@@ -267,7 +267,7 @@ class Watcher:
         if known.state is WatchState.LOCALIZED:
             self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if known.state is not WatchState.LOST:
-            self._is_at_rest = False
+            self._reaction, self._is_at_rest = '', False
         # stamps and ages make each problem a new text
         now, said = time.monotonic(), (known.state, re.sub(r'\d[\d.]*', '', known.problem))
         if said != self._said and (known.state is not before.state
