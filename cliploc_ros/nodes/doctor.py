@@ -39,13 +39,13 @@ from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.nodes.detector import DetectorNode
 from cliploc_ros.nodes.relocalizer import RelocalizerNode
 from cliploc_ros.ros.answer import Verdict
+from cliploc_ros.ros.clients import NotRunningError, ask, check_name
 from cliploc_ros.ros.conversions import of_camera
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, keyframes_path
 from cliploc_ros.ros.inputs.frame_source import NoFrameError
 from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
 from cliploc_ros.ros.node.threads import NodeExecutor
 from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters, map_files
-from cliploc_ros.ros.running import NotRunningError, ask, check_name
 
 # A greater delay of images after their stamps means that the clocks differ. Not measured.
 _MOST_LAG_S = 1.0

@@ -21,7 +21,7 @@ PATIENCE_S = 60.0
 # These imports take most of the start-up time: two seconds, nine with PyTorch.
 _IMPORTS = ['torch', 'torchvision', 'open_clip', 'cliploc_ros.cli.replay',
             'cliploc_ros.nodes.detector', 'cliploc_ros.nodes.relocalizer',
-            'cliploc_ros.ros.wake_up']
+            'cliploc_ros.ros.clients']
 
 
 @cache

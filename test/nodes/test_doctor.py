@@ -20,8 +20,8 @@ from tester import class_matching, make_frame
 
 from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.ros.clients import check_name
 from cliploc_ros.ros.qos import LATCHED
-from cliploc_ros.ros.running import check_name
 
 LINE = re.compile('^(.{12}) (pass|fail|not checked|refused) +(.*)$', re.MULTILINE)
 WHOLE = {'parameters': 'valid', 'map': '12 landmarks', 'camera': 'it publishes image, ',

@@ -25,9 +25,8 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.watch import WatchState
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict
 from cliploc_ros.ros.conversions import detections_to_msg
-from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
+from cliploc_ros.ros.frame_localizer import FrameLocalizer, Instants, Keyframes
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.instants import Instants
 from cliploc_ros.ros.inputs.odometry import OdometryPlace
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes

@@ -17,7 +17,7 @@ from cliploc_ros.messages import (
     faults_of_headers,
     faults_of_rectified,
 )
-from cliploc_ros.ros.inputs.instants import faults_of_axes
+from cliploc_ros.ros.frame_localizer import faults_of_axes
 
 SIZE = (CAMERA.width, CAMERA.height)
 K = [500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0]
