@@ -143,7 +143,15 @@ class Doctor(RelocalizerNode):
         if localizer is None:
             report.add('map', State.FAIL, self._map_error)
         else:
-            report_map(localizer, parameters, report)
+            report.add('map', State.PASS, localizer.description)
+            keyframes, file = localizer.keyframes, keyframes_path(parameters)
+            if file is None:
+                report.add('keyframes', State.NOT_CHECKED,
+                           'none next to the map: build_map makes them from images')
+            else:
+                report.judge('keyframes', '' if keyframes is not None else
+                             f'{file} is not used, see the error above: rebuild it with build_map',
+                             f'{len(keyframes.localizer.layer if keyframes else ())} of {file}')
         has_frame = self._check_inputs(parameters, patience_s, report)
         if parameters.require_localizer:
             report.judge('localizer', self._handoff.missing() if parameters.base_frame else
@@ -209,19 +217,6 @@ class Doctor(RelocalizerNode):
             f'images come {lag_s:.1f} s after their stamps by '
             f"{'/clock' if uses_sim_time else 'the clock of this machine'} (limit "
             f'{_MOST_LAG_S:g}): synchronize the clocks; play a bag with --clock and use_sim_time')
-
-
-def report_map(localizer: FrameLocalizer, parameters: RelocalizerParameters, report: Report
-               ) -> None:
-    """Report a loaded map and its keyframes."""
-    report.add('map', State.PASS, f'{localizer.description}')
-    keyframes, file = localizer.keyframes, keyframes_path(parameters)
-    if file is None:
-        return report.add('keyframes', State.NOT_CHECKED,
-                          'none next to the map: build_map makes them from images')
-    return report.judge('keyframes', '' if keyframes is not None else
-                        f'{file} is not used, see the error above: rebuild it with build_map',
-                        f'{len(keyframes.localizer.layer if keyframes else ())} of {file}')
 
 
 def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) -> None:

@@ -73,8 +73,9 @@ class RelocalizerStatus:
     def __init__(self, node: Node, name: str) -> None:
         self._name = name
         self._begun_at = time.monotonic()
-        # Arrival of the last diagnostics (monotonic clock) [s], and their message.
-        self._received_at, self._message = -math.inf, ''
+        #: Arrival of the last diagnostics (monotonic clock) [s]
+        self.received_at = -math.inf
+        self._message = ''
         #: The values of the last diagnostics
         self.values: dict[str, str] = {}
         node.create_subscription(DiagnosticArray, '/diagnostics', self._take, 10)
@@ -82,16 +83,7 @@ class RelocalizerStatus:
     @property
     def silent_s(self) -> float:
         """Return the time since the last diagnostics [s]."""
-        return time.monotonic() - max(self._received_at, self._begun_at)
-
-    @property
-    def time_limit_s(self) -> float:
-        """Return the time limit of a request [s]; infinite if unknown."""
-        return float(self.values.get('time limit [s]', math.inf))
-
-    def has_reported_since(self, moment: float) -> bool:
-        """Return whether it is active and has reported since `moment` (monotonic clock) [s]."""
-        return self._received_at > moment and self.values.get('state') == 'active'
+        return time.monotonic() - max(self.received_at, self._begun_at)
 
     def problem(self) -> str:
         """Return why the relocalizer cannot answer a request, and the remedy; empty if it can."""
@@ -111,7 +103,7 @@ class RelocalizerStatus:
     def _take(self, msg: DiagnosticArray) -> None:
         for status in msg.status:
             if status.hardware_id == self._name.lstrip('/'):
-                self._received_at, self._message = time.monotonic(), status.message
+                self.received_at, self._message = time.monotonic(), status.message
                 self.values = {value.key: value.value for value in status.values}
 
 
@@ -338,9 +330,9 @@ class WakeUp(Node):
         while True:
             self._spin()
             self._say('waiting', self._status.problem())
-            if not self._status.has_reported_since(accepted_at):
-                continue
             values = self._status.values
+            if self._status.received_at <= accepted_at or values.get('state') != 'active':
+                continue
             if 'watch' not in values:
                 return 'the relocalizer does not watch: set its parameter watch to tf or amcl_pose'
             self._say('watch', values['watch'] if values['watch'] != 'lost' else
@@ -351,11 +343,11 @@ class WakeUp(Node):
     def _look(self) -> tuple[Verdict, str, str]:
         """Request the pose once; return the verdict, the kind of a refusal, and the answer."""
         begun_at, future = time.monotonic(), self._client.call_async(SelfTest.Request())
+        limit_s = float(self._status.values.get('time limit [s]', math.inf))
 
         def is_over() -> bool:
-            waited_s = time.monotonic() - begun_at
             return bool(future.done() or self._status.silent_s > SILENT_S
-                        or waited_s > self._status.time_limit_s + _ON_ITS_WAY_S)
+                        or time.monotonic() - begun_at > limit_s + _ON_ITS_WAY_S)
         self._wait(is_over, math.inf)
         if future.done():
             (status,) = future.result().status

@@ -161,8 +161,14 @@ class HandOff:
             self._node.get_logger().warning(
                 "base_frame is empty, so initialpose is the camera's pose; for AMCL set "
                 "base_frame to AMCL's base_frame_id", once=True)
-        if parameters.require_localizer:
-            self._wait_for_localizer(deadline)
+        until = deadline - _LEAST_S  # later, a localizer could not use the pose
+        # discovery of a localizer that has just started takes up to three seconds
+        while parameters.require_localizer and (missing := self.missing()) \
+                and not self._stopped.is_set():
+            if not _left_s(until):
+                raise NoLocalizerError(missing)
+            with self._changed:
+                self._changed.wait(min(_POLL_S, _left_s(until)))
         must_show = parameters.require_localizer and self._subscription is not None
         given, times, begun_at = pose, 0, time.monotonic()
         while not times or (must_show and not self._is_shown(given, deadline)):
@@ -198,18 +204,6 @@ class HandOff:
             self._changed.notify_all()
         for listener in self._listeners:
             listener(shown)
-
-    def _wait_for_localizer(self, deadline: float) -> None:
-        """Wait for a localizer; raise NoLocalizerError if there is none in time to use it.
-
-        Discovery of a localizer that has just started takes up to three seconds.
-        """
-        until = deadline - _LEAST_S
-        while (missing := self.missing()) and not self._stopped.is_set():
-            if not _left_s(until):
-                raise NoLocalizerError(missing)
-            with self._changed:
-                self._changed.wait(min(_POLL_S, _left_s(until)))
 
     def _is_shown(self, given: PoseWithCovarianceStamped, deadline: float) -> bool:
         """Return whether the localizer's pose agrees with `given`; wait briefly for that."""

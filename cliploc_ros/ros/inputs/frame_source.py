@@ -131,7 +131,8 @@ class FrameSource:
         self._deadlines: list[float] = []
         self._wanted_until = 0.0
         self._rates = Rates()
-        self._closed = 'the node is not active'
+        #: Why the source is closed; empty while it is open
+        self.closed = 'the node is not active'
 
     @property
     def image_topic(self) -> str:
@@ -145,7 +146,7 @@ class FrameSource:
         """
         with self._changed:
             self._detections = detection_type(self._package)
-            self._closed = ''
+            self.closed = ''
             if self._linger_s == math.inf:
                 self._wanted_until = math.inf
                 self._subscribe()
@@ -153,7 +154,7 @@ class FrameSource:
     def close(self, reason: str) -> None:
         """Unsubscribe. From now on `want` raises StoppedError with this reason."""
         with self._changed:
-            self._closed = reason
+            self.closed = reason
             self._deadlines.clear()
             self._unsubscribe()
             self._changed.notify_all()
@@ -170,8 +171,8 @@ class FrameSource:
 
         The caller holds the condition. StoppedError: the source was closed.
         """
-        if self._closed:
-            raise StoppedError(self._closed)
+        if self.closed:
+            raise StoppedError(self.closed)
         self._deadlines.append(deadline)
         self._subscribe()
 
@@ -180,8 +181,8 @@ class FrameSource:
 
         StoppedError: the source was closed.
         """
-        if self._closed:
-            raise StoppedError(self._closed)
+        if self.closed:
+            raise StoppedError(self.closed)
         if deadline in self._deadlines:  # it is missing if the source was reopened meanwhile
             self._deadlines.remove(deadline)
         linger_s = self._linger_s if linger_s is None else linger_s
@@ -198,11 +199,6 @@ class FrameSource:
                 [self._wanted_until, *self._deadlines]):
             self._unsubscribe()
         return bool(self._subscriptions)
-
-    @property
-    def is_closed(self) -> bool:
-        """Return whether the source is closed."""
-        return bool(self._closed)
 
     def missing(self) -> list[str]:
         """Return a message with the remedy for each input without a publisher."""
@@ -236,7 +232,8 @@ class FrameSource:
 
         The caller holds the condition.
         """
-        return self._pairing.waits_near('image', stamp_ns, tolerance_s * NS_PER_S)
+        return any(abs(waiting_ns - stamp_ns) <= tolerance_s * NS_PER_S
+                   for waiting_ns in self._pairing.waiting('image'))
 
     def _subscribe(self) -> None:
         if len(self._subscriptions) == len(self.topics):
@@ -352,16 +349,10 @@ class FrameSource:
                 f'{self._resolved(name)} {stamps.problem}: {_STAMPING[name]}'
                 for name, stamps in self._stamps.items() if stamps.problem]
 
-    def unheard(self, since: float) -> dict[str, str]:
-        """Return the inputs without a message since a time (monotonic clock), and why."""
-        return {name: self._silence(name) for name in self.topics
-                if name not in _OF_DEPTH and self._heard_at(name) < since}
-
     def why_none(self, since: float) -> str:
         """Return why no frame was completed since a time (monotonic clock)."""
-        if missing := self.unheard(since):
-            return '; '.join(missing.values())
-        if problems := self._stamp_problems():
+        if problems := [self._silence(name) for name in self.topics if name not in _OF_DEPTH
+                        and self._heard_at(name) < since] or self._stamp_problems():
             return '; '.join(problems)
         if self._unsure is not None:
             return (f'too few images on {self.image_topic} to check that their stamps differ: '

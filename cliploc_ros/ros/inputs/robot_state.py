@@ -206,7 +206,12 @@ def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
                 f'the IMU is moving: it measures {np.linalg.norm(mean):.2f} m/s^2, at rest '
                 f'{_STANDARD_GRAVITY:.2f}')
         return np.asarray(mean / np.linalg.norm(mean))
-    contradiction_deg = _contradiction_deg(samples)
+    # all samples, not only those around the image: acceleration and braking of the robot deflect
+    # the vertical briefly
+    cosines = [float(sample.up @ sample.acceleration) / float(np.linalg.norm(sample.acceleration))
+               for sample in samples if sample.up is not None and sample.acceleration is not None
+               and _is_gravity(sample.acceleration)] or [1.0]
+    contradiction_deg = float(np.degrees(np.median(np.arccos(np.clip(cosines, -1.0, 1.0)))))
     if contradiction_deg > _MAX_CONTRADICTION_DEG:
         raise NoVerticalError(
             f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity '
@@ -222,19 +227,6 @@ def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
 
 def _is_gravity(acceleration: NDArray[np.float64]) -> bool:
     return bool(abs(np.linalg.norm(acceleration) - _STANDARD_GRAVITY) <= _MAX_ACCELERATION)
-
-
-def _contradiction_deg(samples: Sequence[Sample]) -> float:
-    """Return the median angle between orientation and acceleration at rest [deg].
-
-    The median includes all samples, not only those around the image, because acceleration and
-    braking of the robot deflect the vertical briefly. 0 if no sample measures both at rest.
-    """
-    cosines = [float(sample.up @ sample.acceleration) / float(np.linalg.norm(sample.acceleration))
-               for sample in samples if sample.up is not None and sample.acceleration is not None
-               and _is_gravity(sample.acceleration)]
-    return float(np.degrees(np.median(np.arccos(np.clip(cosines, -1.0, 1.0))))) \
-        if cosines else 0.0
 
 
 class PriorSource:

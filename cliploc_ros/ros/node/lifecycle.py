@@ -328,14 +328,11 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         self.close()
 
     def _free(self) -> None:
+        from cliploc_ros.models.onnx_network import free_memory
         if self.active:
             self._deactivate()
-        self.worker.run(self._unload)
-
-    def _unload(self) -> None:
-        from cliploc_ros.models.onnx_network import free_memory
-        self.unload()
-        free_memory()
+        self.worker.run(self.unload)
+        self.worker.run(free_memory)
 
     def _attempt(self, step: Callable[[], None]) -> Outcome:
         """Run a transition and log its exceptions, which rclpy would hide.

@@ -190,12 +190,6 @@ class LatestOnly[T]:
         self._items: list[T] = []
         self.dropped = 0
 
-    @property
-    def waiting(self) -> T | None:
-        """Return the waiting item; None without any."""
-        with self._lock:
-            return self._items[0] if self._items else None
-
     def offer(self, item: T) -> None:
         """Queue an item in place of a waiting item."""
         with self._lock:
