@@ -93,6 +93,8 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     assert tester.set_parameter('keyframes_file', 'auto').successful
     assert tester.trigger('reload_map').success
     process.wait_for_output('without keyframes')
+    assert '[ERROR]' in next(line for line in process.output().splitlines()
+                             if 'without keyframes' in line), 'also of Python loggers'
     assert not tester.relocalize((image, info, detections)).success
     assert 'keyframes' not in diagnostics_of(tester)
     write_bare_map(tmp_path / 'bare.yaml', bare_layer())  # landmarks may come and go

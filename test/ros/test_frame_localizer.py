@@ -58,19 +58,6 @@ def timer():
     return StageTimes('waiting', time.monotonic())
 
 
-def test_a_perfect_view_gives_the_true_pose(localizer, values):
-    times = timer()
-    found, landmark_map, view, for_filter, *_ = localizer.localize(
-        make_frame(), values, KnownBefore(RobotState(np.eye(4))), times)
-    np.testing.assert_array_equal(for_filter, found.covariance)
-    assert view.image_rgb.shape == (CAMERA.height, CAMERA.width, 3)
-    distance_m, angle_deg = pose_error(found.hypotheses[0].map_from_camera, MAP_FROM_CAMERA)
-    assert found.accepted and distance_m < 0.05 and angle_deg < 1.0
-    assert list(times.ms) == ['waiting', 'decoding', 'search']
-    assert landmark_map.frame_id == 'map'
-    assert localizer.description.startswith('12 landmarks')
-
-
 def test_a_rectified_image_is_measured_with_p(localizer, values):
     useless = {'k': [0.0] * 9, 'distortion_model': 'plumb_bob', 'd': [0.5] * 5}
     with pytest.raises(CameraError, match='camera_info: K'):

@@ -110,7 +110,10 @@ def test_odometry_that_goes_on_is_no_restart_and_invalid_messages_change_nothing
     np.testing.assert_allclose(place(robot, 10.05).odom_from_frame,
                                odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
     assert place(robot, 10.05).run == run
-    assert source.recent(1.0, 1.0).header.stamp == stamp(10.2)
+    talk(source, 13.0)
+    for moment in (9.0, 11.0, 13.5):  # before, in a gap, after
+        assert place(robot, moment) is None
+    assert source.recent(1.0, 1.0).header.stamp == stamp(13.0)
     source.forget()
     talk(source, 2.0)
     assert not restarts, 'a jump of the clock is reported by TimeJumps'

@@ -62,11 +62,11 @@ def kitchen(shared_data):
     frames = rgbd_frames(shared_data / 'seven_scenes_kitchen', FolderOptions())
     landmark_map = LandmarkMap.from_file(shared_data / 'tum_fr3_office' / 'map.yaml')
     nothing = Detections(np.empty((0, 4)), (), np.empty(0))
-    return landmark_map, build_layer(frames.select(range(0, 30, 3)), landmark_map, EVERY), [
+    return landmark_map, build_layer(frames.select(range(0, 30, 6)), landmark_map, EVERY), [
         PosedQuery(number, Observation(frame.camera, nothing, np.empty((0, len(landmark_map))),
                                        (1 + number) * 10**9), frame.map_from_camera,
                    image=partial(np.asarray, frame.image_rgb))
-        for number, frame in enumerate(frames.select(range(1, 30, 6)).read())]
+        for number, frame in enumerate(frames.select(range(1, 30, 18)).read())]
 
 
 def rooms(shared_data):
@@ -74,7 +74,7 @@ def rooms(shared_data):
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     walked, asked = (read_folder(ASSETS / name, FolderOptions(layout='tum'))
                      for name in ('mapping', 'sequence'))
-    asked = asked.select(range(0, asked.count, 5))
+    asked = asked.select(range(0, asked.count, 9))
     recorded = record_every_frame(asked, LoadNetworks(
         DetectorOptions(model=str(ASSETS / 'yolo.onnx')), None)())
     return (landmark_map, build_layer(walked.select(range(0, walked.count, 4)), landmark_map,

@@ -98,7 +98,8 @@ class FrameSource:
                  changed: threading.Condition | None = None) -> None:
         self._node, self._camera = node, camera
         self._linger_s, self._on_frame = linger_s, on_frame
-        self._package, self._detections = parameters.detections_type, detection_type('vision_msgs')
+        self._package = parameters.detections_type
+        self._detections_type, self._converted = detection_type('vision_msgs')
         is_raw, depth = parameters.image_transport == 'raw', parameters.depth_transport
         self._image_type = Image if is_raw else CompressedImage
         self._depth_type = Image if depth == 'raw' else CompressedImage
@@ -145,7 +146,7 @@ class FrameSource:
         OptionsError: the message type of the detections is not installed.
         """
         with self._changed:
-            self._detections = detection_type(self._package)
+            self._detections_type, self._converted = detection_type(self._package)
             self.closed = ''
             if self._linger_s == math.inf:
                 self._wanted_until = math.inf
@@ -242,7 +243,7 @@ class FrameSource:
         self._subscribed_at = time.monotonic()
         of_topics = {'image': (self._image_type, qos.IMAGE),
                      'camera_info': (CameraInfo, qos.CAMERA_INFO),
-                     'detections': (self._detections.message_type, qos.DETECTIONS_IN),
+                     'detections': (self._detections_type, qos.DETECTIONS_IN),
                      'depth': (self._depth_type, qos.IMAGE),
                      'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
         for name, topic in self.topics.items():
@@ -271,7 +272,7 @@ class FrameSource:
             if not self._subscriptions:
                 return
             if name == 'detections':
-                msg = self._detections.converted(msg)
+                msg = self._converted(msg)
             self.heard[name] = msg, time.monotonic()
             frame = None
             if name == 'depth':

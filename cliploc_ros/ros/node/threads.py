@@ -35,27 +35,25 @@ class BoundedCallbackGroup(CallbackGroup):
 
     def __init__(self, limit: int) -> None:
         super().__init__()
-        self._limit = limit
-        self._running: list[object] = []
+        self._free = limit
         self._lock = threading.Lock()
 
     def can_execute(self, entity: object) -> bool:
         """Return whether a further callback may begin."""
-        with self._lock:
-            return len(self._running) < self._limit
+        return self._free > 0
 
     def beginning_execution(self, entity: object) -> bool:
         """Count a callback that begins; return whether it may begin."""
         with self._lock:
-            if len(self._running) >= self._limit:
+            if not self._free:
                 return False
-            self._running.append(entity)
+            self._free -= 1
             return True
 
     def ending_execution(self, entity: object) -> None:
         """Count a callback that ended."""
         with self._lock:
-            self._running.remove(entity)
+            self._free += 1
 
 
 class NodeExecutor(SingleThreadedExecutor):
