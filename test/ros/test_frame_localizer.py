@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
+from frames import frame_of, header_of
 from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, write_map
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
@@ -15,15 +15,11 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.errors import CameraError
-from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import load_localizer
-from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.odometry import OdometryPlace
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
-
-HEADER = Header(frame_id='camera', stamp=Time(sec=100))
 
 
 @pytest.fixture
@@ -34,14 +30,8 @@ def values(tmp_path):
     return RelocalizerParameters(map_file=str(path), matching='class', algorithm='bf')
 
 
-def make_frame(encoding='mono8', detections=None, **info):
-    image = Image(header=HEADER, width=CAMERA.width, height=CAMERA.height, encoding=encoding,
-                  step=CAMERA.width, data=bytes(CAMERA.width * CAMERA.height))
-    fields = {'width': CAMERA.width, 'height': CAMERA.height, 'k': CAMERA.matrix.ravel(),
-              'p': np.c_[CAMERA.matrix, np.zeros(3)].ravel()}
-    found = see_room(make_room()) if detections is None else detections
-    return Frame(image, CameraInfo(header=HEADER, **(fields | info)),
-                 detections_to_msg(found, HEADER), 0.0, 0.0)
+def make_frame(**info):
+    return frame_of(see_room(make_room()), header_of(100 * 10**9), info=info)
 
 
 @pytest.fixture
@@ -94,7 +84,7 @@ def test_a_camera_of_another_run_of_odometry_is_left_out_and_named(localizer, va
     places = [RobotState(np.eye(4), place=OdometryPlace(np.eye(4), run, 0.0)) for run in (1, 1, 2)]
     frames = [replace(make_frame(), camera=name) for name in ('front', 'left', 'back')]
     first = replace(frames[0], left_out=('right',))
-    frames[1].image.header = Header(frame_id='camera', stamp=Time(sec=99, nanosec=980_000_000))
+    frames[1].image.header = header_of(99_980_000_000)
     found = localizer.localize(first, values, KnownBefore(places[0], list(zip(
         frames[1:], places[1:], strict=True))), timer())
     assert [(frame.camera_name, frame.stamp_ns) for frame in found.query.frames] == [
