@@ -15,7 +15,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -66,25 +65,20 @@ class State(StrEnum):
     REFUSED = 'refused'  #: A request gets no pose here, although nothing is broken
 
 
-class Finding(NamedTuple):
-    """A check, its result, and for a failure the remedy."""
-
-    what: str
-    state: State
-    text: str
-
-
 class Report:
-    """Collects findings, and calls `tell` with each one immediately."""
+    """Collects checks with their results, and tells each one immediately.
 
-    def __init__(self, tell: Callable[[Finding], object]) -> None:
+    `tell` is called with the name of a check, its result, and for a failure the remedy.
+    """
+
+    def __init__(self, tell: Callable[[str, State, str], object]) -> None:
         self._tell = tell
-        self.findings: list[Finding] = []
+        self.findings: list[tuple[str, State]] = []
 
     def add(self, what: str, state: State, text: str) -> None:
-        """Add a finding."""
-        self.findings.append(Finding(what, state, text))
-        self._tell(self.findings[-1])
+        """Add a check."""
+        self.findings.append((what, state))
+        self._tell(what, state, text)
 
     def judge(self, what: str, problem: str, text: str) -> None:
         """Add a failure with `problem`, or, if `problem` is empty, a pass with `text`."""

@@ -44,8 +44,6 @@ _GRACE_S = 3.0
 _STOP_S = 4.0
 _ENDS = {GoalStatus.STATUS_ABORTED: 'aborted', GoalStatus.STATUS_CANCELED: 'cancelled'}
 
-#: Spins the node until a condition holds, or for a number of seconds; returns whether it holds.
-Wait = Callable[[Callable[[], bool], float], bool]
 _SERVICE = 'relocalize_fields'
 # Discovery takes time: nodes and topics appear late.
 _DISCOVERY_S = 2.0
@@ -156,86 +154,6 @@ def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, li
                     for parameter, value in zip(names, got.result().values, strict=True)]
 
 
-class Turning:
-    """Turns a robot step by step; reverses the direction after a failed turn.
-
-    Parameters
-    ----------
-    step_rad : float
-        Angle of a step [rad]. Positive: counterclockwise. 0: never turn.
-    """
-
-    def __init__(self, node: Node, wait: Wait, step_rad: float) -> None:
-        self._wait = wait
-        self._step_rad = step_rad
-        self._client: ActionClient | None = None
-        if step_rad:
-            with suppress(ImportError):
-                self._action = importlib.import_module('nav2_msgs.action').Spin
-                self._client = ActionClient(node, self._action, 'spin')
-        self._name = node.resolve_topic_name('spin')
-        self._goal: Any = None
-
-    def obstacle(self) -> str:
-        """Return why the robot cannot turn; empty if it can."""
-        if not self._step_rad:
-            return 'switched off'
-        if self._client is None:
-            return 'nav2_msgs is not installed: sudo apt install ros-jazzy-nav2-msgs'
-        if not self._client.server_is_ready():
-            return f"nothing serves {self._name}: activate Nav2's behavior_server"
-        return ''
-
-    def turn(self) -> str:
-        """Turn by a step; return a description of the result."""
-        step = f'turned by {math.degrees(self._step_rad):.0f} deg'
-        problem = self._problem_of(self._action.Goal(
-            target_yaw=self._step_rad, time_allowance=Duration(sec=int(_ALLOWANCE_S))))
-        if not problem:
-            return step
-        self._step_rad = -self._step_rad
-        self._wait(lambda: False, _PAUSE_S)  # an immediate next turn would fail as well
-        return f'not {step} ({problem})'
-
-    def stop(self) -> None:
-        """Cancel the current turn, and wait until the server has accepted that."""
-        if self._goal is None:
-            return
-        if not self._goal.done():  # the server may still accept the goal
-            self._wait(self._goal.done, _STOP_S)
-        handle = self._goal.result() if self._goal.done() else None
-        self._goal = None
-        if handle is not None and handle.accepted:
-            self._wait(handle.cancel_goal_async().done, _STOP_S)
-
-    def _problem_of(self, goal: Any) -> str:
-        """Turn; return why that failed, empty after success."""
-        assert self._client is not None
-        end = time.monotonic() + _ALLOWANCE_S + _GRACE_S
-        self._goal = self._client.send_goal_async(goal)
-        if not self._wait(self._goal.done, _GRACE_S):
-            self.stop()
-            return f'no answer from {self._name}'
-        handle = self._goal.result()
-        if not handle.accepted:
-            self._goal = None
-            return f"refused by {self._name}: activate Nav2's behavior_server"
-        result = handle.get_result_async()
-        if not self._wait(result.done, end - time.monotonic()):
-            self.stop()
-            return f'no result from {self._name} within {_ALLOWANCE_S + _GRACE_S:g} s'
-        self._goal = None
-        outcome = result.result()
-        if outcome.status == GoalStatus.STATUS_SUCCEEDED:
-            return ''
-        found, code = outcome.result, int(outcome.result.error_code)
-        names = {getattr(type(found), name): name.lower().replace('_', ' ')
-                 for name in ('TIMEOUT', 'TF_ERROR', 'COLLISION_AHEAD')}
-        # Nav2 before Jazzy has no field error_msg
-        words = [*filter(None, [names.get(code), getattr(found, 'error_msg', '')]), f'code {code}']
-        return f'{_ENDS.get(outcome.status, "failed")}: {", ".join(words)}'
-
-
 class Outcome(IntEnum):
     """The result of a wake-up, as an exit code."""
 
@@ -270,7 +188,14 @@ class WakeUp(Node):
         self._service = self.resolve_service_name(f'{relocalizer}/{_SERVICE}')
         self._client = self.create_client(SelfTest, self._service)
         self._status = RelocalizerStatus(self, self._service.removesuffix(f'/{_SERVICE}'))
-        self._turning = Turning(self, self._wait, math.radians(turn_deg))
+        # Angle of the next turn [rad], and the goal of the current turn.
+        self._step_rad = math.radians(turn_deg)
+        self._goal: Any = None
+        self._spinner: ActionClient | None = None
+        if turn_deg:
+            with suppress(ImportError):
+                self._action = importlib.import_module('nav2_msgs.action').Spin
+                self._spinner = ActionClient(self, self._action, 'spin')
         self._began_at = time.monotonic()
         self._timeout_s, self._watches = timeout_s, watch
         self._interrupted = interrupted
@@ -291,7 +216,7 @@ class WakeUp(Node):
             return outcome
         finally:
             self._interrupted = Interruption()  # the first interruption is handled
-            self._turning.stop()
+            self._stop()
 
     def _look_about(self) -> Outcome:
         looks, turned, kinds = 0, '', Counter[str]()
@@ -359,10 +284,64 @@ class WakeUp(Node):
             'restarted, or the network lost the answer')
 
     def _turn(self) -> str:
-        """Turn before the next request, if possible; return a description of the result."""
-        obstacle = self._turning.obstacle()
+        """Turn before the next request, if possible; return a description of the result.
+
+        The direction is reversed after a failed turn.
+        """
+        name = self.resolve_topic_name('spin')
+        obstacle = 'switched off' if not self._step_rad else \
+            'nav2_msgs is not installed: sudo apt install ros-jazzy-nav2-msgs' \
+            if self._spinner is None else '' if self._spinner.server_is_ready() else \
+            f"nothing serves {name}: activate Nav2's behavior_server"
         self._say('not turning', obstacle)
-        return self._rest() if obstacle else f', {self._turning.turn()}'
+        if obstacle:
+            return self._rest()
+        step = f'turned by {math.degrees(self._step_rad):.0f} deg'
+        problem = self._problem_of(self._action.Goal(
+            target_yaw=self._step_rad, time_allowance=Duration(sec=int(_ALLOWANCE_S))), name)
+        if not problem:
+            return f', {step}'
+        self._step_rad = -self._step_rad
+        self._rest()  # an immediate next turn would fail as well
+        return f', not {step} ({problem})'
+
+    def _stop(self) -> None:
+        """Cancel the current turn, and wait until the server has accepted that."""
+        if self._goal is None:
+            return
+        if not self._goal.done():  # the server may still accept the goal
+            self._wait(self._goal.done, _STOP_S)
+        handle = self._goal.result() if self._goal.done() else None
+        self._goal = None
+        if handle is not None and handle.accepted:
+            self._wait(handle.cancel_goal_async().done, _STOP_S)
+
+    def _problem_of(self, goal: Any, name: str) -> str:
+        """Turn by the action `name`; return why that failed, empty after success."""
+        assert self._spinner is not None
+        end = time.monotonic() + _ALLOWANCE_S + _GRACE_S
+        self._goal = self._spinner.send_goal_async(goal)
+        if not self._wait(self._goal.done, _GRACE_S):
+            self._stop()
+            return f'no answer from {name}'
+        handle = self._goal.result()
+        if not handle.accepted:
+            self._goal = None
+            return f"refused by {name}: activate Nav2's behavior_server"
+        result = handle.get_result_async()
+        if not self._wait(result.done, end - time.monotonic()):
+            self._stop()
+            return f'no result from {name} within {_ALLOWANCE_S + _GRACE_S:g} s'
+        self._goal = None
+        outcome = result.result()
+        if outcome.status == GoalStatus.STATUS_SUCCEEDED:
+            return ''
+        found, code = outcome.result, int(outcome.result.error_code)
+        names = {getattr(type(found), kind): kind.lower().replace('_', ' ')
+                 for kind in ('TIMEOUT', 'TF_ERROR', 'COLLISION_AHEAD')}
+        # Nav2 before Jazzy has no field error_msg
+        words = [*filter(None, [names.get(code), getattr(found, 'error_msg', '')]), f'code {code}']
+        return f'{_ENDS.get(outcome.status, "failed")}: {", ".join(words)}'
 
     def _rest(self) -> str:
         self._wait(lambda: False, _PAUSE_S)
@@ -388,7 +367,7 @@ class WakeUp(Node):
         self._said[topic] = text, elapsed_s
 
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        """Process callbacks until a condition holds, at most for `patience_s`; see Wait."""
+        """Process callbacks until a condition holds or time is up; return whether it holds."""
         end = time.monotonic() + patience_s
         while not condition():
             if time.monotonic() > end:

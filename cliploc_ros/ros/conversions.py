@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseArray, PoseWithCovarianceStamped
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 from vision_msgs.msg import (
@@ -79,11 +79,6 @@ def pose_with_covariance_msg(header: Header, parent_from_child: NDArray[np.float
     msg.pose.pose = pose_to_msg(parent_from_child)
     msg.pose.covariance = covariance.ravel()
     return msg
-
-
-def pose_array_msg(header: Header, poses: list[NDArray[np.float64]]) -> PoseArray:
-    """Return poses (4, 4) as a message, in the same order."""
-    return PoseArray(header=header, poses=[pose_to_msg(pose) for pose in poses])
 
 
 def detection_type(package: str) -> tuple[type, Callable[[Any], Detection2DArray]]:

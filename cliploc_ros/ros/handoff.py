@@ -19,7 +19,6 @@ from builtin_interfaces.msg import Time as Stamp
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from numpy.typing import NDArray
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
@@ -35,6 +34,7 @@ from cliploc_ros.ros.conversions import pose_from_msg, pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.node.threads import steady_timer
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # Least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
@@ -394,8 +394,7 @@ class MapToOdom:
                                    'or set publish_tf: false') from error
         if self._broadcaster is None:
             self._broadcaster = TransformBroadcaster(self._node)
-        self._timer = self._node.create_timer(_PERIOD_S, self._broadcast, clock=Clock(
-            clock_type=ClockType.STEADY_TIME))
+        self._timer = steady_timer(self._node, _PERIOD_S, self._broadcast)
 
     def close(self) -> None:
         """Stop broadcasting, and drop the transform."""

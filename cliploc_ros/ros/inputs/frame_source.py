@@ -135,11 +135,6 @@ class FrameSource:
         #: Why the source is closed; empty while it is open
         self.closed = 'the node is not active'
 
-    @property
-    def image_topic(self) -> str:
-        """Return the resolved name of the image topic."""
-        return self._resolved('image')
-
     def open(self) -> None:
         """Allow calls of `want`.
 
@@ -321,7 +316,7 @@ class FrameSource:
                      if abs(stamp_ns(depth.header.stamp) - at_ns) <= self._depth_tolerance_ns),
                     key=lambda depth: abs(stamp_ns(depth.header.stamp) - at_ns), default=None),
                 self.heard.get('depth_camera_info', (None, 0.0))[0], self._camera,
-                image_topic=self.image_topic)
+                image_topic=self._resolved('image'))
         frame = self._unsure
         # the next images may have the same stamp; wait until stamps are known to differ
         if frame is None or not (self._stamps['image'].are_own or all(
@@ -356,8 +351,8 @@ class FrameSource:
                         and self._heard_at(name) < since] or self._stamp_problems():
             return '; '.join(problems)
         if self._unsure is not None:
-            return (f'too few images on {self.image_topic} to check that their stamps differ: '
-                    'raise its rate, or timeout_s')
+            return (f'too few images on {self._resolved("image")} to check that their stamps '
+                    'differ: raise its rate, or timeout_s')
         if self._pairing.outrun:
             return (f'detections arrive {self._pairing.outrun} images late, more than fit in '
                     f'{_MAX_IMAGE_BYTES // 2**20} MiB of memory: use smaller images, '

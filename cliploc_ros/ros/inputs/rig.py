@@ -10,12 +10,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from itertools import islice
 
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.node.diagnostics import Health
+from cliploc_ros.ros.node.threads import steady_timer
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
@@ -90,10 +89,7 @@ class CameraRig:
         self._passed_ns = -_LATE_NS
         # With several cameras in continuous mode, a late or silent camera must not delay others.
         self._is_continuous = linger_s == math.inf and len(self.sources) > 1
-        # Steady time, because simulated time may be paused.
-        node.create_timer(_CHECK_PERIOD_S if self._is_continuous else _REST_PERIOD_S, self._tick,
-                          MutuallyExclusiveCallbackGroup(),
-                          Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(node, _CHECK_PERIOD_S if self._is_continuous else _REST_PERIOD_S, self._tick)
 
     def open(self) -> None:
         """Allow calls of next_frame; OptionsError: see FrameSource."""

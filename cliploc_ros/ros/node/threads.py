@@ -10,7 +10,8 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.node import Node
@@ -28,6 +29,12 @@ _THREADS = MAX_REQUESTS + 8
 _BEGIN_S = 0.1
 # Greatest delay of the end of the process by a running network.
 _GRACE_S = 0.2
+
+
+def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
+    """Return a timer in steady time, because simulated time may be paused."""
+    return node.create_timer(period_s, callback, MutuallyExclusiveCallbackGroup(),
+                             Clock(clock_type=ClockType.STEADY_TIME))
 
 
 class BoundedCallbackGroup(CallbackGroup):
