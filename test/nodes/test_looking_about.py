@@ -32,7 +32,7 @@ def test_a_robot_that_sees_too_little_in_each_image_wakes_up(own_relocalizer, te
         wait_for(future.done, 'an answer', work=robot.step)
         return future.result()
     answer = ask_until(ask, 'accepted: ')
-    assert ' frames in ' in answer.message
+    assert ' frames, ' in answer.message, 'several are localized together'
     tester.wait(lambda: tester.poses, 'the pose')
     stamp, found = tester.poses[-1].header.stamp, transform_of(tester.poses[-1].pose.pose)
     truth = truths[min(truths, key=lambda at_s: abs(at_s - stamp.sec - 1e-9 * stamp.nanosec))]
