@@ -155,6 +155,8 @@ def test_the_way_is_what_was_driven_not_how_far_it_led():
     assert window.way_at(35 * S) == pytest.approx(3.5, abs=0.05)
     window.add(39 * S + S // 20, np.array([0.1, 0.0, 0.0]), UPRIGHT)  # late
     assert window.way_at(39 * S + S // 20) == window.way_at(39 * S)
+    window.add(40 * S, np.zeros(3), UPRIGHT)
+    assert window.way_at(40 * S) == pytest.approx(4.0, abs=0.05)
     window.clear()
     rng = np.random.default_rng(0)  # visual odometry jitters by millimetres
     for tick in range(50 * 50, 110 * 50):
