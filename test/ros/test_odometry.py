@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Quaternion
 from handing_over import stamp
 from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
@@ -103,8 +104,9 @@ def test_odometry_that_goes_on_is_no_restart_and_invalid_messages_change_nothing
     source.on_restart(restarts.append)
     talk(source, 9.9, 10.1, 10.0)  # one of them late
     run = place(robot, 9.95).run
-    for broken in (message(10.05), message(10.15)):
-        broken.pose.pose.position.x = broken.pose.pose.orientation.w = float('nan')
+    for number, (x_m, w) in enumerate(((np.nan, 1.0), (1e300, 1.0), (1.0, 2.0), (1.0, np.nan))):
+        broken = message(10.04 + 0.01 * number)
+        broken.pose.pose.position.x, broken.pose.pose.orientation = x_m, Quaternion(w=w)
         source.take(broken)
     talk(source, 10.2)
     np.testing.assert_allclose(place(robot, 10.03).odom_from_frame,
