@@ -72,10 +72,12 @@ def test_a_mount_of_body_axes_is_refused_where_the_pose_contradicts_it(make_node
 
 
 def test_options_hold_from_the_next_frame_on(localizer, values):
+    cameras = localizer.localizer.cameras
     assert localize(localizer, make_frame(), values).accepted
     for changes in ({'min_confidence': 1.0}, {'max_detections': 3}):
         assert not localize(localizer, make_frame(), replace(values, **changes)).accepted
     found = localize(localizer, make_frame(), replace(values, algorithm='ransac'))
+    assert localizer.localizer.cameras is cameras, 'evidence about the cameras is kept'
     assert found.accepted and localizer.description.endswith('algorithm ransac')
 
 
