@@ -67,19 +67,19 @@ def run(options: argparse.Namespace) -> int:
     with needs_ros('doctor'):
         from cliploc_ros.nodes.doctor import Report, State, doctor, make_ready
 
-    report = Report(lambda finding: print(
-        f'{finding.what:<12} {finding.state:<12} {printable(finding.text)}', flush=True))
+    report = Report(lambda what, state, text: print(
+        f'{what:<12} {state:<12} {printable(text)}', flush=True))
     with running_ros(arguments):
         if options.prepare:
             print(*make_ready(options.image, options.cache_dir, not options.without_detector,
                               report), sep='\n')
         else:
             doctor(options.params_file, options.relocalizer, options.timeout, report)
-    failed = [finding.what for finding in report.findings if finding.state is State.FAIL]
+    failed = [what for what, state in report.findings if state is State.FAIL]
     print(f'{len(failed)} of {len(report.findings)} failed: {", ".join(failed)}' if failed else
           f'nothing failed in {len(report.findings)} checks' + (
               ', but no pose was accepted here' if any(
-                  finding.state is State.REFUSED for finding in report.findings) else ''))
+                  state is State.REFUSED for _, state in report.findings) else ''))
     return int(bool(failed))
 
 

@@ -56,8 +56,7 @@ def wake_up(options: argparse.Namespace, ros_args: list[str], interrupted: comma
     OptionsError: ROS is missing, or does not start with these arguments.
     """
     with command.needs_ros('wake_up'):
-        from cliploc_ros.ros.running import check_name
-        from cliploc_ros.ros.wake_up import WakeUp
+        from cliploc_ros.ros.clients import WakeUp, check_name
     check_name(options.relocalizer)
     with command.running_ros(ros_args):
         node = WakeUp(interrupted, options.relocalizer, options.timeout, options.turn_deg,

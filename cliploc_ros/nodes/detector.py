@@ -170,7 +170,8 @@ class DetectorNode(ManagedNode[DetectorParameters]):
 
     def __init__(self) -> None:
         super().__init__('detector', DetectorParameters, RelocalizerParameters)
-        self._detector: ObjectDetector | None = None
+        #: The network, None unless it is loaded
+        self.detector: ObjectDetector | None = None
         # The node is opened in one thread, subscribers are matched in another.
         self._lock = threading.Lock()
         self._open = False
@@ -190,18 +191,13 @@ class DetectorNode(ManagedNode[DetectorParameters]):
             prompts = prompts_of_names(parameters.vocabulary)
         options = replace(with_detector(detector_options(parameters), parameters.profile),
                           prompts=prompts, text_model=parameters.text_model)
-        self._detector = load_detector(options)
+        self.detector = load_detector(options)
         of_texts = f', {len(options.prompts)} texts' if options.prompts else ''
         return f'detector {options.model}{of_texts}'
 
-    @property
-    def detector(self) -> ObjectDetector | None:
-        """Return the network, None unless it is loaded."""
-        return self._detector
-
     def unload(self) -> None:
         """Drop the network."""
-        self._detector = None
+        self.detector = None
 
     def open(self) -> None:
         """Subscribe to images while something subscribes to detections."""
@@ -235,15 +231,15 @@ class DetectorNode(ManagedNode[DetectorParameters]):
     def _detect(self, name: str, image: TimedImage) -> None:
         """Publish the detections in an image; runs in the worker's thread."""
         camera = self._cameras[name]
-        if not self.active or self._detector is None or not camera.subscription:
+        if not self.active or self.detector is None or not camera.subscription:
             return  # while the image waited, the node was deactivated or lost its subscribers
         times = StageTimes('waiting', image.received_at)
         times.begin('decoding')
         try:
-            self._detector.configure(detector_options(self.settings.snapshot()))
+            self.detector.configure(detector_options(self.settings.snapshot()))
             pixels = image_from_msg(image.msg)
             times.begin('detection')
-            detections = self._detector.detect(pixels)
+            detections = self.detector.detect(pixels)
         except CliplocError as error:
             self._last_error = str(error)
             self.get_logger().error(self._last_error, throttle_duration_sec=_LOG_PERIOD_S)

@@ -15,7 +15,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -39,13 +38,13 @@ from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.nodes.detector import DetectorNode
 from cliploc_ros.nodes.relocalizer import RelocalizerNode
 from cliploc_ros.ros.answer import Verdict
+from cliploc_ros.ros.clients import NotRunningError, ask, check_name
 from cliploc_ros.ros.conversions import of_camera
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, keyframes_path
 from cliploc_ros.ros.inputs.frame_source import NoFrameError
 from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
 from cliploc_ros.ros.node.threads import NodeExecutor
 from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters, map_files
-from cliploc_ros.ros.running import NotRunningError, ask, check_name
 
 # A greater delay of images after their stamps means that the clocks differ. Not measured.
 _MOST_LAG_S = 1.0
@@ -66,25 +65,20 @@ class State(StrEnum):
     REFUSED = 'refused'  #: A request gets no pose here, although nothing is broken
 
 
-class Finding(NamedTuple):
-    """A check, its result, and for a failure the remedy."""
-
-    what: str
-    state: State
-    text: str
-
-
 class Report:
-    """Collects findings, and calls `tell` with each one immediately."""
+    """Collects checks with their results, and tells each one immediately.
 
-    def __init__(self, tell: Callable[[Finding], object]) -> None:
+    `tell` is called with the name of a check, its result, and for a failure the remedy.
+    """
+
+    def __init__(self, tell: Callable[[str, State, str], object]) -> None:
         self._tell = tell
-        self.findings: list[Finding] = []
+        self.findings: list[tuple[str, State]] = []
 
     def add(self, what: str, state: State, text: str) -> None:
-        """Add a finding."""
-        self.findings.append(Finding(what, state, text))
-        self._tell(self.findings[-1])
+        """Add a check."""
+        self.findings.append((what, state))
+        self._tell(what, state, text)
 
     def judge(self, what: str, problem: str, text: str) -> None:
         """Add a failure with `problem`, or, if `problem` is empty, a pass with `text`."""
@@ -143,7 +137,15 @@ class Doctor(RelocalizerNode):
         if localizer is None:
             report.add('map', State.FAIL, self._map_error)
         else:
-            report_map(localizer, parameters, report)
+            report.add('map', State.PASS, localizer.description)
+            keyframes, file = localizer.keyframes, keyframes_path(parameters)
+            if file is None:
+                report.add('keyframes', State.NOT_CHECKED,
+                           'none next to the map: build_map makes them from images')
+            else:
+                report.judge('keyframes', '' if keyframes is not None else
+                             f'{file} is not used, see the error above: rebuild it with build_map',
+                             f'{len(keyframes.localizer.layer if keyframes else ())} of {file}')
         has_frame = self._check_inputs(parameters, patience_s, report)
         if parameters.require_localizer:
             report.judge('localizer', self._handoff.missing() if parameters.base_frame else
@@ -209,19 +211,6 @@ class Doctor(RelocalizerNode):
             f'images come {lag_s:.1f} s after their stamps by '
             f"{'/clock' if uses_sim_time else 'the clock of this machine'} (limit "
             f'{_MOST_LAG_S:g}): synchronize the clocks; play a bag with --clock and use_sim_time')
-
-
-def report_map(localizer: FrameLocalizer, parameters: RelocalizerParameters, report: Report
-               ) -> None:
-    """Report a loaded map and its keyframes."""
-    report.add('map', State.PASS, f'{localizer.description}')
-    keyframes, file = localizer.keyframes, keyframes_path(parameters)
-    if file is None:
-        return report.add('keyframes', State.NOT_CHECKED,
-                          'none next to the map: build_map makes them from images')
-    return report.judge('keyframes', '' if keyframes is not None else
-                        f'{file} is not used, see the error above: rebuild it with build_map',
-                        f'{len(keyframes.localizer.layer if keyframes else ())} of {file}')
 
 
 def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) -> None:

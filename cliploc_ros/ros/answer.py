@@ -88,11 +88,6 @@ class Answer:
                        detail=f'{why} ({self.message})')
 
     @property
-    def is_linked(self) -> bool:
-        """Return whether odometry links the frame with earlier and later frames."""
-        return self.query is not None and self.query.run is not None
-
-    @property
     def message(self) -> str:
         """Return the verdict, its reason, the kind of a refusal and the map in one line."""
         text = self.detail if self.verdict is Verdict.FAILED else f'{self.verdict}: {self.detail}'

@@ -4,11 +4,11 @@
 
 import importlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseArray, PoseWithCovarianceStamped
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 from vision_msgs.msg import (
@@ -81,31 +81,18 @@ def pose_with_covariance_msg(header: Header, parent_from_child: NDArray[np.float
     return msg
 
 
-def pose_array_msg(header: Header, poses: list[NDArray[np.float64]]) -> PoseArray:
-    """Return poses (4, 4) as a message, in the same order."""
-    return PoseArray(header=header, poses=[pose_to_msg(pose) for pose in poses])
+def detection_type(package: str) -> tuple[type, Callable[[Any], Detection2DArray]]:
+    """Return the detection message of a package, and its conversion to Detection2DArray.
 
-
-class DetectionType(NamedTuple):
-    """A message type, and its conversion to vision_msgs/Detection2DArray."""
-
-    message_type: type
-    converted: Callable[[Any], Detection2DArray]
-
-
-def detection_type(package: str) -> DetectionType:
-    """Return the detection message of a package, `vision_msgs` or `yolo_msgs`.
-
-    OptionsError: the package is not installed.
+    The package is `vision_msgs` or `yolo_msgs`. OptionsError: it is not installed.
     """
     if package == 'vision_msgs':
-        return DetectionType(Detection2DArray, lambda msg: msg)
+        return Detection2DArray, lambda msg: msg
     try:
-        message_type = importlib.import_module('yolo_msgs.msg').DetectionArray
+        return importlib.import_module('yolo_msgs.msg').DetectionArray, from_yolo_msg
     except ImportError as error:
         raise OptionsError('detections_type: yolo_msgs is not installed: build yolo_ros in this '
                            'workspace and source it, or set vision_msgs') from error
-    return DetectionType(message_type, from_yolo_msg)
 
 
 def from_yolo_msg(msg: Any) -> Detection2DArray:

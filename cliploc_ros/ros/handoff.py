@@ -19,7 +19,6 @@ from builtin_interfaces.msg import Time as Stamp
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from numpy.typing import NDArray
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
@@ -35,6 +34,7 @@ from cliploc_ros.ros.conversions import pose_from_msg, pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.node.threads import steady_timer
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # Least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
@@ -161,8 +161,14 @@ class HandOff:
             self._node.get_logger().warning(
                 "base_frame is empty, so initialpose is the camera's pose; for AMCL set "
                 "base_frame to AMCL's base_frame_id", once=True)
-        if parameters.require_localizer:
-            self._wait_for_localizer(deadline)
+        until = deadline - _LEAST_S  # later, a localizer could not use the pose
+        # discovery of a localizer that has just started takes up to three seconds
+        while parameters.require_localizer and (missing := self.missing()) \
+                and not self._stopped.is_set():
+            if not _left_s(until):
+                raise NoLocalizerError(missing)
+            with self._changed:
+                self._changed.wait(min(_POLL_S, _left_s(until)))
         must_show = parameters.require_localizer and self._subscription is not None
         given, times, begun_at = pose, 0, time.monotonic()
         while not times or (must_show and not self._is_shown(given, deadline)):
@@ -198,18 +204,6 @@ class HandOff:
             self._changed.notify_all()
         for listener in self._listeners:
             listener(shown)
-
-    def _wait_for_localizer(self, deadline: float) -> None:
-        """Wait for a localizer; raise NoLocalizerError if there is none in time to use it.
-
-        Discovery of a localizer that has just started takes up to three seconds.
-        """
-        until = deadline - _LEAST_S
-        while (missing := self.missing()) and not self._stopped.is_set():
-            if not _left_s(until):
-                raise NoLocalizerError(missing)
-            with self._changed:
-                self._changed.wait(min(_POLL_S, _left_s(until)))
 
     def _is_shown(self, given: PoseWithCovarianceStamped, deadline: float) -> bool:
         """Return whether the localizer's pose agrees with `given`; wait briefly for that."""
@@ -400,8 +394,7 @@ class MapToOdom:
                                    'or set publish_tf: false') from error
         if self._broadcaster is None:
             self._broadcaster = TransformBroadcaster(self._node)
-        self._timer = self._node.create_timer(_PERIOD_S, self._broadcast, clock=Clock(
-            clock_type=ClockType.STEADY_TIME))
+        self._timer = steady_timer(self._node, _PERIOD_S, self._broadcast)
 
     def close(self) -> None:
         """Stop broadcasting, and drop the transform."""

@@ -12,32 +12,25 @@ from typing import Any
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
-# Inputs are best effort unless all their publishers are reliable, see AdaptiveSubscription.
+# Of all profiles the history is KEEP_LAST. Inputs are best effort unless all their publishers are
+# reliable, see AdaptiveSubscription.
+_BEST_EFFORT, _RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 # Only the newest image counts.
-IMAGE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
-                   reliability=ReliabilityPolicy.BEST_EFFORT,
-                   durability=DurabilityPolicy.VOLATILE)
+IMAGE = QoSProfile(depth=1, reliability=_BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
 # Small messages, paired with images by stamp: a burst must not displace them.
-CAMERA_INFO = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
-                         reliability=ReliabilityPolicy.BEST_EFFORT)
-DETECTIONS_IN = CAMERA_INFO
+CAMERA_INFO = DETECTIONS_IN = QoSProfile(depth=10, reliability=_BEST_EFFORT)
 # Buffers the messages of a fast IMU or odometry while another callback runs.
-IMU = ODOM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
-                        reliability=ReliabilityPolicy.BEST_EFFORT)
-DETECTIONS_OUT = POSE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10,
-                                   reliability=ReliabilityPolicy.RELIABLE)
+IMU = ODOM = QoSProfile(depth=100, reliability=_BEST_EFFORT)
+DETECTIONS_OUT = POSE = QoSProfile(depth=10, reliability=_RELIABLE)
 # Late subscribers get the last message.
-LATCHED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1,
-                     reliability=ReliabilityPolicy.RELIABLE,
-                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = QoSProfile(depth=1, reliability=_RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Requests are answered one after another; up to 100 may wait.
-SERVICE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100,
-                     reliability=ReliabilityPolicy.RELIABLE)
+SERVICE = QoSProfile(depth=100, reliability=_RELIABLE)
 
 
 _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
@@ -107,8 +100,8 @@ class AdaptiveSubscription:
         """Return the most reliable policy that matches all current publishers."""
         offered = [info.qos_profile.reliability
                    for info in self._node.get_publishers_info_by_topic(self._topic)]
-        reliable = bool(offered) and all(r == ReliabilityPolicy.RELIABLE for r in offered)
-        return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        reliable = bool(offered) and all(r == _RELIABLE for r in offered)
+        return _RELIABLE if reliable else _BEST_EFFORT
 
     def _create(self) -> Subscription:
         # Each subscription has its own group: if a subscription is destroyed before its event is

@@ -254,7 +254,7 @@ class Requests:
                                                                  deadline)
             last, is_up, after = answer, answer.is_cut, time.monotonic()
             looks += 1
-            unlinked += not answer.is_linked
+            unlinked += answer.query is None or answer.query.run is None  # by odometry
             stages_ms.update(answer.stages_ms)
         assert last is not None
         # further images do not help if no objects of the map are visible

@@ -31,7 +31,7 @@ from cliploc_ros.core.map.similarities import CropSimilarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import pose_array_msg
+from cliploc_ros.ros.conversions import pose_to_msg
 
 #: Greatest number of landmarks shown: RViz is slow with more landmarks.
 MAX_SHOWN = 5000
@@ -349,8 +349,8 @@ class Visualization:
         The header has the stamp of the image and the coordinate frame of the map.
         """
         if self._hypotheses.get_subscription_count() > 0:
-            self._hypotheses.publish(pose_array_msg(header, [
-                hypothesis.map_from_camera @ camera_from_base
+            self._hypotheses.publish(PoseArray(header=header, poses=[
+                pose_to_msg(hypothesis.map_from_camera @ camera_from_base)
                 for hypothesis in found.hypotheses]))
         if self._matches.get_subscription_count() == 0:
             return

@@ -14,7 +14,6 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +33,7 @@ from cliploc_ros.ros.answer import Answer
 from cliploc_ros.ros.conversions import pose_from_msg, stamp_ns
 from cliploc_ros.ros.handoff import HandOff, HandOffError
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
-from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
+from cliploc_ros.ros.inputs.frame_source import NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps, stamp_problem
@@ -235,23 +234,21 @@ class Watcher:
         pose = self._pose.at(image, state, parameters, [
             part.landmark_map.frame_id for part in parts_of(localizer.landmark_map)])
         self._had_pose = True
-        report = self._node.worker.run(
-            partial(self._score, frame, parameters, state, pose, age), begun_at + _STALE_S)
+
+        def score() -> WatchReport | None:
+            """Check the pose, in the worker's thread; None if it is outdated meanwhile."""
+            localizer = self._pipeline.localizer  # a map may have been loaded meanwhile
+            if localizer is None or age != self._age:
+                return None
+            begun_s = time.thread_time()
+            try:
+                return localizer.look(frame, parameters, state, *pose)
+            finally:
+                self._cost_s = time.thread_time() - begun_s
+        report = self._node.worker.run(score, begun_at + _STALE_S)
         if report is not None:
             self._say(_Known(report.state, report.reason, report, time.monotonic()), stopped, age)
         return image.stamp
-
-    def _score(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
-               pose: tuple[str, NDArray[np.float64]], age: int) -> WatchReport | None:
-        """Check a pose, in the worker's thread; None if it is outdated meanwhile."""
-        localizer = self._pipeline.localizer  # a map may have been loaded meanwhile
-        if localizer is None or age != self._age:
-            return None
-        begun_s = time.thread_time()
-        try:
-            return localizer.look(frame, parameters, state, *pose)
-        finally:
-            self._cost_s = time.thread_time() - begun_s
 
     # ---- the verdict ----------------------------------------------------------------------------
 
@@ -267,7 +264,7 @@ class Watcher:
         if known.state is WatchState.LOCALIZED:
             self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if known.state is not WatchState.LOST:
-            self._is_at_rest = False
+            self._reaction, self._is_at_rest = '', False
         # stamps and ages make each problem a new text
         now, said = time.monotonic(), (known.state, re.sub(r'\d[\d.]*', '', known.problem))
         if said != self._said and (known.state is not before.state

@@ -25,32 +25,27 @@ from demo import ASSETS
 SEQUENCE = ASSETS / 'sequence'
 
 
-def make_messages(stamp):
+def request(node):
+    """Publish the picture until the request is answered; return the answer."""
     camera, _ = find_camera(None, SEQUENCE)
-    pixels = cv2.imread(str(min((SEQUENCE / 'rgb').iterdir())))
-    header = Header(stamp=stamp, frame_id='camera')
+    pixels, header = cv2.imread(str(min((SEQUENCE / 'rgb').iterdir()))), Header(frame_id='camera')
     image = Image(header=header, width=camera.width, height=camera.height, encoding='bgr8',
                   step=3 * camera.width, data=pixels.tobytes())
     info = CameraInfo(header=header, width=camera.width, height=camera.height,
                       distortion_model='plumb_bob', d=list(camera.distortion),
                       k=camera.matrix.reshape(-1).tolist())
-    return image, info
-
-
-def request(node):
-    """Publish the picture until the request is answered; return the answer."""
-    publishers = [node.create_publisher(kind, topic, 1)
-                  for kind, topic in ((Image, 'image'), (CameraInfo, 'camera_info'))]
+    images, infos = node.create_publisher(Image, 'image', 1), node.create_publisher(
+        CameraInfo, 'camera_info', 1)
     client = node.create_client(Trigger, 'relocalizer/relocalize')
-    wait_for(lambda: client.service_is_ready(), 'the service')
+    wait_for(client.service_is_ready, 'the service')
     future = client.call_async(Trigger.Request())
 
     def publish():
-        for publisher, message in zip(publishers, make_messages(node.get_clock().now().to_msg()),
-                                      strict=True):
-            publisher.publish(message)
+        header.stamp = node.get_clock().now().to_msg()
+        image.header = info.header = header
+        images.publish(image)
+        infos.publish(info)
         rclpy.spin_once(node, timeout_sec=0.2)
-
     wait_for(future.done, 'the answer', work=publish)
     return future.result()
 

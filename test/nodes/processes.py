@@ -21,7 +21,7 @@ PATIENCE_S = 60.0
 # These imports take most of the start-up time: two seconds, nine with PyTorch.
 _IMPORTS = ['torch', 'torchvision', 'open_clip', 'cliploc_ros.cli.replay',
             'cliploc_ros.nodes.detector', 'cliploc_ros.nodes.relocalizer',
-            'cliploc_ros.ros.wake_up']
+            'cliploc_ros.ros.clients']
 
 
 @cache
@@ -66,18 +66,18 @@ class Fork:
 class Process:
     """A module of the package in a separate process, with its output in a file.
 
-    By default it is forked from a server with the imports done. With ``fresh``, inside another
-    command, or with environment variables, it starts in a new interpreter, as for a user.
+    By default it is forked from a server with the imports done. With ``fresh``, or with
+    environment variables, it starts in a new interpreter, as for a user.
     """
 
-    def __init__(self, module, arguments, log, fresh=False, within=(), **environment):
+    def __init__(self, module, arguments, log, fresh=False, **environment):
         self.log = log
         log.touch()
         arguments = [*map(str, arguments)]
-        if fresh or within or environment:
+        if fresh or environment:
             with log.open('w') as output:
                 self._process = subprocess.Popen(
-                    [*within, sys.executable, '-m', f'cliploc_ros.{module}', *arguments],
+                    [sys.executable, '-m', f'cliploc_ros.{module}', *arguments],
                     stdout=output, stderr=subprocess.STDOUT, cwd=PROJECT,
                     env=os.environ | environment)
         else:
@@ -89,10 +89,6 @@ class Process:
 
     def output(self):
         return self.log.read_text()
-
-    def sees(self, path):
-        """Return the path outside the process's mounts."""
-        return self._proc(f'root{path}')
 
     def wait_for_output(self, text):
         wait_for(lambda: text in self.output() or not self.alive,
@@ -113,11 +109,6 @@ class Process:
     def threads(self):
         """Return the number of threads."""
         return len(list(self._proc('task').iterdir()))
-
-    def cpu_s(self):
-        """Return the processor time used so far [s]."""
-        fields = self._proc('stat').read_text().rsplit(')', 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
     def send(self, number):
         """Send a signal."""

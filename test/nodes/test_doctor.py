@@ -20,8 +20,8 @@ from tester import class_matching, make_frame
 
 from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.ros.clients import check_name
 from cliploc_ros.ros.qos import LATCHED
-from cliploc_ros.ros.running import check_name
 
 LINE = re.compile('^(.{12}) (pass|fail|not checked|refused) +(.*)$', re.MULTILINE)
 WHOLE = {'parameters': 'valid', 'map': '12 landmarks', 'camera': 'it publishes image, ',
@@ -118,41 +118,40 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
     assert not tester.initial_poses and not tester.poses
 
 
-@pytest.mark.parametrize(('what', 'text', 'broken', 'parameters', 'follows'), [
-    ('parameters', 'k: -3 ', {}, {'k': -3}, ''),
-    ('map', '/nowhere.yaml: ', {}, {'map_file': '/nowhere.yaml'}, ''),
-    ('keyframes', 'build_map', {}, {'keyframes_file': '/nowhere.npz'}, ''),
-    ('camera', ' /image ', {'change': without(0)}, {}, ''),
-    ('camera', 'no camera_info on', {'change': without(1)}, {}, ''),
-    ('camera', ' /detections', {'change': without(2)}, {}, ''),
-    ('input', 'K: ', {'change': uncalibrated}, {}, 'pose'),
-    ('input', "'left'", {'change': of_another_frame}, {}, ''),
-    ('clock', 'synchronize', {'late_s': 100.0}, {}, 'input'),  # odometry is newer
-    ('clock', ' /clock', {}, {'use_sim_time': True}, ''),
-    ('tf' if find_spec('tf2_ros') else 'start', 'base_from_camera', {},
-     {'base_from_camera': [0.0] * 7}, 'pose'),
-    ('odometry', '1.00 m/s', {'speed_m_s': 1.0}, {}, ''),
-    ('input', 'no message on /imu', {}, {'gravity': 'imu'}, ''),
-    ('input', 'zebra', {'change': of_another_detector}, {}, ''),
-    ('input', 'depth_tolerance_s', {}, {'depth_transport': 'raw'}, ''),
-    ('localizer', ' /nowhere: ', {}, {'localizer_pose': 'nowhere'}, ''),
-    ('pose', 'raise timeout_s', {'detection_s': 0.5}, {'timeout_s': 0.1}, '')])
-def test_what_is_broken_fails_with_what_to_do(examine, robot, what, text, broken, parameters,
-                                              follows):
+@pytest.mark.parametrize(('fails', 'broken', 'parameters'), [
+    ({'parameters': 'k: -3 '}, {}, {'k': -3}),
+    ({'map': '/nowhere.yaml: ', 'camera': 'no camera_info on'}, {'change': without(1)},
+     {'map_file': '/nowhere.yaml'}),
+    ({'keyframes': 'build_map', 'camera': ' /image ', 'localizer': ' /nowhere: '},
+     {'change': without(0)}, {'keyframes_file': '/nowhere.npz', 'localizer_pose': 'nowhere'}),
+    ({'camera': ' /detections', 'clock': ' /clock'}, {'change': without(2)},
+     {'use_sim_time': True}),
+    ({'input': 'K: ', 'odometry': '1.00 m/s', 'pose': ''},
+     {'change': uncalibrated, 'speed_m_s': 1.0}, {}),
+    ({'input': "'left'"}, {'change': of_another_frame}, {}),
+    ({'clock': 'synchronize', 'input': ''}, {'late_s': 100.0}, {}),  # odometry is newer
+    ({'tf' if find_spec('tf2_ros') else 'start': 'base_from_camera', 'pose': ''}, {},
+     {'base_from_camera': [0.0] * 7}),
+    ({'input': 'zebra.*no message on /imu'}, {'change': of_another_detector},
+     {'gravity': 'imu', 'timeout_s': 2.0}),
+    ({'input': 'depth_tolerance_s'}, {}, {'depth_transport': 'raw'}),
+    ({'pose': 'raise timeout_s'}, {'detection_s': 0.5}, {'timeout_s': 0.1})])
+def test_what_is_broken_fails_with_what_to_do(examine, robot, fails, broken, parameters):
     for name, value in broken.items():
         setattr(robot, name, value)
     found, code = examine(**parameters)
     assert code == 1
-    assert found[what][0] == 'fail' and text in found[what][1]
-    assert {one for one, (state, _) in found.items() if state == 'fail'} <= {what, follows}
+    failed = {what: text for what, (state, text) in found.items() if state == 'fail'}
+    assert failed.keys() <= fails.keys()
+    for what, text in fails.items():
+        assert re.search(text, failed.get(what, '' if text else 'follows'))
 
 
 def test_a_prior_decides_for_the_doctor_as_for_the_relocalizer(examine, tester, tmp_path):
     """Of two rooms that look alike."""
     write_map(TWINS, tmp_path / 'twins.yaml')
     save_layer(layer_path(tmp_path / 'twins.yaml'), make_layer(TWINS))
-    parameters = {'map_file': str(tmp_path / 'twins.yaml'), 'timeout_s': 5.0, **SEARCH}
-    assert examine(**parameters)[0]['pose'][0] == 'refused'
+    parameters = {'map_file': str(tmp_path / 'twins.yaml'), 'timeout_s': 3.0, **SEARCH}
     publisher = tester.create_publisher(PoseWithCovarianceStamped, 'relocalizer/prior', LATCHED)
     publisher.publish(at(0.0))
     assert 'accepted' in examine(**parameters)[0]['pose'][1]

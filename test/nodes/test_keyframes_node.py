@@ -39,6 +39,11 @@ def room_map(tmp_path):
     return path
 
 
+def bare_layer():
+    return build_layer(frames_of('mapping').select(LIKE_QUERY), LandmarkMap.empty('map'),
+                       LayerOptions(0.0, 0.0, 300))
+
+
 def query_frame(stamp_s=100.0):
     """Return image 2 of the walk with its pose and messages."""
     seen = next(one for number, one in enumerate(frames_of('sequence').read()) if number == QUERY)
@@ -69,8 +74,6 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     again = ['--bag', str(case), '--map', str(room_map)]
     assert evaluate(again) == 0
     assert 'again:    accepted' in capsys.readouterr().out
-    assert evaluate([*again, '--no-keyframes']) == 1
-    assert 'another verdict' in capsys.readouterr().out
     tester.wait(lambda: tester.poses, 'a pose')
     assert pose_error(transform_of(tester.poses[0].pose.pose), seen.map_from_camera)[0] < 0.05
     # boxes that the object search accepts, in an image of another place
@@ -81,18 +84,31 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     assert health['keyframes'] == '8'
     assert health['keyframes file'] == str(layer_path(room_map))
     assert health['keyframes hash'] == layer_hash(layer_path(room_map))
+    layer_path(room_map).rename(tmp_path / 'other.npz')  # and the layer of a named file
+    for name, has_keyframes in (('auto', False), (str(tmp_path / 'other.npz'), True), ('', False)):
+        assert tester.set_parameter('keyframes_file', name).successful
+        assert tester.trigger('reload_map').success
+        assert ('keyframes' in diagnostics_of(tester)) == has_keyframes
     layer_path(room_map).write_bytes(b'no layer')
+    assert tester.set_parameter('keyframes_file', 'auto').successful
     assert tester.trigger('reload_map').success
     process.wait_for_output('without keyframes')
+    assert '[ERROR]' in next(line for line in process.output().splitlines()
+                             if 'without keyframes' in line), 'also of Python loggers'
     assert not tester.relocalize((image, info, detections)).success
     assert 'keyframes' not in diagnostics_of(tester)
+    write_bare_map(tmp_path / 'bare.yaml', bare_layer())  # landmarks may come and go
+    for path, frame in ((tmp_path / 'bare.yaml', (image, info, detections)),
+                        (room_map, make_frame())):
+        assert tester.set_parameter('map_file', str(path)).successful
+        assert tester.trigger('reload_map').success
+        assert tester.relocalize(frame).success
 
 
 def test_a_map_of_keyframes_alone(start, tester, room_map, tmp_path, capsys):
-    """It is a valid map with default options and without CLIP; landmarks may come and go."""
+    """It is a valid map with default options and without CLIP."""
     bare = tmp_path / 'bare.yaml'
-    write_bare_map(bare, build_layer(frames_of('mapping').select(LIKE_QUERY),
-                                     LandmarkMap.empty('map'), LayerOptions(0.0, 0.0, 300)))
+    write_bare_map(bare, bare_layer())
     process = start('nodes.relocalizer', parameters={'map_file': bare,
                                                      'record_folder': tmp_path / 'cases'})
     process.wait_for_output('ready after')
@@ -107,20 +123,11 @@ def test_a_map_of_keyframes_alone(start, tester, room_map, tmp_path, capsys):
     refusal = tester.relocalize(make_frame()).message
     assert 'the map has only keyframes, and none matches' in refusal
     assert 'detector' not in process.output()
-    process.stop()
     for methods, problem in ((['all'], "'class_bf' uses landmarks only"),
                              (['auto', '--no-keyframes'], 'has no landmarks')):
         assert evaluate(['--tum', str(ASSETS / 'sequence'), '--map', str(bare),
                          '--methods', *methods]) == 1
         assert problem in capsys.readouterr().err
-
-    process = start('nodes.relocalizer', parameters=class_matching(room_map))
-    process.wait_for_output('ready after')
-    tester.connect()
-    for path, its in ((bare, frame), (room_map, make_frame()), (bare, frame)):
-        assert tester.set_parameter('map_file', str(path)).successful
-        assert tester.trigger('reload_map').success
-        assert tester.relocalize(its).success
 
 
 def diagnostics_of(tester):

@@ -13,7 +13,6 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from processes import PROJECT
 from tester import class_matching, make_frame
 
-ASSETS = PROJECT / 'demo/assets'
 IDS = {'configure': Transition.TRANSITION_CONFIGURE, 'activate': Transition.TRANSITION_ACTIVATE,
        'deactivate': Transition.TRANSITION_DEACTIVATE, 'cleanup': Transition.TRANSITION_CLEANUP}
 SHUTDOWN_IDS = {'unconfigured': Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
@@ -63,9 +62,9 @@ def manage(start, tester):
     """Start a node that waits for its manager; return node and manager."""
     managers = []
 
-    def run(name, fresh=False, environment=(), **parameters):
-        process = start(f'nodes.{name}', fresh=fresh,
-                        parameters={'autostart': 'false', **parameters}, **dict(environment))
+    def run(name, environment=(), **parameters):
+        process = start(f'nodes.{name}', parameters={'autostart': 'false', **parameters},
+                        **dict(environment))
         managers.append(Manager(tester, name))
         return process, managers[-1]
     yield run
@@ -73,20 +72,12 @@ def manage(start, tester):
         manager.close()
 
 
-def with_networks(name, folder):
-    """Parameters that make a node load its real, small networks."""
-    if name == 'detector':
-        return {'model': ASSETS / 'yolo.onnx'}
-    return {'map_file': ASSETS / 'map.yaml', 'clip_pretrained': ASSETS / 'clip',
-            'cache_dir': folder}
-
-
 @pytest.mark.full
 @pytest.mark.parametrize('state', [*WAY_TO, 'finalized'])
 @pytest.mark.parametrize('name', ['detector', 'relocalizer'])
 def test_sigterm_ends_a_node_in_every_state(manage, room_map, name, state):
-    parameters = class_matching(room_map) if name == 'relocalizer' else with_networks(name, '')
-    process, manager = manage(name, **parameters)
+    process, manager = manage(name, **(class_matching(room_map) if name == 'relocalizer' else
+                                       {'model': PROJECT / 'demo/assets/yolo.onnx'}))
     if state == 'finalized':
         assert manager.change(SHUTDOWN_IDS['unconfigured'])
     else:
@@ -98,40 +89,28 @@ def test_sigterm_ends_a_node_in_every_state(manage, room_map, name, state):
     assert 'Traceback' not in process.output()
 
 
-def test_a_label_of_a_megabyte_is_refused_in_a_short_line(manage, room_map):
-    process, manager = manage('relocalizer', **class_matching(room_map))
-    assert not manager.change(IDS['configure'], 'x' * 1_000_000)
-    assert manager.change(IDS['configure'], 'configure') and manager.state == 'inactive'
-    assert process.stop()[0] == 0
-    assert max(map(len, process.output().splitlines())) < 2000
-
-
 def test_only_an_active_relocalizer_localizes(manage, tester, room_map):
-    _, manager = manage('relocalizer', **class_matching(room_map, mode='continuous'))
+    """A label of a megabyte is refused; deactivation answers the request that waits."""
+    process, manager = manage('relocalizer', **class_matching(room_map))
     tester.connect()
     assert not tester.answer(tester.ask()).success
-    manager.do('configure')
+    assert not manager.change(IDS['configure'], 'x' * 1_000_000)
+    assert manager.change(IDS['configure'], 'configure') and manager.state == 'inactive'
     assert not tester.answer(tester.ask()).success
     assert tester.listened_to() == 0
     manager.do('activate')
     assert tester.relocalize(make_frame()).success
-    manager.do('deactivate')
-    tester.answer(tester.ask_reinitialize())
-    assert not tester.answer(tester.ask()).success
-    assert tester.listened_to() == 0
-
-
-def test_deactivation_answers_the_request_that_waits(manage, tester, room_map):
-    _, manager = manage('relocalizer', **class_matching(room_map))
-    tester.connect()
-    manager.do('configure', 'activate')
+    tester.wait(lambda: tester.listened_to() == 0, 'the end of the subscriptions')
     future = tester.ask()
     tester.wait(lambda: tester.listened_to() == 3, 'the relocalizer to subscribe')
     manager.do('deactivate')
     answer = tester.answer(future)
-    assert not answer.success
-    assert answer.message.startswith('the node was ')
+    assert not answer.success and answer.message.startswith('the node was ')
     tester.wait(lambda: tester.listened_to() == 0, 'the subscriptions to end')
+    tester.answer(tester.ask_reinitialize())
+    assert not tester.answer(tester.ask()).success
+    assert process.stop()[0] == 0
+    assert max(map(len, process.output().splitlines())) < 2000
 
 
 def test_the_manager_hears_by_a_bond_whether_a_node_lives(manage, tester, room_map):

@@ -13,7 +13,12 @@ from processes import PROJECT
 from scene import MAP_FROM_CAMERA, make_room, see_room
 from tester import make_frame, transform_of
 
-from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    move_covariance,
+    pose_error,
+    transform_from_pose,
+)
 from cliploc_ros.ros.qos import LATCHED
 
 
@@ -74,6 +79,24 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     tester.wait(lambda: heard[-1].status == refused.status, 'the same answer on the topic')
     assert int(refused.id) == int(fields['answer']) > 1
     tester.destroy_subscription(subscription)
+
+
+def test_the_mount_moves_the_pose_and_its_covariance(relocalizer, tester):
+    assert tester.relocalize(make_frame()).success
+    mount = [0.1, 0.0, 1.0, 0.0, 0.6, 0.0, 0.8]
+    assert tester.set_parameter('base_from_camera', mount).successful
+    assert tester.set_parameter('base_frame', 'base_link').successful
+    assert tester.relocalize(make_frame()).success
+    tester.wait(lambda: len(tester.poses) == 2, 'the poses of camera and base')
+    camera, base = (transform_of(pose.pose.pose) for pose in tester.poses)
+    camera_from_base = invert_transform(
+        transform_from_pose(np.array(mount[:3]), np.array(mount[3:])))
+    assert pose_error(base, MAP_FROM_CAMERA @ camera_from_base) < (0.08, 1.0)
+    of_camera, of_base = (np.array(pose.pose.covariance).reshape(6, 6) for pose in tester.poses)
+    moved = move_covariance(of_camera, base[:3, 3] - camera[:3, 3])
+    assert np.abs(moved - of_camera).max() > 1e-6
+    np.testing.assert_allclose(of_base, moved, rtol=1e-6, atol=1e-12)
+    assert tester.set_parameter('base_frame', '').successful
 
 
 def test_frames_out_of_order_and_time_going_back(relocalizer, tester):

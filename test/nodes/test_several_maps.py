@@ -21,23 +21,29 @@ def other_room():
 
 @pytest.fixture
 def floors(tmp_path):
-    """Write maps; return their files as a command-line parameter."""
-    def write(*maps):
-        files = [tmp_path / f'{number}.yaml' for number in range(len(maps))]
-        for number, (one, file) in enumerate(zip(maps, files, strict=True)):
-            write_map(replace(one, frame_id=f'floor_{number}'), file)
-        return list(map(str, files))
-    return write
+    """Write the maps of two floors; return their files."""
+    files = [tmp_path / f'{number}.yaml' for number in range(2)]
+    for number, (one, file) in enumerate(zip((ROOM, other_room()), files, strict=True)):
+        write_map(replace(one, frame_id=f'floor_{number}'), file)
+    return list(map(str, files))
 
 
-def listed(files):
-    return f'[{", ".join(files)}]'
+def test_maps_change_while_the_node_runs_and_each_floor_has_its_own_frame(relocalizer, tester,
+                                                                          floors, room_map):
+    """A bad list changes nothing; one map is replaced, and restored."""
+    first, second = floors
+    there = make_frame(see_room(other_room()))
 
-
-def test_each_floor_answers_in_its_own_coordinate_frame(own_relocalizer, tester, floors):
-    files = floors(ROOM, other_room())
-    process = own_relocalizer(map_file="''", map_files=listed(files),
-                              expect="24 landmarks in 2 maps, frames 'floor_0', 'floor_1'")
+    def reloaded(**parameters):
+        """Set parameters; return whether the maps could be reloaded."""
+        assert all(tester.set_parameter(*parameter).successful for parameter in parameters.items())
+        return tester.trigger('reload_map').success
+    assert not tester.relocalize(there).success
+    assert not reloaded(map_files=[first, second]), 'map_file is set, too'
+    assert reloaded(map_file='')
+    assert "24 landmarks in 2 maps, frames 'floor_0', 'floor_1'" in relocalizer.output()
+    for bad in ([first, first], [first, '/nowhere.yaml']):
+        assert not reloaded(map_files=bad)
     for number, room in enumerate((ROOM, other_room())):
         tester.forget()
         answer = tester.relocalize(make_frame(see_room(room), stamp_s=100.0 + number))
@@ -46,70 +52,46 @@ def test_each_floor_answers_in_its_own_coordinate_frame(own_relocalizer, tester,
         tester.wait(lambda: tester.poses, 'a pose')
         assert tester.poses[-1].header.frame_id == f'floor_{number}'
         assert tester.poses[-1].pose.pose.position.x == pytest.approx(0.3, abs=0.05)
-    assert process.stop()[0] == 0
+    assert reloaded(map_files=[''], map_file=str(room_map))
+    assert not tester.relocalize(there).success
 
 
-def test_maps_change_while_the_node_runs(own_relocalizer, tester, floors):
-    """A bad list changes nothing; one map is replaced, and restored."""
-    first, second = floors(ROOM, other_room())
-    own_relocalizer(map_file=first)
-    frame = make_frame(see_room(other_room()))
-
-    def reloaded(**parameters):
-        """Set parameters; return whether the maps could be reloaded."""
-        assert all(tester.set_parameter(*parameter).successful for parameter in parameters.items())
-        return tester.trigger('reload_map').success
-    assert not tester.relocalize(frame).success
-    assert not reloaded(map_files=[first, second])
-    assert reloaded(map_file='')
-    assert ' in floor_1, ' in tester.relocalize(frame).message
-    for bad in ([first, first], [first, '/nowhere.yaml']):
-        assert not reloaded(map_files=bad)
-    assert ' in floor_1, ' in tester.relocalize(frame).message
-    assert reloaded(map_files=[''], map_file=first)
-    assert not tester.relocalize(frame).success
+@pytest.fixture
+def load(tester):
+    """Load a map as Nav2's map server does; return the result."""
+    srv = importlib.import_module('nav2_msgs.srv')
+    return lambda url: tester.call(srv.LoadMap, 'relocalizer/load_map',
+                                   srv.LoadMap.Request(map_url=url)).result
 
 
 @pytest.mark.needs('nav2_msgs')
-def test_a_map_is_loaded_as_nav2_loads_its_own(own_relocalizer, tester, floors, tmp_path):
-    srv = importlib.import_module('nav2_msgs.srv')
-    first, second = floors(ROOM, other_room())
-    own_relocalizer(map_file="''", map_files=listed([first, second]))
-
-    def load(url):
-        return tester.call(srv.LoadMap, '/relocalizer/load_map',
-                           srv.LoadMap.Request(map_url=url)).result
+def test_a_map_is_loaded_as_nav2_loads_its_own(relocalizer, tester, floors, load, tmp_path):
+    results = importlib.import_module('nav2_msgs.srv').LoadMap.Response
+    assert tester.set_parameter('map_file', floors[1]).successful
+    assert tester.trigger('reload_map').success
     for url in ('/nowhere.yaml', 'package://nowhere/map.yaml'):
-        assert load(url) == srv.LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+        assert load(url) == results.RESULT_MAP_DOES_NOT_EXIST
     (tmp_path / 'broken.yaml').write_text('no map')
-    assert load(str(tmp_path / 'broken.yaml')) == srv.LoadMap.Response.RESULT_INVALID_MAP_DATA
+    assert load(str(tmp_path / 'broken.yaml')) == results.RESULT_INVALID_MAP_DATA
     assert tester.relocalize(make_frame(see_room(other_room()))).success
-    assert load(f'file://{first}') == srv.LoadMap.Response.RESULT_SUCCESS
+    assert load(f'file://{floors[0]}') == results.RESULT_SUCCESS
     assert tester.relocalize(make_frame()).success
     assert not tester.relocalize(make_frame(see_room(other_room()))).success
 
 
 @pytest.mark.full
 @pytest.mark.needs('nav2_msgs')
-def test_no_url_keeps_the_relocalizer_from_answering(own_relocalizer, tester, floors, tmp_path):
+def test_no_url_keeps_the_relocalizer_from_answering(relocalizer, tester, floors, load, tmp_path):
     """Pipes, devices, sparse files, floods, and impossible names."""
-    srv = importlib.import_module('nav2_msgs.srv')
-    first, _ = floors(ROOM, other_room())
-    process = own_relocalizer(map_file=first)
-
-    def load(url):
-        return tester.call(srv.LoadMap, '/relocalizer/load_map',
-                           srv.LoadMap.Request(map_url=url)).result
     os.mkfifo(tmp_path / 'pipe')
     with (tmp_path / 'holes').open('wb') as file:
         file.truncate(3 * 2**30)
     (tmp_path / 'flood').write_text(f'a: [{"[]," * 1_600_000}1]')
-    for name in ('pipe', 'holes', 'flood', '', 'x' * 300, 'x' * 1_000_000):
-        assert load(str(tmp_path / name)) != srv.LoadMap.Response.RESULT_SUCCESS
-    for url in ('/dev/zero', '/dev/stdin', 'package://', 'package://nowhere/map.yaml',
-                f'package://{"x" * 300}/map.yaml'):
-        assert load(url) != srv.LoadMap.Response.RESULT_SUCCESS
-    assert load(first) == srv.LoadMap.Response.RESULT_SUCCESS
+    for url in (*(str(tmp_path / name) for name in (
+            'pipe', 'holes', 'flood', '', 'x' * 300, 'x' * 1_000_000)), '/dev/zero', '/dev/stdin',
+            'package://', 'package://nowhere/map.yaml', f'package://{"x" * 300}/map.yaml'):
+        assert load(url) != 0, url[:80]
+    assert load(floors[0]) == 0
     assert tester.relocalize(make_frame()).success
-    assert process.memory_mib('VmHWM') < 1000
-    assert max(map(len, process.output().splitlines())) < 2000
+    assert relocalizer.memory_mib('VmHWM') < 1000
+    assert max(map(len, relocalizer.output().splitlines())) < 2000

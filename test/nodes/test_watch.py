@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from processes import wait_for
 from scene import make_room, write_map
 from std_msgs.msg import Bool, Header, String
-from tester import transform_of
+from tester import class_matching, transform_of
 from watched import MOUNT, Robot, stamp
 
 from cliploc_ros.core.geometry.transforms import pose_error
@@ -23,8 +23,9 @@ PERIOD_S = 1.0
 class Watched:
     """The published output of a watch, while its robot drives."""
 
-    def __init__(self, tester, robot, process):
-        self.tester, self.robot, self.process = tester, robot, process
+    def __init__(self, tester, process):
+        self.tester, self.robot, self.process = tester, Robot(tester), process
+        self._begin = len(process.output())
         #: One report of each look.
         self.states, self.flags, self.values, self.message = [], [], {}, ''
         self._heard = [
@@ -34,13 +35,20 @@ class Watched:
                                        lambda msg: self.flags.append(msg.data), LATCHED),
             tester.create_subscription(DiagnosticArray, '/diagnostics', self._take, 10)]
 
+    def output(self):
+        """Return the relocalizer's output since the start of the test."""
+        return self.process.output()[self._begin:]
+
     def _take(self, msg):
         self.message = msg.status[0].message
         self.values = {value.key: value.value for value in msg.status[0].values}
 
     def close(self):
+        self.robot.close()
         for subscription in self._heard:
             self.tester.destroy_subscription(subscription)
+        print(self.output())
+        assert self.process.alive and 'Traceback' not in self.output()
 
     def until(self, condition, what):
         try:
@@ -77,30 +85,35 @@ class Watched:
         assert 'lost' not in self.states[before:]
 
 
-@pytest.fixture
-def watch(own_relocalizer, tester):
-    """Start a relocalizer with a watch, and a robot in its room."""
-    made = []
+def parameters(room_map, **others):
+    return class_matching(room_map, base_frame='base_link', base_from_camera=MOUNT,
+                          watch_period_s=PERIOD_S, **others)
 
-    def run(**parameters):
-        tester.localizer.is_on = False
-        process = own_relocalizer(base_frame='base_link', base_from_camera=MOUNT,
-                                  **{'watch': 'amcl_pose', 'watch_period_s': PERIOD_S,
-                                     **parameters})
-        made.append(Watched(tester, Robot(tester), process))
-        return made[-1]
-    yield run
-    for watched in made:
-        watched.close()
-        watched.robot.close()
-        print(watched.process.output())
-        assert watched.process.alive and 'Traceback' not in watched.process.output()
+
+@pytest.fixture(scope='module')
+def watching(start_shared, tester, room_map):
+    """Return a relocalizer that watches a localizer by its topic."""
+    tester.localizer.is_on = False
+    process = start_shared('nodes.relocalizer', parameters=parameters(room_map, watch='amcl_pose'))
+    process.wait_for_output('ready after')
+    tester.connect()
+    yield process
     tester.localizer.is_on = True
 
 
+@pytest.fixture
+def watched(watching, tester):
+    """A robot in the room, whose localizer is watched from now on."""
+    watched = Watched(tester, watching)
+    assert tester.set_parameter('on_lost', 'report').successful
+    assert tester.trigger('reload_map').success  # drops the verdict of the test before
+    tester.wait(lambda: watched.states and watched.states[-1] == 'uncertain', 'the end')
+    yield watched
+    watched.close()
+
+
 @pytest.mark.full
-def test_a_right_localizer_stays_localized_and_a_kidnapped_robot_is_only_reported(watch):
-    watched = watch()
+def test_a_kidnapped_robot_is_reported_and_on_demand_relocalized_once_it_stands(watched, tester):
     watched.until_state('localized')
     assert set(watched.looks(10)) == {'localized'}
     assert watched.flags[-1] is True
@@ -109,78 +122,68 @@ def test_a_right_localizer_stays_localized_and_a_kidnapped_robot_is_only_reporte
     assert 'expected' in watched.values['watch matched']
     watched.kidnap()
     assert watched.flags[-1] is False
-    watched.robot.speed_m_s = 0.0
-    watched.until(lambda: watched.values.get('on lost') == 'the robot is at rest', 'rest')
-    watched.looks(3)
-    assert not watched.tester.initial_poses
-    assert 'watch: lost' in watched.message
-
-
-@pytest.mark.full
-def test_a_lost_robot_is_relocalized_once_it_stands(watch):
-    watched = watch(on_lost='relocalize')
-    watched.until_state('localized')
-    watched.robot.carry(3.0)
-    watched.until_state('lost')
+    assert tester.set_parameter('on_lost', 'relocalize').successful
     watched.looks(3)
     assert watched.values['on lost'].startswith(
         ('the robot moves', 'the robot has just')), 'nothing is done'
-    assert 'relocalizing' not in watched.process.output()
-    assert not watched.tester.poses and not watched.tester.initial_poses
+    assert tester.set_parameter('on_lost', 'report').successful
     watched.robot.speed_m_s = 0.0
-    watched.until(lambda: watched.tester.poses, 'a request')
-    error_m, error_deg = pose_error(transform_of(watched.tester.poses[-1].pose.pose),
+    watched.until(lambda: watched.values.get('on lost') == 'the robot is at rest', 'rest')
+    watched.looks(3)
+    assert 'watch: lost' in watched.message and 'relocalizing' not in watched.output()
+    assert not tester.poses and not tester.initial_poses
+    assert tester.set_parameter('on_lost', 'relocalize').successful
+    watched.until(lambda: tester.poses, 'a request')
+    error_m, error_deg = pose_error(transform_of(tester.poses[-1].pose.pose),
                                     watched.robot.map_from_base)
     assert error_m < 0.05 and error_deg < 1.0
     watched.until_state('localized')
     watched.robot.speed_m_s = 0.2
     assert set(watched.looks(5)) == {'localized'}
-    assert 'relocalizing' in watched.process.output()
-    assert watched.process.output().count('relocalizing') == 1
+    assert watched.output().count('relocalizing') == 1
 
 
-def test_a_localizer_that_started_again_without_a_pose_is_woken_up(watch, tester):
+def test_a_localizer_that_started_again_without_a_pose_is_woken_up(watched, tester):
     """As AMCL with use_respawn: it advertises and subscribes again, and waits for a pose."""
-    watched = watch(on_lost='relocalize')
+    assert tester.set_parameter('on_lost', 'relocalize').successful
     watched.until_state('localized')
     watched.robot.speed_m_s, watched.robot.has_localizer = 0.0, False
     watched.looks(1)  # the start takes time; the previous pose is still received
     tester.localizer.start_again()
     watched.until(lambda: tester.poses, 'a request')
     watched.until_state('localized')
-    assert 'the localizer has no pose' in watched.process.output()
+    assert 'the localizer has no pose' in watched.output()
 
 
-def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watch, tester, tmp_path):
+def test_a_map_of_another_frame_ends_the_verdict_of_the_one_before(watched, tester, room_map,
+                                                                   tmp_path):
     """No image arrives meanwhile: the verdict is dropped with its map, not at the next look."""
-    watched = watch()
     watched.until_state('localized')
     write_map(replace(make_room(), frame_id='elsewhere'), tmp_path / 'elsewhere.yaml')
-    assert tester.set_parameter('map_file', str(tmp_path / 'elsewhere.yaml'))
+    assert tester.set_parameter('map_file', str(tmp_path / 'elsewhere.yaml')).successful
     assert tester.trigger('reload_map').success
     tester.wait(lambda: 'a map was loaded' in watched.values['watch reason'], 'the end')
     assert watched.states[-1] == 'uncertain'
     watched.until_reason("the localizer's pose is in frame 'map'")
-    assert 'internal error' not in watched.process.output()
+    assert 'internal error' not in watched.output()
+    assert tester.set_parameter('map_file', str(room_map)).successful
 
 
-def test_a_dead_localizer_is_logged_once_however_long_it_is_dead(watch):
+def test_a_dead_localizer_is_logged_once_however_long_it_is_dead(watched):
     """Its age in the message grows with each look."""
-    watched = watch()
     watched.until_state('localized')
     watched.robot.has_localizer = watched.robot.has_odom = False
     watched.until_reason('s older than the image')
-    watched.looks(4)
-    assert watched.process.output().count('s older than the image') == 1
+    watched.looks(2)
+    assert watched.output().count('s older than the image') == 1
     watched.robot.has_localizer = watched.robot.has_odom = True
     watched.until_state('localized')
-    assert watched.process.output().count('watch: localized') == 2, 'changes are logged'
+    assert watched.output().count('watch: localized') == 2, 'changes are logged'
 
 
 @pytest.mark.full
-def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
+def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watched, start):
     """The robot continues to drive, and nothing is done until it stands."""
-    watched = watch()
     watched.robot.speed_m_s = 0.0
     process = start('cli.wake_up', '--watch', '--turn-deg', 0)
     watched.until(lambda: 'look 1 ' in process.output(), 'a look')
@@ -197,7 +200,7 @@ def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watch, start):
 
 
 @pytest.mark.needs('tf2_ros')
-def test_a_localizer_by_tf_is_right_kidnapped_and_silent(watch, tester):
+def test_a_localizer_by_tf_is_right_kidnapped_and_silent(watching, start, tester, room_map):
     from tf2_msgs.msg import TFMessage
     publisher = tester.create_publisher(TFMessage, '/tf', 100)
 
@@ -206,10 +209,15 @@ def test_a_localizer_by_tf_is_right_kidnapped_and_silent(watch, tester):
             transform_msg(Header(frame_id=parent, stamp=stamp(now_s)), child, pose)
             for parent, child, pose in (('map', 'odom', map_from_odom),
                                         ('odom', 'base_link', odom_from_base))]))
-    watched = watch(watch='tf')
+    watching.stop()
+    process = start('nodes.relocalizer', parameters=parameters(room_map, watch='tf'))
+    process.wait_for_output('ready after')
+    tester.connect()
+    watched = Watched(tester, process)
     watched.robot.on_tick, watched.robot.has_localizer = send, False
     watched.until_state('localized')
     watched.kidnap()
     watched.robot.on_tick = lambda *_: None
     watched.until_reason("no transform from 'base_link' to 'map'")
+    watched.close()
     tester.destroy_publisher(publisher)

@@ -11,18 +11,15 @@ from tester import class_matching, make_frame
 from cliploc_ros.ros.conversions import from_yolo_msg
 
 
-def as_yolo(msg, array=Fields, detection=Fields):
+def as_yolo(msg):
     """Return detections with the fields of a yolo_msgs/DetectionArray."""
     made = []
     for given in msg.detections:
         guess, box = given.results[0].hypothesis, given.bbox
-        made.append(detection(class_id=0, class_name=guess.class_id, score=guess.score, id=''))
-        made[-1].bbox = made[-1].bbox if hasattr(made[-1], 'bbox') else Fields(
-            center=Fields(position=Fields(), theta=0.0), size=Fields())
-        made[-1].bbox.center.position.x = box.center.position.x
-        made[-1].bbox.center.position.y = box.center.position.y
-        made[-1].bbox.size.x, made[-1].bbox.size.y = box.size_x, box.size_y
-    return array(header=msg.header, detections=made)
+        made.append(Fields(class_id=0, class_name=guess.class_id, score=guess.score, id='',
+                           bbox=Fields(center=Fields(position=box.center.position, theta=0.0),
+                                       size=Fields(x=box.size_x, y=box.size_y))))
+    return Fields(header=msg.header, detections=made)
 
 
 def test_all_that_counts_is_kept():

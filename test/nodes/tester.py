@@ -32,16 +32,15 @@ RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 class TakingLocalizer:
     """Publishes each initial pose at once as its estimate, while it is switched on."""
 
-    def __init__(self, node, namespace=''):
-        self.is_on, self.frame = True, None
-        self._node, self._namespace = node, namespace
+    def __init__(self, node):
+        self.is_on, self._node = True, node
         self._start()
 
     def _start(self):
         self._publisher = self._node.create_publisher(
-            PoseWithCovarianceStamped, f'{self._namespace}amcl_pose', LATCHED)
+            PoseWithCovarianceStamped, 'amcl_pose', LATCHED)
         self._subscription = self._node.create_subscription(
-            PoseWithCovarianceStamped, f'{self._namespace}initialpose', self._show, RELIABLE)
+            PoseWithCovarianceStamped, 'initialpose', self._show, RELIABLE)
 
     def start_again(self):
         """Forget the pose, like a process that was killed and restarted."""
@@ -50,7 +49,6 @@ class TakingLocalizer:
         self._start()
 
     def _show(self, pose):
-        pose.header.frame_id = self.frame or pose.header.frame_id
         if self.is_on:
             self._publisher.publish(pose)
 
@@ -58,8 +56,8 @@ class TakingLocalizer:
 class Tester(Node):
     """Publishes frames, requests poses, and collects the relocalizer's messages."""
 
-    def __init__(self):
-        super().__init__('tester')
+    def __init__(self, namespace=''):
+        super().__init__('tester', namespace=namespace)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self.images = self.create_publisher(Image, 'image', RELIABLE)
@@ -97,7 +95,7 @@ class Tester(Node):
 
     def connect(self):
         """Wait until exactly one relocalizer publishes and its services are ready."""
-        self.wait(lambda: len(self.get_publishers_info_by_topic('/relocalizer/pose')) == 1,
+        self.wait(lambda: len(self.get_publishers_info_by_topic('relocalizer/pose')) == 1,
                   'one relocalizer')
         self.wait(self._relocalize.service_is_ready, 'the service relocalize')
         self.wait(self._reinitialize.service_is_ready, 'the service reinitialize')
@@ -112,13 +110,13 @@ class Tester(Node):
 
     def trigger(self, name):
         """Call a service of the relocalizer that takes no arguments; return its answer."""
-        return self.call(Trigger, f'/relocalizer/{name}', Trigger.Request())
+        return self.call(Trigger, f'relocalizer/{name}', Trigger.Request())
 
     def set_parameter(self, name, value):
         """Set a parameter of the relocalizer; return rclpy's result."""
         request = SetParameters.Request(
             parameters=[Parameter(name, value=value).to_parameter_msg()])
-        return self.call(SetParameters, '/relocalizer/set_parameters', request).results[0]
+        return self.call(SetParameters, 'relocalizer/set_parameters', request).results[0]
 
     @contextmanager
     def hearing_detections(self):

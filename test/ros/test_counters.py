@@ -2,16 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counts of refusals by kind, an answer that is withheld, and the hash of a map."""
 
-import hashlib
 
-import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from scene import make_room, write_map
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
-from cliploc_ros.errors import MapError
 from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict, answer_msg
-from cliploc_ros.ros.frame_localizer import load_map
 
 
 def test_counts_add_up():
@@ -33,16 +28,3 @@ def test_a_withheld_answer_states_no_pose():
     status, = answer_msg(withheld, '/relocalizer').status
     assert status.message == 'withheld: the robot moves (accepted: here; map ab); map ab'
     assert withheld.pose is None and 'x [m]' not in {value.key for value in status.values}
-
-
-def test_the_hash_of_a_file_is_that_of_sha256sum(tmp_path):
-    path = tmp_path / 'map.yaml'
-    write_map(make_room(), path)
-    loaded, digest = load_map(None, [str(path)])
-    assert len(loaded) == 12
-    assert hashlib.sha256(path.read_bytes()).hexdigest().startswith(digest)
-    assert len(digest) == 12
-    path.write_text(path.read_text() + '# another one\n')
-    assert load_map(None, [str(path)])[1] != digest
-    with pytest.raises(MapError, match='No such file'):
-        load_map(None, [str(tmp_path / 'none.yaml')])

@@ -41,7 +41,11 @@ def pixels_of(canvas, color):
 def test_boxes_and_outlines_are_where_they_were_seen(room, found):
     seen = grey_image(room)
     canvas = draw_debug_image(seen, found, room, '')
+    shown = draw_debug_image(seen, found, room, 'accepted: ' + ' '.join(99 * ['words']))
     assert (seen.image_rgb == 128).all(), 'the image itself is unchanged'
+    height, width = canvas.shape[:2]
+    assert (shown[:height] == canvas).all(), 'the verdict covers none of the image'
+    assert height < len(shown) < 1.1 * height and shown.shape[1] == width
     box = seen.observation.detections.bboxes_xyxy[0]
     middle = (box[:2] + box[2:]) / 2
     outline = pixels_of(canvas, ELLIPSE)
@@ -96,12 +100,3 @@ def test_the_best_keyframe_is_beside_the_image(room, found):
     assert np.abs(shown[20, width + 20].astype(int) - (200, 30, 30)).max() < 12
     dot_here, dot_there = shown[140, 290], shown[240, width + 290]
     assert (dot_here == dot_there).all() and np.ptp(dot_here.astype(int)) > 200, 'equal colours'
-
-
-def test_the_verdict_is_on_a_bar_that_covers_none_of_the_image(room, found):
-    seen = grey_image(room)
-    alone = draw_debug_image(seen, found, room, '')
-    shown = draw_debug_image(seen, found, room, 'accepted: ' + ' '.join(99 * ['words']))
-    height, width = alone.shape[:2]
-    assert (shown[:height] == alone).all()
-    assert height < len(shown) < 1.1 * height and shown.shape[1] == width

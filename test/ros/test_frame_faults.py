@@ -17,7 +17,7 @@ from cliploc_ros.messages import (
     faults_of_headers,
     faults_of_rectified,
 )
-from cliploc_ros.ros.inputs.instants import faults_of_axes
+from cliploc_ros.ros.frame_localizer import faults_of_axes
 
 SIZE = (CAMERA.width, CAMERA.height)
 K = [500.0, 0.0, 320.0, 0.0, 500.0, 240.0, 0.0, 0.0, 1.0]
@@ -29,14 +29,14 @@ RIGHT = {'p': [400.0, 0.0, 310.0, -48.0, *P[4:]]}
 TURNED = Rotation.from_euler('y', 12.0, degrees=True).as_matrix().ravel()
 
 
-def judged(changes, rectified=False, size=SIZE):
+def judged(changes, rectified=False):
     """Return 'refused', 'doubted' or 'sound', and the reason."""
     fields = {'width': SIZE[0], 'height': SIZE[1], 'distortion_model': 'plumb_bob',
               'd': [0.0] * 5, 'k': K, 'p': P, 'r': np.eye(3).ravel()} | changes
     msg = CameraInfo(**{name: value if isinstance(value, (int, str, RegionOfInterest)) else [
         *map(float, value)] for name, value in fields.items()})
     try:
-        faults = faults_of_camera_info(msg, camera_from_msg(msg, size, rectified), rectified)
+        faults = faults_of_camera_info(msg, camera_from_msg(msg, SIZE, rectified), rectified)
     except CameraError as error:
         return 'refused', str(error)
     text = '; '.join(fault.text for fault in faults)
@@ -49,50 +49,42 @@ def with_element(name, matrix, place, value):
 
 @pytest.mark.parametrize(('changes', 'verdict', 'names'), [
     *((with_element('k', K, place, value), verdict, 'K') for place, value, verdict in (
-        (0, 0.0, 'refused'), (0, -500.0, 'refused'), (0, 1400.0, 'refused'),
-        (0, 1000.0, 'refused'), (0, 250.0, 'refused'), (1, 20.0, 'refused'), (2, 640.0, 'refused'),
-        (2, 0.0, 'refused'), (3, 5.0, 'refused'), (4, 0.0, 'refused'), (4, 250.0, 'refused'),
-        (5, 480.0, 'refused'), (6, 320.0, 'refused'), (7, 240.0, 'refused'), (8, 0.0, 'refused'),
-        *((place, float('nan'), 'refused') for place in range(9)))),
+        (0, 0.0, 'refused'), (0, -500.0, 'refused'), (0, 1000.0, 'refused'), (1, 20.0, 'refused'),
+        (2, 640.0, 'refused'), (3, 5.0, 'refused'), (4, 250.0, 'refused'), (5, 480.0, 'refused'),
+        (6, 320.0, 'refused'), (7, 240.0, 'refused'), (8, 0.0, 'refused'),
+        (5, float('nan'), 'refused'))),
     *((with_element('p', P, place, value), 'doubted', 'P') for place, value in (
         (0, 550.0), (1, 20.0), (2, 640.0), (3, -60.0), (4, 5.0), (5, 450.0), (6, 480.0),
-        (7, -60.0), (8, 1.0), (9, 1.0), (10, 0.0), (11, 1.0), (0, -500.0),
-        *((place, float('nan')) for place in range(12)))),
-    *((with_element('p', P, place, value), 'refused', 'P') for place, value in (
-        (0, 1000.0), (5, 250.0))),
+        (7, -60.0), (8, 1.0), (9, 1.0), (10, 0.0), (11, 1.0), (0, -500.0), (6, float('nan')))),
+    (with_element('p', P, 5, 250.0), 'refused', 'P'),
     ({'k': np.reshape(K, (3, 3)).T.ravel()}, 'refused', 'transposed'),
     # without P, unusual pixel shapes are possible
     (with_element('k', K, 0, 1000.0) | {'p': [0.0] * 12}, 'doubted', 'K'),
-    (with_element('k', K, 2, 424.0) | {'p': [0.0] * 12}, 'doubted', 'K'),
     (with_element('k', K, 2, 424.0), 'refused', 'P'),
     *(({'k': [focal, 0.0, 320.0, 0.0, focal, 240.0, 0.0, 0.0, 1.0]}, verdict, 'P')
       for focal, verdict in ((1000.0, 'refused'), (390.0, 'refused'), (550.0, 'doubted'))),
     ({'k': [505.0, 0.0, 320.0, 0.0, 505.0, 240.0, 0.0, 0.0, 1.0]}, 'sound', ''),
     ({'p': [250.0, 0.0, 160.0, 0.0, 0.0, 250.0, 120.0, *P[7:]]}, 'doubted', 'P'),
-    ({'k': np.multiply(K, 2.0)}, 'refused', 'K'),
     ({'k': [1000.0, 0.0, 640.0, 0.0, 1000.0, 480.0, 0.0, 0.0, 1.0]}, 'refused', '1280x960'),
     ({'k': [250.0, 0.0, 160.0, 0.0, 250.0, 120.0, 0.0, 0.0, 1.0]}, 'refused', '320x240'),
     # without a size only the principal point can be checked
     ({'width': 0, 'height': 0, 'k': [1000.0, 0.0, 640.0, 0.0, 1000.0, 480.0, 0.0, 0.0, 1.0]},
      'refused', '1280x960'),
-    ({'width': 1280, 'height': 960}, 'refused', '1280x960'), ({'width': 480}, 'refused', '480x'),
-    ({'height': 640}, 'refused', '640x640'), ({'binning_x': 2}, 'refused', 'binning 2x1'),
-    ({'binning_y': 2}, 'refused', 'binning 1x2'),
+    ({'width': 480}, 'refused', '480x'), ({'height': 640}, 'refused', '640x640'),
+    ({'binning_x': 2}, 'refused', 'binning 2x1'), ({'binning_y': 2}, 'refused', 'binning 1x2'),
     ({'roi': RegionOfInterest(width=320, height=240)}, 'refused', 'roi 320x240'),
     ({'roi': RegionOfInterest(x_offset=100)}, 'refused', 'roi 0x0 at'),
     ({'r': TURNED}, 'doubted', '12 degrees'), ({'r': 2.0 * np.eye(3).ravel()}, 'doubted', 'R'),
     ({'r': np.diag([1.0, 1.0, -1.0]).ravel()}, 'doubted', 'R'),
     ({'r': [float('nan')] * 9}, 'doubted', 'R'),
     *(({'distortion_model': name, 'd': d}, 'refused', name) for name in (
-        'fisheye', 'kannala_brandt', 'thin_prism', 'double_sphere', 'mystery')
-        for d in ([0.0] * 4, [], [0.1] * 4)),
+        'fisheye', 'mystery') for d in ([0.0] * 4, [])),
     ({'distortion_model': ''}, 'sound', ''),
     ({'distortion_model': '', 'd': [0.1]}, 'refused', "''"),
     ({'d': [0.1] * 3}, 'refused', '4 or 5'), ({'d': [0.1] * 6}, 'refused', '4 or 5'),
     *(({'distortion_model': 'rational_polynomial', 'd': [0.1] * count}, 'refused', str(count))
-      for count in (4, 5, 7, 13)),
-    *((FISHEYE | {'d': [value] * count}, 'refused', str(count)) for value in (0.0, 0.01)
-      for count in (0, 1, 3, 5)),
+      for count in (7, 13)),
+    *((FISHEYE | {'d': [0.0] * count}, 'refused', str(count)) for count in (0, 3, 5)),
     ({'d': [float('nan')] * 5}, 'refused', 'not finite'),
     ({'d': [-6.0, 0.0, 0.0, 0.0]}, 'refused', 'fold'),
     (BARREL | {'p': [900.0, *P[1:]]}, 'doubted', 'resolution')])
@@ -102,46 +94,42 @@ def test_each_field_of_camera_info(changes, verdict, names):
     assert names in reason
 
 
-@pytest.mark.parametrize(('changes', 'rectified', 'verdict'), [
-    (RIGHT | {'r': TURNED} | {'d': BARREL['d']}, True, 'doubted'),  # may be in the left's frame
-    (with_element('p', P, 0, 0.0), True, 'refused'),
-    (with_element('p', P, 1, 9.0), True, 'refused'),
-    (with_element('p', P, 5, 1400.0), True, 'refused'), ({'p': [0.0] * 12}, True, 'refused'),
-    (with_element('p', P, 2, 640.0), True, 'refused'),
-    (with_element('p', P, 10, 0.0), True, 'refused')])
-def test_rectified_images_are_judged_by_p(changes, rectified, verdict):
-    assert judged(changes, rectified)[0] == verdict
+@pytest.mark.parametrize(('changes', 'verdict'), [
+    (RIGHT | {'r': TURNED} | {'d': BARREL['d']}, 'doubted'),  # may be in the left's frame
+    (with_element('p', P, 1, 9.0), 'refused'), ({'p': [0.0] * 12}, 'refused'),
+    (with_element('p', P, 5, 1400.0), 'refused'), (with_element('p', P, 2, 640.0), 'refused'),
+    (with_element('p', P, 10, 0.0), 'refused')])
+def test_rectified_images_are_judged_by_p(changes, verdict):
+    assert judged(changes, rectified=True)[0] == verdict
 
 
-@pytest.mark.parametrize(('changes', 'size', 'rectified'), [
-    ({}, SIZE, False), ({}, SIZE, True), ({'d': []}, SIZE, False),
-    ({'p': [0.0] * 12}, SIZE, False),
-    ({'r': [0.0] * 9}, SIZE, False), (BARREL, SIZE, False), (BARREL, SIZE, True),
-    (BARREL | {'r': TURNED}, SIZE, True), ({'k': [0.0] * 9, 'd': [0.5] * 5}, SIZE, True),
-    ({'d': [0.0] * 8}, SIZE, False), ({'distortion_model': 'rational_polynomial'}, SIZE, False),
-    (FISHEYE, SIZE, False), (FISHEYE | {'k': [240.0, 0.0, *K[2:4], 240.0, *K[5:]]}, SIZE, False),
+@pytest.mark.parametrize(('changes', 'rectified'), [
+    ({}, False), ({}, True), ({'d': []}, False), ({'p': [0.0] * 12}, False),
+    ({'r': [0.0] * 9}, False), (BARREL, False), (BARREL | {'r': TURNED}, True),
+    ({'k': [0.0] * 9, 'd': [0.5] * 5}, True), ({'d': [0.0] * 8}, False),
+    ({'distortion_model': 'rational_polynomial'}, False), (FISHEYE, False),
+    (FISHEYE | {'k': [240.0, 0.0, *K[2:4], 240.0, *K[5:]]}, False),
     # a crop of the sensor's corner, and 2 x 2 binning
     ({'width': 1920, 'height': 1200, 'k': [1400.0, 0.0, 960.0, 0.0, 1400.0, 600.0, 0.0, 0.0, 1.0],
       'p': [0.0] * 12, 'roi': RegionOfInterest(x_offset=1280, y_offset=720, width=640,
-                                               height=480)}, SIZE, False),
+                                               height=480)}, False),
     ({'width': 1280, 'height': 960, 'k': [1000.0, 0.0, 640.0, 0.0, 1000.0, 480.0, 0.0, 0.0, 1.0],
-      'p': [0.0] * 12, 'binning_x': 2, 'binning_y': 2}, SIZE, False),
-    ({'width': 0, 'height': 0}, SIZE, False),
-    ({'k': [500.0, 0.0, 320.0, 0.0, 515.0, 264.0, 0.0, 0.0, 1.0], 'p': [0.0] * 12}, SIZE, False)])
-def test_valid_odd_messages_are_sound(changes, size, rectified):
-    assert judged(changes, rectified, size) == ('sound', '')
+      'p': [0.0] * 12, 'binning_x': 2, 'binning_y': 2}, False),
+    ({'width': 0, 'height': 0}, False),
+    ({'k': [500.0, 0.0, 320.0, 0.0, 515.0, 264.0, 0.0, 0.0, 1.0], 'p': [0.0] * 12}, False)])
+def test_valid_odd_messages_are_sound(changes, rectified):
+    assert judged(changes, rectified) == ('sound', '')
 
 
 @pytest.mark.parametrize(('frames', 'certain'), [
-    (('camera', 'camera', 'camera'), []), (('/camera', 'camera', 'camera/'), []),
-    (('camera', '', ''), []), (('left', 'left', 'right'), [True]),
-    (('left', 'right', ''), [False]),
+    (('/camera', 'camera', 'camera/'), []), (('camera', '', ''), []),
+    (('left', 'left', 'right'), [True]), (('left', 'right', ''), [False]),
     (('left', 'right', 'right'), [True, False])])
 def test_messages_of_another_coordinate_frame(frames, certain):
     assert [fault.is_certain for fault in faults_of_headers(*frames)] == certain
 
 
-@pytest.mark.parametrize('tilt_deg', [-40.0, -20.0, 0.0, 30.0])
+@pytest.mark.parametrize('tilt_deg', [-40.0, 30.0])
 def test_a_body_frame_in_place_of_an_optical_one(tilt_deg):
     """The camera's pose on a robot shows whether it looks at the ceiling."""
     base_from_body = make_transform(
@@ -155,14 +143,12 @@ def test_a_body_frame_in_place_of_an_optical_one(tilt_deg):
 
 
 @pytest.mark.parametrize(('topic', 'rectified', 'changes', 'certain'), [
-    ('/camera/image_rect', False, BARREL, [True]),
+    ('/camera/image_rect', False, RIGHT, [True]), ('/camera/image_rect', False, FISHEYE, [True]),
     ('/camera/image_rect_color/compressed', False, BARREL, [True]),
     ('/camera/image_rect', False, {}, []),  # no rectification needed
-    ('/camera/image_rect', False, RIGHT, [True]), ('/camera/image_rect', False, FISHEYE, [True]),
     ('/rect/image', False, BARREL, [False]), ('/camera/image_rect', True, BARREL, []),
     ('/camera/image_raw', False, BARREL, []), ('/infra1/image_rect_raw', False, {}, []),
-    ('/camera/image_raw', True, BARREL, [False]), ('/camera/image_raw', True, {}, []),
-    ('/camera/image_raw/compressed', True, BARREL, [False]),
+    ('/camera/image_raw/compressed', True, BARREL, [False]), ('/camera/image_raw', True, {}, []),
     ('/camera/image', True, BARREL, [])])
 def test_images_that_sound_rectified_or_raw(topic, rectified, changes, certain):
     fields = {'distortion_model': 'plumb_bob', 'd': [0.0] * 5, 'k': K, 'p': P} | changes

@@ -8,7 +8,6 @@ from scene import make_room
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.errors import MapError
 from cliploc_ros.ros.frame_localizer import load_map
 
 
@@ -40,11 +39,3 @@ def test_parameters_and_file_give_the_same_map(start_with, tmp_path):
         row = loaded.landmark_ids.index(room.landmark_ids[3])
         assert loaded.weighted_labels[row] == ((room.labels[3], 0.75), *details.labels)
         assert loaded.classes.sizes_of(loaded.classes.classes_of(['cell phone'])) == len(room)
-
-
-def test_a_value_beside_its_own_fields_is_named(make_node):
-    node = make_node()
-    node.declare_parameter('map.frame_id', 'map')
-    node.declare_parameter('map.frame_id.name', 'map')
-    with pytest.raises(MapError, match="'frame_id' has both"):
-        load_map(node, [])

@@ -3,7 +3,6 @@
 """map -> odom, and transforms before and after a jump; mostly with the real tf2_ros."""
 
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,14 +11,13 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
-from cliploc_ros.errors import OptionsError
 from cliploc_ros.ros.handoff import MapToOdom, transform_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
-PARAMETERS = RelocalizerParameters(publish_tf=True, base_frame='base_link', tf_timeout_s=5.0)
+PARAMETERS = RelocalizerParameters(base_frame='base_link', tf_timeout_s=5.0)
 QUARTER_LEFT = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
 MAP_FROM_BASE = transform_from_pose(np.array([5.0, 5.0, 0.0]), np.array(QUARTER_LEFT))
 
@@ -31,12 +29,6 @@ def moving(seconds, x_m, parent='odom', child='base_link'):
     """Return a transform of a robot that is x_m ahead and turned to the left."""
     return transform_msg(Header(frame_id=parent, stamp=stamp(seconds)), child,
                          transform_from_pose(np.array([x_m, 0.0, 0.0]), np.array(QUARTER_LEFT)))
-
-
-def test_a_robot_is_needed():
-    PARAMETERS.check()
-    with pytest.raises(OptionsError, match='publish_tf'):
-        replace(PARAMETERS, base_frame='').check()
 
 
 class Robot:
@@ -91,22 +83,9 @@ def robot(make_node, spin_until):
 
 
 @pytest.mark.needs('tf2_ros')
-def test_odom_is_tied_to_the_map(robot):
-    robot.map_to_odom.open()
-    robot.tell(100.0, 1.0)
-    robot.map_to_odom.update(Header(frame_id='map', stamp=STAMP), MAP_FROM_BASE,
-                             PARAMETERS, time.monotonic())
-    robot.spin_until(lambda: robot.heard, 'map -> odom')
-    t = robot.heard[0].transform.translation
-    # the same heading in both, so odom is a metre behind along its x axis
-    np.testing.assert_allclose([t.x, t.y, t.z], [4.0, 5.0, 0.0], atol=1e-9)
-    assert robot.heard[0].child_frame_id == 'odom'
-
-
-@pytest.mark.needs('tf2_ros')
 @pytest.mark.parametrize(('restart_s', 'x_m'), [
     (100.0, None),  # the clock jumps
-    (100.5, -100.0), (103.0, 2.5), (2.0, 1.0)])  # odometry restarts, and no clock jumps
+    (103.0, 2.5), (2.0, 1.0)])  # odometry restarts, and no clock jumps
 def test_a_jump_or_a_restart_ends_the_broadcast_until_the_next_pose(robot, restart_s, x_m):
     """Its origin is reset, at once or during a silence, or a bag loops."""
     robot.map_to_odom.open()
@@ -117,6 +96,10 @@ def test_a_jump_or_a_restart_ends_the_broadcast_until_the_next_pose(robot, resta
     header = Header(frame_id='map', stamp=STAMP)
     robot.map_to_odom.update(header, MAP_FROM_BASE, PARAMETERS, received_at)
     robot.spin_until(lambda: robot.heard, 'map -> odom')
+    t = robot.heard[0].transform.translation
+    # the same heading in both, so odom is a metre behind along its x axis
+    np.testing.assert_allclose([t.x, t.y, t.z], [4.0, 5.0, 0.0], atol=1e-9)
+    assert robot.heard[0].child_frame_id == 'odom'
     if x_m is None:
         robot.map_to_odom.forget()
     else:
@@ -139,8 +122,7 @@ def test_a_jump_or_a_restart_ends_the_broadcast_until_the_next_pose(robot, resta
 
 
 @pytest.mark.needs('tf2_ros')
-@pytest.mark.parametrize('restart_s', [95.0, 2.0])
-def test_transforms_from_before_a_jump_are_forgotten(robot, restart_s):
+def test_transforms_from_before_a_jump_are_forgotten(robot):
     robot.static_broadcaster.sendTransform(moving(0.0, 7.0, child='shelf'))
     robot.spin_until(lambda: robot.place(0.0, 'shelf') == 7.0, 'the static transform')
     for seconds, x_m in ((99.0, 1.0), (100.0, 2.0)):
@@ -150,7 +132,7 @@ def test_transforms_from_before_a_jump_are_forgotten(robot, restart_s):
     assert robot.place(0.0, 'shelf') == 7.0, 'the transform is not repeated'
     # a late message from before
     robot.tell(100.02, 3.0)
-    for seconds, x_m in ((restart_s, 11.0), (restart_s + 1.0, 12.0)):
+    for seconds, x_m in ((95.0, 11.0), (96.0, 12.0)):
         robot.tell(seconds, x_m)
-    assert robot.place(restart_s + 0.5) == pytest.approx(11.5)
-    assert robot.place(restart_s + 2.0) is None, 'no interpolation across the jump'
+    assert robot.place(95.5) == pytest.approx(11.5)
+    assert robot.place(97.0) is None, 'no interpolation across the jump'

@@ -69,10 +69,7 @@ def test_values_are_taken_and_changed_whole_numbers_too(declare):
 
 
 @pytest.mark.parametrize(('values', 'reason'), [
-    ({'low': 101}, '0 to 100'),
-    ({'ratio': '.nan'}, 'ratio: nan'),
-    ({'mode': 'willd'}, "mean 'wild'?"),
-    ({'span': '[1.0]'}, 'span: '), ({'low': 6}, 'low: above high')])
+    ({'low': 101}, '0 to 100'), ({'low': 6}, 'low: above high')])
 def test_an_invalid_start_is_reported_until_it_is_corrected(declare, values, reason):
     _, parameters = declare(given(**values))
     for _ in range(2):
@@ -90,9 +87,7 @@ def test_mistyped_names_are_warned_of_with_the_nearest(declare, capfd):
 
 
 @pytest.mark.parametrize(('values', 'reason'), [
-    ({'low': -1}, 'low out of range'), ({'low': 2, 'high': 1}, 'low: above high'),
-    ({'span': [1.0]}, 'span: '),
-    ({'ratio': 'half'}, 'type'), ({'mode': 'wild'}, 'read-only'),
+    ({'span': [1.0]}, 'span: '), ({'mode': 'wild'}, 'read-only'),
     ({'use_sim_time': False, 'high': 0}, 'low: above high')])
 def test_a_refused_change_changes_nothing(declare, values, reason):
     node, parameters = declare()

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Quaternion
 from handing_over import stamp
 from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
@@ -56,12 +57,6 @@ def place(robot, seconds, **values):
     return robot.at(image, replace(PARAMETERS, **values)).place
 
 
-def test_the_camera_is_where_its_mount_has_it(robot, source):
-    talk(source, 9.9, 10.0, 10.1)
-    np.testing.assert_allclose(place(robot, 10.05).odom_from_frame,
-                               odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
-
-
 def test_a_body_that_nobody_places_links_nothing(robot, source, capfd):
     talk(source, 10.0, child_frame='wheels')
     assert place(robot, 10.0) is None
@@ -72,8 +67,8 @@ def test_an_image_waits_for_the_message_after_it(robot, source):
     talk(source, 10.0)
     late = threading.Timer(0.05, talk, (source, 10.1))
     late.start()
-    np.testing.assert_allclose(place(robot, 10.05).odom_from_frame,
-                               odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
+    np.testing.assert_allclose(place(robot, 10.03).odom_from_frame,
+                               odom_from_base(10.03) @ BASE_FROM_CAMERA, atol=1e-9)
     late.join()
 
 
@@ -88,7 +83,7 @@ def test_places_in_two_odometry_frames_do_not_compare(robot, source, frames):
 
 
 @pytest.mark.parametrize(('moments_s', 'moved'), [
-    ((10.1, 10.2), {'x': -100.0}),  # at once
+    ((10.1, 10.2), {'x': -100.0}),
     ((13.0, 13.1), {'y': 0.6})])  # 1.4 m away and turned, after a silence
 def test_an_origin_that_is_reset_is_a_restart_and_reported_once(robot, source, moments_s, moved):
     stamps_ns = []
@@ -109,31 +104,25 @@ def test_odometry_that_goes_on_is_no_restart_and_invalid_messages_change_nothing
     source.on_restart(restarts.append)
     talk(source, 9.9, 10.1, 10.0)  # one of them late
     run = place(robot, 9.95).run
-    for broken in (message(10.05), message(10.15)):
-        broken.pose.pose.position.x = broken.pose.pose.orientation.w = float('nan')
+    for number, (x_m, w) in enumerate(((np.nan, 1.0), (1e300, 1.0), (1.0, 2.0), (1.0, np.nan))):
+        broken = message(10.04 + 0.01 * number)
+        broken.pose.pose.position.x, broken.pose.pose.orientation = x_m, Quaternion(w=w)
         source.take(broken)
     talk(source, 10.2)
-    np.testing.assert_allclose(place(robot, 10.05).odom_from_frame,
-                               odom_from_base(10.05) @ BASE_FROM_CAMERA, atol=1e-9)
-    assert place(robot, 10.05).run == run
-    assert source.recent(1.0, 1.0).header.stamp == stamp(10.2)
+    np.testing.assert_allclose(place(robot, 10.03).odom_from_frame,
+                               odom_from_base(10.03) @ BASE_FROM_CAMERA, atol=1e-9)
+    assert place(robot, 10.03).run == run
+    talk(source, 13.0)
+    for moment in (9.0, 11.0, 13.5):  # before, in a gap, after
+        assert place(robot, moment) is None
+    assert source.recent(1.0, 1.0).header.stamp == stamp(13.0)
     source.forget()
     talk(source, 2.0)
     assert not restarts, 'a jump of the clock is reported by TimeJumps'
 
 
 @pytest.mark.parametrize('moments', [
-    np.arange(9.5, 10.05, 0.05), [9.6, 10.0], [9.4, 10.0], [9.0, 10.0], [9.7, 9.8, 10.8],
-    [7.0, 10.0]])
+    np.arange(9.5, 10.05, 0.05), [9.6, 10.0], [9.0, 10.0], [9.7, 9.8, 10.8], [7.0, 10.0]])
 def test_poses_give_the_mean_speed_where_the_twist_is_empty(source, moments):
     talk(source, *moments)
     assert source.speeds_by_poses(0.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
-
-
-def test_it_tells_how_far_the_robot_is_from_where_it_was(source):
-    assert source.moved_since(stamp(9.85), 0.0) is None
-    talk(source, *np.arange(9.5, 10.55, 0.1))
-    assert source.moved_since(stamp(9.75), 0.0) == (pytest.approx(0.08), pytest.approx(16.0))
-    assert source.moved_since(stamp(10.5), 0.0) == (0.0, 0.0)
-    assert source.moved_since(stamp(9.4), 0.0) is None
-    assert source.moved_since(stamp(10.6), 0.0) is None

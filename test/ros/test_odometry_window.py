@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometryWindow
+from cliploc_ros.ros.inputs.odometry import OdometryWindow
 
 S = 1_000_000_000
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -25,90 +25,12 @@ def drive(window, seconds, step_s=0.1, speed_m_s=1.0, turn_deg_s=30.0):
                           turned(turn_deg_s * moment))
 
 
-def heading(pose):
-    return np.degrees(np.arctan2(pose[1, 0], pose[0, 0]))
-
-
-def test_between_two_messages_it_is_in_between():
-    window = OdometryWindow(10.0)
-    drive(window, (5.0, 8.0))
-    for moment in (5.0, 6.0, 6.05, 7.123, 7.9):
-        pose = window.pose_at(round(moment * S))
-        np.testing.assert_allclose(pose[:3, 3], [moment, 0, 0], atol=1e-6)
-        assert np.cos(np.radians(heading(pose) - 30.0 * moment)) == pytest.approx(1.0, abs=1e-12)
-        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
-
-
-@pytest.mark.parametrize('speed_m_s', [1.0, 0.0])  # reset 51 m away, or detected by its heading
-def test_odometry_that_was_reset_joins_nothing_across_it(speed_m_s):
-    window = OdometryWindow(10.0)
-    drive(window, (50.0, 51.05), speed_m_s=speed_m_s)
-    run = window.run
-    window.add(round(51.02 * S), np.zeros(3), UPRIGHT)
-    assert len(window) == 1 and window.run == run + 1
-    drive(window, (51.1, 51.3), speed_m_s=0.01)
-    with pytest.raises(NoOdometryError, match='newer'):
-        window.pose_at(round(50.5 * S))
-
-
-def test_late_messages_find_their_place():
-    window, ordered = OdometryWindow(10.0), OdometryWindow(10.0)
-    drive(ordered, (0.0, 2.0))
-    moments = np.arange(0.0, 2.0, 0.1).reshape(4, 5)[:, [2, 0, 4, 3, 1]].ravel()
-    for moment in [*moments, moments[-1]]:  # and one twice
-        window.add(round(moment * S), np.array([moment, 0.0, 0.0]), turned(30.0 * moment))
-    assert len(window) == len(ordered) == 20
-    for moment in (0.05, 0.95, 1.85):
-        np.testing.assert_allclose(window.pose_at(round(moment * S)),
-                                   ordered.pose_at(round(moment * S)), atol=1e-12)
-
-
 def test_memory_is_bounded():
-    window = OdometryWindow(2.0)
+    window, crowded = OdometryWindow(2.0), OdometryWindow(1000.0, max_poses=50)
     drive(window, (0.0, 60.0))
-    assert len(window) == 21
-    crowded = OdometryWindow(1000.0, max_poses=50)
     drive(crowded, (0.0, 60.0))
-    assert len(crowded) == 50
+    assert (len(window), len(crowded)) == (21, 50)
     crowded.pose_at(round(59.85 * S))
-    with pytest.raises(NoOdometryError):
-        crowded.pose_at(round(40.0 * S))
-
-
-@pytest.mark.parametrize(('moment', 'named'), [
-    (4.0, '1.000 s newer'), (8.5, '0.600 s older'),
-    (6.5, 'has a gap of 1.100 s')])
-def test_what_is_not_known_is_said(moment, named):
-    window = OdometryWindow(10.0)
-    drive(window, (5.0, 6.0))
-    drive(window, (7.0, 8.0))
-    with pytest.raises(NoOdometryError, match=named):
-        window.pose_at(round(moment * S))
-    window.clear()
-    with pytest.raises(NoOdometryError, match='no odometry yet'):
-        window.pose_at(round(6.0 * S))
-
-
-@pytest.mark.parametrize(('position', 'quat_xyzw'), [
-    ([np.nan, 0.0, 0.0], UPRIGHT), ([0.0, np.inf, 0.0], UPRIGHT),
-    ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]), ([0.0, 0.0, 0.0], [0.0, 0.0, np.nan, 1.0]),
-    ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0]), ([1e300, 0.0, 0.0], UPRIGHT)])
-def test_what_is_no_pose_is_left_out(position, quat_xyzw):
-    window = OdometryWindow(10.0)
-    drive(window, (0.0, 1.0))
-    assert not window.add(S, np.array(position), np.array(quat_xyzw))
-    assert len(window) == 10
-
-
-def test_a_clock_set_back_begins_anew():
-    window = OdometryWindow(5.0)
-    for restart in (98.0, 3.0):  # a bag that restarts, and a simulation
-        drive(window, (100.0, 102.0))
-        drive(window, (restart, restart + 1.0))
-        assert len(window) == 10
-        window.pose_at(round((restart + 0.55) * S))
-        with pytest.raises(NoOdometryError, match='older'):
-            window.pose_at(101 * S)
 
 
 def talk(window, seconds, x_m=0.0, degrees=0.0):
@@ -143,6 +65,13 @@ def test_a_slow_source_that_misses_two_messages_goes_on():
     window = OdometryWindow(30.0)
     for moment in (0.0, 1.0, 2.0, 3.0, 6.0, 7.0, 9.0):
         assert not talk(window, moment, 0.3 * moment)
+
+
+def test_stamps_that_go_back_bit_by_bit_hold_no_run_together():
+    window = OdometryWindow(30.0)
+    for tick in range(60):
+        window.add(round((100.0 - 0.01 * tick) * S), np.array([0.03 * tick, 0.0, 0.0]), UPRIGHT)
+    assert window.run >= 5 and len(window) <= 6
 
 
 def on_an_arc(window, seconds, speed_m_s, aside_m=0.0, degrees=0.0):
@@ -196,24 +125,16 @@ def test_a_robot_that_starts_and_stops_does_not_restart(rate_hz):
 
 
 @pytest.mark.parametrize('rate_hz', [5, 50])
-@pytest.mark.parametrize('back_s', [0.25, 0.8])
-def test_a_clock_set_back_by_less_than_a_second_begins_anew(rate_hz, back_s):
-    """Repeated or nearly repeated stamps with other poses."""
+@pytest.mark.parametrize('back_s', [0.25, 0.8, 98.0])
+def test_a_clock_set_back_begins_another_run(rate_hz, back_s):
+    """Repeated or nearly repeated stamps with other poses, and a simulation that restarts."""
     window, newest = driven(rate_hz, 1.0)
-    for moment in newest + np.arange(1, 2 + round(back_s * rate_hz)) / rate_hz:
+    for moment in newest + np.arange(1, 2 + round(min(back_s, 1.0) * rate_hz)) / rate_hz:
         angle = 0.4 * moment
         place = np.array([2.5 * np.sin(angle), 2.5 * (1.0 - np.cos(angle)), 0.0])
         window.add(round((moment - back_s) * S), place, turned(np.degrees(angle)))
     assert window.run >= 1
     assert window.pose_at(round((moment - back_s) * S))[0, 3] == pytest.approx(place[0])
-
-
-@pytest.mark.parametrize('step_s', [0.0, -0.01])
-def test_stamps_that_do_not_go_on_hold_no_run_together(step_s):
-    window = OdometryWindow(30.0)
-    for tick in range(60):
-        window.add(round((100.0 + step_s * tick) * S), np.array([0.03 * tick, 0.0, 0.0]), UPRIGHT)
-    assert window.run >= 5 and len(window) <= 6
 
 
 def test_one_of_two_poses_of_a_stamp_stays():
@@ -234,6 +155,8 @@ def test_the_way_is_what_was_driven_not_how_far_it_led():
     assert window.way_at(35 * S) == pytest.approx(3.5, abs=0.05)
     window.add(39 * S + S // 20, np.array([0.1, 0.0, 0.0]), UPRIGHT)  # late
     assert window.way_at(39 * S + S // 20) == window.way_at(39 * S)
+    window.add(40 * S, np.zeros(3), UPRIGHT)
+    assert window.way_at(40 * S) == pytest.approx(4.0, abs=0.05)
     window.clear()
     rng = np.random.default_rng(0)  # visual odometry jitters by millimetres
     for tick in range(50 * 50, 110 * 50):

@@ -8,9 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
-from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import Header
+from frames import frame_of, header_of
 
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, repeat
@@ -36,9 +34,7 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.offline.recording.recorder import LoadNetworks, record_every_frame
-from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
-from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -65,11 +61,11 @@ def kitchen(shared_data):
     frames = rgbd_frames(shared_data / 'seven_scenes_kitchen', FolderOptions())
     landmark_map = LandmarkMap.from_file(shared_data / 'tum_fr3_office' / 'map.yaml')
     nothing = Detections(np.empty((0, 4)), (), np.empty(0))
-    return landmark_map, build_layer(frames.select(range(0, 30, 3)), landmark_map, EVERY), [
+    return landmark_map, build_layer(frames.select(range(0, 30, 6)), landmark_map, EVERY), [
         PosedQuery(number, Observation(frame.camera, nothing, np.empty((0, len(landmark_map))),
                                        (1 + number) * 10**9), frame.map_from_camera,
                    image=partial(np.asarray, frame.image_rgb))
-        for number, frame in enumerate(frames.select(range(1, 30, 6)).read())]
+        for number, frame in enumerate(frames.select(range(1, 30, 18)).read())]
 
 
 def rooms(shared_data):
@@ -77,7 +73,7 @@ def rooms(shared_data):
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     walked, asked = (read_folder(ASSETS / name, FolderOptions(layout='tum'))
                      for name in ('mapping', 'sequence'))
-    asked = asked.select(range(0, asked.count, 5))
+    asked = asked.select(range(0, asked.count, 10))
     recorded = record_every_frame(asked, LoadNetworks(
         DetectorOptions(model=str(ASSETS / 'yolo.onnx')), None)())
     return (landmark_map, build_layer(walked.select(range(0, walked.count, 4)), landmark_map,
@@ -119,16 +115,8 @@ def by_node(landmark_map, layer, queries, file):
         layer and Keyframes(KeyframeLocalizer(layer)))
     found = []
     for query in queries:
-        seen, image = query.observation, query.image()
-        header = Header(frame_id='camera', stamp=Time(
-            sec=seen.stamp_ns // 10**9, nanosec=seen.stamp_ns % 10**9))
-        frame = Frame(
-            Image(header=header, width=seen.camera.width, height=seen.camera.height,
-                  encoding='rgb8', step=3 * seen.camera.width, data=image.tobytes()),
-            CameraInfo(header=header, width=seen.camera.width, height=seen.camera.height,
-                       k=seen.camera.matrix.ravel(),
-                       p=np.c_[seen.camera.matrix, np.zeros(3)].ravel()),
-            detections_to_msg(seen.detections, header), 0.0, 0.0)
+        seen = query.observation
+        frame = frame_of(seen.detections, header_of(seen.stamp_ns), query.image(), seen.camera)
         localized = localizer.localize(frame, PARAMETERS, KnownBefore(RobotState(np.eye(4))),
                                        StageTimes('waiting', time.monotonic()),
                                        time.monotonic() + 600.0)
@@ -142,12 +130,13 @@ def by_node(landmark_map, layer, queries, file):
     return found
 
 
-@pytest.mark.parametrize('place', [fr3, kitchen, rooms])
-def test_the_same_question_has_one_answer(place, shared_data, tmp_path):
+@pytest.mark.parametrize(('place', 'scales'), [
+    (fr3, (1.0, 0.5, 1.25)), (kitchen, (1.0, 0.5)), (rooms, (1.0, 0.5))])
+def test_the_same_question_has_one_answer(place, scales, shared_data, tmp_path):
     """Right and wrong focal lengths: evidence about the camera counts everywhere."""
     landmark_map, layer, queries = place(shared_data)
     accepted = []
-    for scale in (1.0, 0.5, 1.25):
+    for scale in scales:
         camera = queries[0].observation.camera
         camera = replace(camera, fx=scale * camera.fx, fy=scale * camera.fy)
         asked = [replace(query, observation=replace(query.observation, camera=camera))

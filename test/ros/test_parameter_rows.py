@@ -25,9 +25,8 @@ TABLES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParam
 
 
 @pytest.mark.parametrize(('row', 'value', 'validated'), [
-    (TEXT, 'b', 'b'), (CHOICE, 'compressed', 'compressed'), (COUNT, 10, 10),
-    (LENGTH, 2.0, 2.0), (LENGTH, 1, 1.0), (SWITCH, True, True), (MOUNT, [1, 2.5], [1.0, 2.5]),
-    (MOUNT, array.array('q', [3, 4]), [3.0, 4.0]), (NAMES, ('a', 'b'), ['a', 'b'])])
+    (LENGTH, 1, 1.0), (MOUNT, array.array('q', [3, 4]), [3.0, 4.0]),
+    (NAMES, ('a', 'b'), ['a', 'b'])])
 def test_good_values_come_back_in_the_parameters_type(row, value, validated):
     result = row.validated(value)
     assert result == validated and type(result) is type(validated)
@@ -36,12 +35,10 @@ def test_good_values_come_back_in_the_parameters_type(row, value, validated):
 
 
 @pytest.mark.parametrize(('row', 'value', 'message'), [
-    (TEXT, 1, 'str, not int'), (CHOICE, 'RAW', 'raw, compressed'),
-    (CHOICE, 'compresed', "mean 'compressed'"), (COUNT, 0, '1 to 10'), (COUNT, 11, '1 to 10'),
-    (COUNT, 3.0, 'int, not float'), (COUNT, True, 'int, not bool'), (LENGTH, 3, '0 to 2'),
-    (LENGTH, math.nan, 'nan'), (SWITCH, 1, 'bool, not int'), (MOUNT, [], '2 finite'),
-    (MOUNT, [1.0], '2 finite'), (MOUNT, [1.0, -math.inf], '2 finite'), (MOUNT, '12', '2 finite'),
-    (NAMES, ['a', 1], 'texts'), (NAMES, 'a', 'texts'), (NAMES, 1, 'texts')])
+    (TEXT, 1, 'str, not int'), (CHOICE, 'compresed', "mean 'compressed'"), (COUNT, 0, '1 to 10'),
+    (COUNT, 11, '1 to 10'), (COUNT, 3.0, 'int, not float'), (COUNT, True, 'int, not bool'),
+    (LENGTH, math.nan, 'nan'), (MOUNT, [1.0], '2 finite'), (MOUNT, [1.0, -math.inf], '2 finite'),
+    (MOUNT, '12', '2 finite'), (NAMES, ['a', 1], 'texts'), (NAMES, 'a', 'texts')])
 def test_a_bad_value_is_refused_by_name_and_with_what_is_allowed(row, value, message):
     with pytest.raises(OptionsError, match=message) as raised:
         row.validated(value)
@@ -86,10 +83,11 @@ def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
 
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'matching': 'class', 'algorithm': 'b-prosac'}, "'b-prosac' needs "),
+    *(({'class_map': text}, 'class_map') for text in ('tv', 'tv=', '=tv', 'a=b, a=c')),
     ({'height_range_m': [2.0, 1.0]}, 'height_range_m'),
     ({'gravity': 'base_frame'}, 'base_frame'),
-    ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera'),
-    ({'base_from_camera': [1.0] + [0.0] * 6}, 'base_from_camera')])
+    ({'publish_tf': True}, 'publish_tf'),
+    ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera')])
 def test_values_that_do_not_fit_together(changes, message):
     with pytest.raises(OptionsError, match=message):
         RelocalizerParameters(**changes).check()
@@ -99,9 +97,3 @@ def test_classes_get_the_maps_names():
     given = RelocalizerParameters(class_map=' tvmonitor=tv , potted plant = plant,')
     assert parse_class_map(given.class_map) == {'tvmonitor': 'tv', 'potted plant': 'plant'}
     assert parse_class_map(RelocalizerParameters().class_map) == {}
-
-
-@pytest.mark.parametrize('text', ['tv', 'tv=', '=tv', 'a=b, a=c'])
-def test_a_class_map_that_is_none_is_refused(text):
-    with pytest.raises(OptionsError, match='class_map'):
-        RelocalizerParameters(class_map=text).check()

@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
-from cliploc_ros.ros.inputs.prior import PriorSource
+from cliploc_ros.ros.inputs.robot_state import PriorSource
 from cliploc_ros.ros.node.threads import Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
@@ -114,10 +114,9 @@ def test_the_last_accepted_pose_holds_at_the_next_start_until_another_is_accepte
     woken.close()
 
 
-@pytest.mark.parametrize('content', ['', '{}', '[' * 100_000, '{"map_from_robot": 1}', None])
+@pytest.mark.parametrize('content', ['', '{}', '[' * 100_000, '{"map_from_robot": 1}'])
 def test_a_file_that_is_none_is_not_used(make_node, tmp_path, content):
-    if content is not None:
-        (tmp_path / 'last.json').write_text(content)
+    (tmp_path / 'last.json').write_text(content)
     node = make_node()
     source = PriorSource(node, CoordinateFrames(node))
     source.open(RelocalizerParameters(last_pose_file=str(tmp_path / 'last.json')))

@@ -45,14 +45,11 @@ def up(source, **changes):
     return source.up_in_camera(parameters(**changes), CAMERA_FROM_BASE, 'camera', AT)
 
 
-def test_a_base_stands_upright(source):
-    np.testing.assert_allclose(up(source, gravity='base_frame'), [0, -1, 0], atol=1e-12)
-
-
 def test_an_accelerometer_at_rest_points_up(source):
     for number in range(10):  # half of them too old to count
         source.take(imu((0.0 if number > 4 else 5.0, 0.0, 9.81), seconds=49.55 + 0.05 * number))
-    np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)
+    for gravity in ('imu', 'base_frame'):
+        np.testing.assert_allclose(up(source, gravity=gravity), [0, -1, 0], atol=1e-12)
 
 
 TILT = Rotation.from_euler('xyz', [5.0, -8.0, 30.0], degrees=True)
@@ -68,8 +65,7 @@ TILTED_UP = CAMERA_FROM_BASE[:3, :3] @ TILT.inv().apply([0, 0, 1])
     ((GRAVITY[0] + 0.5, *GRAVITY[1:]), TILT.as_quat(), 0.0, TILTED_UP),
     # rclcpp, rclpy and every driver that fills only the acceleration send w = 1
     (GRAVITY, (0, 0, 0, 1), 0.0, TILTED_UP),
-    # a simulator without noise: a covariance of zeros or a real one
-    ((0.0, 0.0, 9.81), (0, 0, 0, 1), 0.0, (0, -1, 0)),
+    # a simulator without noise
     ((0.0, 0.0, 9.81), (0, 0, 0, 1), 1e-6, (0, -1, 0))])
 def test_an_orientation_counts_more_than_an_acceleration_but_not_a_default_one(
         source, acceleration, quat_xyzw, covariance, expected):
@@ -81,9 +77,7 @@ def test_an_orientation_counts_more_than_an_acceleration_but_not_a_default_one(
 
 @pytest.mark.parametrize(('quat_xyzw', 'acceleration', 'named'), [
     ((0, 0, 0, 1), GRAVITY, ' 9 degrees'),  # a constant one, with a covariance
-    ((1, 0, 0, 0), (0.0, 0.0, 9.81), '180 degrees'),  # NED in place of ENU
-    ((0, 0, 0, 1), (9.81, 0.0, 0.0), '90 degrees'),  # mounted on its side
-])
+    ((1, 0, 0, 0), (0.0, 0.0, 9.81), '180 degrees')])  # NED in place of ENU
 def test_an_orientation_that_contradicts_gravity_is_refused(source, quat_xyzw, acceleration,
                                                             named):
     msg = imu(acceleration, quat_xyzw)
@@ -103,18 +97,8 @@ def test_a_wrong_orientation_stays_refused_when_the_robot_starts(source):
         up(source)
 
 
-def test_a_message_out_of_order_costs_nothing(source):
-    """Drivers stamp in several threads; a stamp that is more than a second late is a jump."""
-    for seconds in (49.92, 49.93, 49.929, 49.94, 50.05, 50.02):
-        source.take(imu((5.0 if seconds < 50 else -5.0, 0.0, 9.81), seconds=seconds))
-    assert len(source._samples) == 6
-    source.take(imu(seconds=49.0))
-    assert len(source._samples) == 1
-
-
 @pytest.mark.parametrize(('messages', 'named'), [
-    ([], 'no message on /imu'), ([imu(frame_id='')], 'no frame_id'),
-    ([imu((0.0, 0.0, 11.0))], r'11\.00 m/s'),
+    ([imu(frame_id='')], 'no frame_id'), ([imu((0.0, 0.0, 11.0))], r'11\.00 m/s'),
     ([imu((0.0, 0.0, 0.0))], 'neither an'),
     ([imu(quat_xyzw=Rotation.from_euler('y', angle, degrees=True).as_quat(), seconds=seconds,
           acceleration=(0.0, 0.0, 0.0)) for angle, seconds in ((-40, 49.95), (40, 50.05))],
@@ -131,13 +115,13 @@ def test_it_listens_from_open_to_close(source, make_node, spin_until):
     talker = make_node('imu_driver')
     publisher = talker.create_publisher(Imu, 'imu', 10)
     source.open('base_frame')
-    assert source._subscription is None
-    for _ in range(2):  # opening or closing it twice has no effect
+    for _ in range(2):  # opening it twice has no effect
         source.open('imu')
     spin_until([talker, source._node], lambda: len(source._samples),
                'a message', work=lambda: publisher.publish(imu()))
     np.testing.assert_allclose(up(source), [0, -1, 0], atol=1e-12)
     assert publisher.get_subscription_count() == 1
-    for _ in range(2):
-        source.close()
-    assert source._subscription is None and not source._samples
+    source.close()
+    assert not source._samples
+    with pytest.raises(NoVerticalError, match='no message on /imu'):
+        up(source)

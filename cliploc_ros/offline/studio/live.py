@@ -25,9 +25,9 @@ from std_srvs.srv import Trigger
 from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.ros import qos
+from cliploc_ros.ros.clients import RelocalizerStatus, check_name
 from cliploc_ros.ros.conversions import pose_from_msg
 from cliploc_ros.ros.node.diagnostics import split_names
-from cliploc_ros.ros.running import RelocalizerStatus, check_name
 
 # The relocalizer reports once a second, but may be late while it loads libraries. Not measured.
 _SILENCE_S = 10.0

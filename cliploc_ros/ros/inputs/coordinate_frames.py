@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transforms: the camera's mount from parameters or tf2, all others from tf2."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -13,9 +14,8 @@ from rclpy.time import Time as RclTime
 
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.errors import CliplocError
-
-if TYPE_CHECKING:
-    from cliploc_ros.ros.inputs.transform_buffer import TransformBuffer
+from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.inputs.stamps import StampOrder
 
 
 class NoTransformError(CliplocError):
@@ -31,9 +31,9 @@ class CoordinateFrames:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._buffer: TransformBuffer | None = None
+        self._buffer: Any = None
 
-    def open(self) -> 'TransformBuffer':
+    def open(self) -> Any:
         """Subscribe to transforms, so that they are known when the first image arrives.
 
         NoTransformError: tf2_ros is not installed.
@@ -41,11 +41,10 @@ class CoordinateFrames:
         buffer = self._buffer
         if buffer is None:
             try:
-                from cliploc_ros.ros.inputs.transform_buffer import TransformBuffer
+                buffer = self._buffer = _make_buffer(self._node)
             except ImportError as error:
                 raise NoTransformError('a transform is needed, but tf2_ros is not installed: '
                                        'install it, or set base_from_camera') from error
-            buffer = self._buffer = TransformBuffer(self._node)
         return buffer
 
     def close(self) -> None:
@@ -105,3 +104,38 @@ class CoordinateFrames:
                 f'{remedy}') from error
         t, q = found.translation, found.rotation
         return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
+
+
+def _make_buffer(node: Node) -> Any:
+    """Return a buffer of `/tf` and `/tf_static`; ImportError: tf2_ros is not installed."""
+    from tf2_ros import Buffer, TransformListener
+
+    class TransformBuffer(Buffer):
+        """A buffer that is cleared when the stamps of a transform go back.
+
+        tf2 itself refuses transforms that are ten seconds older than the newest one, and
+        interpolates across shorter jumps. Jazzy's Buffer is cleared only if it is given a node,
+        and its first releases raise TypeError then. Transforms from before the jump may also
+        arrive after the clock has jumped. clear() keeps static transforms.
+        """
+
+        def __init__(self) -> None:
+            super().__init__()
+            self._stamps = StampOrder()
+            self._listener = TransformListener(self, node)
+
+        def set_transform(self, transform: TransformStamped, authority: str) -> None:
+            """Add a transform; forget the other transforms if time jumped back."""
+            if self._stamps.goes_back(transform.child_frame_id, stamp_ns(transform.header.stamp)):
+                super().clear()
+            super().set_transform(transform, authority)
+
+        def clear(self) -> None:
+            """Forget all transforms except static ones."""
+            self._stamps.clear()
+            super().clear()
+
+        def close(self) -> None:
+            """Unsubscribe."""
+            self._listener.unregister()
+    return TransformBuffer()

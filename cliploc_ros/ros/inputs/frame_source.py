@@ -98,7 +98,8 @@ class FrameSource:
                  changed: threading.Condition | None = None) -> None:
         self._node, self._camera = node, camera
         self._linger_s, self._on_frame = linger_s, on_frame
-        self._package, self._detections = parameters.detections_type, detection_type('vision_msgs')
+        self._package = parameters.detections_type
+        self._detections_type, self._converted = detection_type('vision_msgs')
         is_raw, depth = parameters.image_transport == 'raw', parameters.depth_transport
         self._image_type = Image if is_raw else CompressedImage
         self._depth_type = Image if depth == 'raw' else CompressedImage
@@ -131,12 +132,8 @@ class FrameSource:
         self._deadlines: list[float] = []
         self._wanted_until = 0.0
         self._rates = Rates()
-        self._closed = 'the node is not active'
-
-    @property
-    def image_topic(self) -> str:
-        """Return the resolved name of the image topic."""
-        return self._resolved('image')
+        #: Why the source is closed; empty while it is open
+        self.closed = 'the node is not active'
 
     def open(self) -> None:
         """Allow calls of `want`.
@@ -144,8 +141,8 @@ class FrameSource:
         OptionsError: the message type of the detections is not installed.
         """
         with self._changed:
-            self._detections = detection_type(self._package)
-            self._closed = ''
+            self._detections_type, self._converted = detection_type(self._package)
+            self.closed = ''
             if self._linger_s == math.inf:
                 self._wanted_until = math.inf
                 self._subscribe()
@@ -153,7 +150,7 @@ class FrameSource:
     def close(self, reason: str) -> None:
         """Unsubscribe. From now on `want` raises StoppedError with this reason."""
         with self._changed:
-            self._closed = reason
+            self.closed = reason
             self._deadlines.clear()
             self._unsubscribe()
             self._changed.notify_all()
@@ -170,8 +167,8 @@ class FrameSource:
 
         The caller holds the condition. StoppedError: the source was closed.
         """
-        if self._closed:
-            raise StoppedError(self._closed)
+        if self.closed:
+            raise StoppedError(self.closed)
         self._deadlines.append(deadline)
         self._subscribe()
 
@@ -180,8 +177,8 @@ class FrameSource:
 
         StoppedError: the source was closed.
         """
-        if self._closed:
-            raise StoppedError(self._closed)
+        if self.closed:
+            raise StoppedError(self.closed)
         if deadline in self._deadlines:  # it is missing if the source was reopened meanwhile
             self._deadlines.remove(deadline)
         linger_s = self._linger_s if linger_s is None else linger_s
@@ -198,11 +195,6 @@ class FrameSource:
                 [self._wanted_until, *self._deadlines]):
             self._unsubscribe()
         return bool(self._subscriptions)
-
-    @property
-    def is_closed(self) -> bool:
-        """Return whether the source is closed."""
-        return bool(self._closed)
 
     def missing(self) -> list[str]:
         """Return a message with the remedy for each input without a publisher."""
@@ -236,7 +228,8 @@ class FrameSource:
 
         The caller holds the condition.
         """
-        return self._pairing.waits_near('image', stamp_ns, tolerance_s * NS_PER_S)
+        return any(abs(waiting_ns - stamp_ns) <= tolerance_s * NS_PER_S
+                   for waiting_ns in self._pairing.waiting('image'))
 
     def _subscribe(self) -> None:
         if len(self._subscriptions) == len(self.topics):
@@ -245,7 +238,7 @@ class FrameSource:
         self._subscribed_at = time.monotonic()
         of_topics = {'image': (self._image_type, qos.IMAGE),
                      'camera_info': (CameraInfo, qos.CAMERA_INFO),
-                     'detections': (self._detections.message_type, qos.DETECTIONS_IN),
+                     'detections': (self._detections_type, qos.DETECTIONS_IN),
                      'depth': (self._depth_type, qos.IMAGE),
                      'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
         for name, topic in self.topics.items():
@@ -274,7 +267,7 @@ class FrameSource:
             if not self._subscriptions:
                 return
             if name == 'detections':
-                msg = self._detections.converted(msg)
+                msg = self._converted(msg)
             self.heard[name] = msg, time.monotonic()
             frame = None
             if name == 'depth':
@@ -323,7 +316,7 @@ class FrameSource:
                      if abs(stamp_ns(depth.header.stamp) - at_ns) <= self._depth_tolerance_ns),
                     key=lambda depth: abs(stamp_ns(depth.header.stamp) - at_ns), default=None),
                 self.heard.get('depth_camera_info', (None, 0.0))[0], self._camera,
-                image_topic=self.image_topic)
+                image_topic=self._resolved('image'))
         frame = self._unsure
         # the next images may have the same stamp; wait until stamps are known to differ
         if frame is None or not (self._stamps['image'].are_own or all(
@@ -352,20 +345,14 @@ class FrameSource:
                 f'{self._resolved(name)} {stamps.problem}: {_STAMPING[name]}'
                 for name, stamps in self._stamps.items() if stamps.problem]
 
-    def unheard(self, since: float) -> dict[str, str]:
-        """Return the inputs without a message since a time (monotonic clock), and why."""
-        return {name: self._silence(name) for name in self.topics
-                if name not in _OF_DEPTH and self._heard_at(name) < since}
-
     def why_none(self, since: float) -> str:
         """Return why no frame was completed since a time (monotonic clock)."""
-        if missing := self.unheard(since):
-            return '; '.join(missing.values())
-        if problems := self._stamp_problems():
+        if problems := [self._silence(name) for name in self.topics if name not in _OF_DEPTH
+                        and self._heard_at(name) < since] or self._stamp_problems():
             return '; '.join(problems)
         if self._unsure is not None:
-            return (f'too few images on {self.image_topic} to check that their stamps differ: '
-                    'raise its rate, or timeout_s')
+            return (f'too few images on {self._resolved("image")} to check that their stamps '
+                    'differ: raise its rate, or timeout_s')
         if self._pairing.outrun:
             return (f'detections arrive {self._pairing.outrun} images late, more than fit in '
                     f'{_MAX_IMAGE_BYTES // 2**20} MiB of memory: use smaller images, '

@@ -148,8 +148,13 @@ class OdometryWindow:
             row = 0
         if row < len(poses) and poses[row].stamp_ns == stamp_ns:
             return True
-        poses.insert(row, pose._replace(way_m=self._way_to(position) if row == len(poses)
-                                        else poses[max(row - 1, 0)].way_m))
+        if not poses:
+            self._step_end = position
+        step_m = float(np.linalg.norm(position - self._step_end))
+        if row == len(poses) and step_m > _STEP_M:
+            self._way_m, self._step_end = self._way_m + step_m, position
+        poses.insert(row, pose._replace(way_m=self._way_m if row == len(poses) else
+                                        poses[max(row - 1, 0)].way_m))
         oldest = poses[-1].stamp_ns - self._length_ns
         first = bisect_left(poses, oldest, key=_stamp_of)
         del poses[:max(first, len(poses) - self._max_poses)]
@@ -207,15 +212,6 @@ class OdometryWindow:
         return make_transform(first[:3, :3] @ cv2.Rodrigues(turn)[0],
                               first[:3, 3] + share * (last[:3, 3] - first[:3, 3]))
 
-    def _way_to(self, position: NDArray[np.float64]) -> float:
-        """Return the distance driven to a new position [m]."""
-        if not self._poses:
-            self._step_end = position
-        step_m = float(np.linalg.norm(position - self._step_end))
-        if step_m > _STEP_M:
-            self._way_m, self._step_end = self._way_m + step_m, position
-        return self._way_m
-
     def _fits(self, pose: _Pose, row: int) -> bool:
         """Return whether a robot could move through a pose that is inserted at a row."""
         poses = self._poses
@@ -258,7 +254,10 @@ def _is_explained(poses: Sequence[_Pose], pose: _Pose) -> bool:
     moment_s = (newest.stamp_ns - before.stamp_ns) / NS_PER_S
     speed = -_step(newest, before) / moment_s if moment_s else at_rest
     slack = _CHANGE * gap_s * min((moment_s + gap_s) / 2, _CHANGE_S)
-    if _is_silence(poses, pose.stamp_ns - newest.stamp_ns):
+    # the gap is longer than a few lost messages
+    if gap_s * NS_PER_S > _MAX_GAP_NS and gap_s * NS_PER_S > _MOST_PERIODS * (
+            float(np.median(np.diff([each.stamp_ns for each in poses]))) if len(poses) > 1
+            else _SLOW_NS):
         slack, speed = np.zeros(2), speed if gap_s <= LONG_NS / NS_PER_S else at_rest
     elif not row:  # the run has just begun: its poses are too close in time for a speed
         slack, speed = _FASTEST * gap_s, at_rest
@@ -269,15 +268,6 @@ def _is_explained(poses: Sequence[_Pose], pose: _Pose) -> bool:
     # move and turn lie in balls, with rest and constant speed at the ends of their diameters
     return bool((_lengths(_step(newest, pose) - ahead / 2)
                  <= _lengths(ahead) / 2 + _SLACK + slack).all())
-
-
-def _is_silence(poses: Sequence[_Pose], gap_ns: int) -> bool:
-    """Return whether the gap before the next pose is longer than a few lost messages."""
-    if gap_ns <= _MAX_GAP_NS:
-        return False
-    period_ns = float(np.median(np.diff([pose.stamp_ns for pose in poses]))) \
-        if len(poses) > 1 else _SLOW_NS
-    return gap_ns > _MOST_PERIODS * period_ns
 
 
 class OdometryPlace(NamedTuple):

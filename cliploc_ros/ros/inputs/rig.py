@@ -10,12 +10,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from itertools import islice
 
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from cliploc_ros.ros.inputs.frame_source import Frame, FrameSource, NoFrameError
 from cliploc_ros.ros.node.diagnostics import Health
+from cliploc_ros.ros.node.threads import steady_timer
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
@@ -90,10 +89,7 @@ class CameraRig:
         self._passed_ns = -_LATE_NS
         # With several cameras in continuous mode, a late or silent camera must not delay others.
         self._is_continuous = linger_s == math.inf and len(self.sources) > 1
-        # Steady time, because simulated time may be paused.
-        node.create_timer(_CHECK_PERIOD_S if self._is_continuous else _REST_PERIOD_S, self._tick,
-                          MutuallyExclusiveCallbackGroup(),
-                          Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(node, _CHECK_PERIOD_S if self._is_continuous else _REST_PERIOD_S, self._tick)
 
     def open(self) -> None:
         """Allow calls of next_frame; OptionsError: see FrameSource."""
@@ -143,7 +139,7 @@ class CameraRig:
                     sources)
                 left_s = end - time.monotonic()
                 if (frame is not None and not frame.left_out) or left_s <= 0.0 or any(
-                        source.is_closed for source in sources.values()):
+                        source.closed for source in sources.values()):
                     break
                 # if messages were lost, the next instant may have all cameras
                 self._changed.wait(min(left_s, _CHECK_PERIOD_S))
@@ -177,24 +173,20 @@ class CameraRig:
 
     def _pass_on(self) -> None:
         """Pass on the instants, in order, that no further frame can complete."""
+        def may_grow(instant: _Instant) -> bool:
+            """Return whether a frame of another camera may still arrive."""
+            now, at_ns = time.monotonic(), max(instant.stamps_ns)
+            return now < instant.until and any(
+                now < instant.image_until or source.awaits_detections(at_ns, self._tolerance_s)
+                for name, source in self.sources.items() if name not in instant.frames)
         with self._changed:  # held during the calls, so that the timer cannot change the order
             while self._pending and (len(self._pending) > _MOST_PENDING
-                                     or not self._may_grow(self._pending[0])):
+                                     or not may_grow(self._pending[0])):
                 instant = self._pending.popleft()
                 self._passed.append(instant.frames)
                 self._passed_ns = max(instant.stamps_ns)
                 self._changed.notify_all()
                 self._on_frame(self._joined(instant.frames, self.sources))
-
-    def _may_grow(self, instant: _Instant) -> bool:
-        """Return whether a frame of another camera may still arrive.
-
-        The caller holds the condition.
-        """
-        now, at_ns = time.monotonic(), max(instant.stamps_ns)
-        return now < instant.until and any(
-            now < instant.image_until or source.awaits_detections(at_ns, self._tolerance_s)
-            for name, source in self.sources.items() if name not in instant.frames)
 
     def _tick(self) -> None:
         """Pass on instants that waited long enough; unsubscribe when no frame is wanted."""

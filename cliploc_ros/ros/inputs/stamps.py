@@ -5,8 +5,8 @@
 import math
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from rclpy.clock import ClockChange, JumpThreshold, TimeJump
@@ -41,13 +41,6 @@ class TimeJumpError(CliplocError):
     """Time jumped back while a frame was processed; the message says by how much."""
 
 
-class _Jump(NamedTuple):
-    """The last jump: when it was detected (monotonic clock) [s], and its description."""
-
-    seen_at: float
-    name: str
-
-
 class TimeJumps:
     """Monitors a node's clock, and calls `forget` when time jumps back.
 
@@ -61,7 +54,8 @@ class TimeJumps:
         self._node = node
         self._clock = node.get_clock()
         self._forget = forget
-        self._last = _Jump(-math.inf, '')
+        # The last jump: when it was detected (monotonic clock) [s], and its description.
+        self._last = (-math.inf, '')
         # keep a reference, because rcl stores only a raw pointer to the handle
         self._handle = self._clock.create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
@@ -73,20 +67,20 @@ class TimeJumps:
         `received_at` is when it arrived (monotonic clock) [s]. A message from before the jump may
         arrive after the clock has jumped; then its stamp is in the future.
         """
-        jump = self._last
-        if not jump.name:
+        seen_at, name = self._last
+        if not name:
             return
         ahead_ns = stamp_ns(stamp) - self._clock.now().nanoseconds
-        if received_at <= jump.seen_at or (self._clock.ros_time_is_active
-                                           and ahead_ns > _MAX_AHEAD_NS):
-            raise TimeJumpError(f'{jump.name}: the frame is from before the jump')
+        if received_at <= seen_at or (self._clock.ros_time_is_active
+                                      and ahead_ns > _MAX_AHEAD_NS):
+            raise TimeJumpError(f'{name}: the frame is from before the jump')
 
     def _on_jump(self, jump: TimeJump) -> None:
         if jump.clock_change in (ClockChange.ROS_TIME_ACTIVATED, ClockChange.ROS_TIME_DEACTIVATED):
             name = 'use_sim_time changed'
         else:
             name = f'time jumped back by {-jump.delta.nanoseconds / NS_PER_S:.3f} s'
-        self._last = _Jump(time.monotonic(), name)
+        self._last = (time.monotonic(), name)
         self._forget()
         self._node.get_logger().warning(f'{name}: all earlier input is forgotten',
                                         throttle_duration_sec=1.0)
@@ -195,10 +189,9 @@ class ExactPairing:
                 self._forget(name, next(iter(other)))
         return complete
 
-    def waits_near(self, topic: str, stamp_ns: int, tolerance_ns: float) -> bool:
-        """Return whether a waiting item of a topic has a stamp near a given one."""
-        return any(abs(waiting_ns - stamp_ns) <= tolerance_ns
-                   for waiting_ns in self._waiting[topic])
+    def waiting(self, topic: str) -> Iterable[int]:
+        """Return the stamps of the waiting items of a topic [ns]."""
+        return self._waiting[topic]
 
     def oldest(self, topic: str) -> Any:
         """Return the oldest waiting item of a topic; None without any."""

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+
+from cliploc_ros.ros.node.threads import steady_timer
 
 _PERIOD_S = 1.0
 # Least period of a rate: over a shorter time it fluctuates.
@@ -168,8 +168,7 @@ class Diagnostics:
         self._state = state
         self._lock = threading.Lock()
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        node.create_timer(_PERIOD_S, self.publish, MutuallyExclusiveCallbackGroup(),
-                          Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(node, _PERIOD_S, self.publish)
 
     def publish(self) -> None:
         """Publish the health now."""

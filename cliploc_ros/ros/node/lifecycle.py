@@ -23,8 +23,6 @@ from typing import Any, NoReturn
 
 import rclpy
 from lifecycle_msgs.srv import ChangeState
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState
@@ -36,7 +34,13 @@ from cliploc_ros.command import Interruption, split_ros_args
 from cliploc_ros.errors import CliplocError, OptionsError, StoppedError
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.node.parameters import NodeParameters, Parameters
-from cliploc_ros.ros.node.threads import BoundedCallbackGroup, NodeExecutor, Worker, log_failure
+from cliploc_ros.ros.node.threads import (
+    BoundedCallbackGroup,
+    NodeExecutor,
+    Worker,
+    log_failure,
+    steady_timer,
+)
 from cliploc_ros.units import NS_PER_S
 
 # Nav2's defaults (nav2_util::LifecycleNode and its parameter bond_heartbeat_period).
@@ -141,10 +145,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         self._start: Future[None] | None = None
         self._start_lock = threading.Lock()
         self._pause_s = _FIRST_PAUSE_S
-        # Steady time, because simulated time may be paused.
-        self._starter = self.create_timer(0.0, self._start_by_itself,
-                                          MutuallyExclusiveCallbackGroup(),
-                                          Clock(clock_type=ClockType.STEADY_TIME))
+        self._starter = steady_timer(self, 0.0, self._start_by_itself)
 
     # ---- what a node implements -----------------------------------------------------------------
 
@@ -288,12 +289,10 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         return self._attempt(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> Outcome:
-        """Free map and weights."""
+        """Free map and weights, at a shutdown from any state."""
         return self._attempt(self._free)
 
-    def on_shutdown(self, state: LifecycleState) -> Outcome:
-        """Free everything, from any state."""
-        return self._attempt(self._free)
+    on_shutdown = on_cleanup
 
     def on_error(self, state: LifecycleState) -> Outcome:
         """Free everything after an internal error; the node can be configured again."""
@@ -328,14 +327,11 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         self.close()
 
     def _free(self) -> None:
+        from cliploc_ros.models.onnx_network import free_memory
         if self.active:
             self._deactivate()
-        self.worker.run(self._unload)
-
-    def _unload(self) -> None:
-        from cliploc_ros.models.onnx_network import free_memory
-        self.unload()
-        free_memory()
+        self.worker.run(self.unload)
+        self.worker.run(free_memory)
 
     def _attempt(self, step: Callable[[], None]) -> Outcome:
         """Run a transition and log its exceptions, which rclpy would hide.

@@ -40,7 +40,7 @@ class ParameterRow:
     description: str
     #: SI symbol, px or ''.
     unit: str = ''
-    #: Range of a number, including both ends.
+    #: Range of a number, including both ends; both are infinite, or neither.
     low: float = -math.inf
     high: float = math.inf
     #: The allowed values of a text; empty: any.
@@ -57,11 +57,7 @@ class ParameterRow:
             return ', '.join(self.choices)
         if isinstance(self.default, bool) or not isinstance(self.default, int | float):
             return ''
-        if math.isinf(self.low) and math.isinf(self.high):
-            return ''
-        if math.isinf(self.high):
-            return f'>= {self.low:g}'
-        return f'{self.low:g} to {self.high:g}'
+        return '' if math.isinf(self.high) else f'{self.low:g} to {self.high:g}'
 
     @property
     def descriptor(self) -> ParameterDescriptor:
@@ -151,11 +147,20 @@ class NodeParameters[P: Parameters]:
     """
 
     def __init__(self, node: Node, kind: type[P], others: type[Parameters] = Parameters) -> None:
-        self._node = node
         self._rows = {row.name: row for row in kind.rows()}
         self._problems: dict[str, str] = {}
-        for row in self._rows.values():
-            self._declare(row)
+        for row in self._rows.values():  # with the value from command line or file, or the default
+            value: Value = row.default
+            if node.has_parameter(row.name):
+                given = node.get_parameter(row.name).value
+                node.undeclare_parameter(row.name)
+                try:
+                    value = row.validated(given)
+                except OptionsError as error:
+                    remedy = 'correct it and restart' if row.read_only else \
+                        f'correct it with: ros2 param set {node.get_name()} {row.name} VALUE'
+                    self._problems[row.name] = f'{error}; {remedy}'
+            node.declare_parameter(row.name, value, row.descriptor, ignore_override=True)
         known = {*self._rows, *(row.name for row in others.rows()), *_FOREIGN_NAMES}
         for name in node.get_parameters_by_prefix(''):  # most are typing errors
             if name not in known and not name.startswith(_FOREIGN_PREFIXES):
@@ -177,20 +182,6 @@ class NodeParameters[P: Parameters]:
         values = self.values
         values.check()
         return values
-
-    def _declare(self, row: ParameterRow) -> None:
-        """Declare a parameter with its value from command line or file, else with its default."""
-        value: Value = row.default
-        if self._node.has_parameter(row.name):
-            given = self._node.get_parameter(row.name).value
-            self._node.undeclare_parameter(row.name)
-            try:
-                value = row.validated(given)
-            except OptionsError as error:
-                remedy = 'correct it and restart' if row.read_only else \
-                    f'correct it with: ros2 param set {self._node.get_name()} {row.name} VALUE'
-                self._problems[row.name] = f'{error}; {remedy}'
-        self._node.declare_parameter(row.name, value, row.descriptor, ignore_override=True)
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         """Allow a change if all values are valid together. Other callbacks may still refuse it."""

@@ -10,7 +10,8 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.node import Node
@@ -30,32 +31,36 @@ _BEGIN_S = 0.1
 _GRACE_S = 0.2
 
 
+def steady_timer(node: Node, period_s: float, callback: Callable[[], None]) -> Timer:
+    """Return a timer in steady time, because simulated time may be paused."""
+    return node.create_timer(period_s, callback, MutuallyExclusiveCallbackGroup(),
+                             Clock(clock_type=ClockType.STEADY_TIME))
+
+
 class BoundedCallbackGroup(CallbackGroup):
     """Runs up to `limit` callbacks at a time."""
 
     def __init__(self, limit: int) -> None:
         super().__init__()
-        self._limit = limit
-        self._running: list[object] = []
+        self._free = limit
         self._lock = threading.Lock()
 
     def can_execute(self, entity: object) -> bool:
         """Return whether a further callback may begin."""
-        with self._lock:
-            return len(self._running) < self._limit
+        return self._free > 0
 
     def beginning_execution(self, entity: object) -> bool:
         """Count a callback that begins; return whether it may begin."""
         with self._lock:
-            if len(self._running) >= self._limit:
+            if not self._free:
                 return False
-            self._running.append(entity)
+            self._free -= 1
             return True
 
     def ending_execution(self, entity: object) -> None:
         """Count a callback that ended."""
         with self._lock:
-            self._running.remove(entity)
+            self._free += 1
 
 
 class NodeExecutor(SingleThreadedExecutor):
@@ -189,12 +194,6 @@ class LatestOnly[T]:
         self._lock = threading.Lock()
         self._items: list[T] = []
         self.dropped = 0
-
-    @property
-    def waiting(self) -> T | None:
-        """Return the waiting item; None without any."""
-        with self._lock:
-            return self._items[0] if self._items else None
 
     def offer(self, item: T) -> None:
         """Queue an item in place of a waiting item."""

@@ -1,0 +1,292 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Handing a pose over: real subscribers, odometry, and services that answer or never do."""
+
+import math
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+
+import pytest
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from handing_over import ONE_HZ, PARAMETERS, TEN_HZ, Robot, make_pose, stamp, stand, tell
+from rclpy.time import Time
+
+from cliploc_ros.ros.handoff import HandOffError, NoLocalizerError, difference, usable_pose
+from cliploc_ros.ros.inputs.stamps import TimeJumpError
+
+
+@pytest.mark.clock
+def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
+    start = time.monotonic()
+    with pytest.raises(NoLocalizerError, match=r'/initialpose.*retry'):
+        robot.hand_over(4.0)
+    assert 3.0 < time.monotonic() - start < 5.0
+    robot.localizer.subscribe()
+    robot.meet()
+    robot.hand_over()
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+    assert len(robot.localizer.poses) == 1, 'the withheld pose is not delivered late'
+
+
+@pytest.fixture
+def served(robot):
+    """Return a robot whose localizer receives poses and serves updates."""
+    robot.localizer.subscribe()
+    robot.localizer.serve()
+    robot.meet()
+    robot.meet_service()
+    return robot
+
+
+def test_updates_come_no_faster_than_scans_and_without_an_answer_cost_little(served):
+    assert 2.0 < served.hand_over() < 6.0
+    assert len(served.localizer.updates) == PARAMETERS.nomotion_updates
+    served.localizer.may_answer.clear()
+    for timeout_s, longest_s in ((10.0, 4.0), (0.5, 1.0), (-1.0, 0.5)):
+        assert served.hand_over(timeout_s) < longest_s
+    served.wait(lambda: len(served.localizer.poses) == 4, 'the poses')
+    assert not served.handoff._updater._pending_requests, 'their futures are freed'
+    served.localizer.may_answer.set()
+    assert served.hand_over(nomotion_updates=1) < 2.0, 'late answers do no harm'
+
+
+def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
+    """The hand-over waits for odometry when time jumps."""
+    robot.localizer.subscribe()
+    robot.meet()
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(robot.hand_over)
+        robot.wait(lambda: robot.odometry._heard._waiters, 'a wait for odometry')
+        robot.jump()
+        tell(robot, wheels, TEN_HZ)
+        with pytest.raises(TimeJumpError):
+            handing_over.result()
+    assert not robot.localizer.poses
+    tell(robot, wheels, (1.0, 1.1))
+    robot.hand_over()
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+
+
+@pytest.fixture
+def showing(served):
+    """A localizer that publishes the poses it is given, with an error; NaN: it publishes none."""
+    localizer, node = served.localizer, served.localizer.node
+    shows = node.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
+    localizer.off_m = 0.0
+
+    def show(pose):
+        pose.pose.pose.orientation.w = 1.0
+        pose.pose.pose.position.x += localizer.off_m
+        if math.isfinite(localizer.off_m):
+            shows.publish(pose)
+    node.create_subscription(PoseWithCovarianceStamped, 'initialpose', show, 10)
+    served.handoff.open('amcl_pose')
+    served.wait(lambda: not served.handoff.missing() and shows.get_subscription_count(), 'both')
+
+    def show_at(x_m, seconds):
+        pose = make_pose()
+        pose.pose.pose.position.x, pose.header.stamp = x_m, stamp(100.0 + seconds)
+        show(pose)
+    localizer.show = show_at
+    yield served
+    served.handoff.close()
+
+
+@pytest.mark.parametrize(('off_m', 'timeout_s', 'named', 'times'), [
+    (0.0, 3.2, '', 1), (4.7, 3.2, r'4\.70 m', 3), (math.nan, 3.2, 'no message on', 3),
+    (math.nan, 0.3, 'too little time', 0)])
+def test_a_localizer_has_taken_the_pose_once_it_shows_it(showing, off_m, timeout_s, named, times):
+    showing.localizer.off_m = off_m
+    with pytest.raises(NoLocalizerError, match=named) if named else nullcontext():
+        showing.hand_over(timeout_s)
+    assert len(showing.localizer.poses) == times
+
+
+def test_who_hears_the_pose_but_shows_none_is_no_localizer(robot):
+    """Subscribers such as ros2 topic echo."""
+    robot.localizer.subscribe()
+    robot.handoff.open('amcl_pose')
+    robot.meet()
+    with pytest.raises(NoLocalizerError, match='/amcl_pose'):
+        robot.hand_over(1.0)
+    assert not robot.localizer.poses
+    robot.handoff.close()
+
+
+def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):
+    """It published the pose, but then answers no update and publishes nothing more."""
+    showing.localizer.may_answer.clear()
+    with pytest.raises(NoLocalizerError, match=r'took the pose, but has ended or hangs'):
+        showing.hand_over()
+    assert len(showing.localizer.poses) == 1
+    showing.localizer.may_answer.set()
+
+
+class RearTransforms:
+    """Replaces tf2's buffer: it knows a frame at the robot's origin, turned by 180 degrees."""
+
+    def lookup_transform(self, target, source, stamp, timeout):
+        if (target, source) != ('base_link', 'rear'):
+            raise LookupError('unknown frame')
+        found = TransformStamped()
+        found.transform.rotation.z, found.transform.rotation.w = 1.0, 0.0
+        return found
+
+
+@pytest.mark.parametrize(('x_m', 'driven_m', 'body', 'named'), [
+    (2.0, 0.0, 'base_link', r'differs from it by 2\.00 m'), (2.0, 2.0, 'base_link', ''),
+    (2.0, 2.0, 'wheels', r'differs from it by 2\.00 m'), (-2.0, 2.0, 'rear', '')])
+def test_where_the_localizer_is_once_it_has_settled_decides(showing, wheels, x_m, driven_m, body,
+                                                            named):
+    """It answers no update but shows a pose, also that of a robot that has driven off.
+
+    The robot drives after the pose was taken. Nobody places `wheels` at the robot; `rear` looks
+    back.
+    """
+    showing.handoff._transforms._buffer = RearTransforms()
+    stand(showing, wheels, dict.fromkeys((-0.1, 0.0, 0.1, 0.2, 0.3, 0.4), 0.0), body=body)
+    showing.localizer.may_answer.clear()
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(showing.hand_over)
+        showing.wait(lambda: showing.localizer.updates, 'an update')
+        stand(showing, wheels, {0.4 + 0.1 * tick: driven_m * tick / 20 for tick in range(1, 21)},
+              twist_m_s=5.0 * driven_m / 10, body=body)
+        showing.localizer.show(x_m, 2.4)
+        with pytest.raises(NoLocalizerError, match=named) if named else nullcontext():
+            handing_over.result()
+    showing.localizer.may_answer.set()
+
+
+@pytest.mark.parametrize('timeout_s', [10.0, 0.3])
+def test_a_robot_that_drives_is_told_so_however_little_time_is_left(showing, wheels, timeout_s):
+    tell(showing, wheels, TEN_HZ, twist_m_s=0.5)
+    with pytest.raises(HandOffError, match=r'moves at 0\.50'):
+        showing.hand_over(timeout_s)
+    assert not showing.localizer.poses
+
+
+@pytest.mark.parametrize(('end', 'error'), [
+    (Robot.jump, TimeJumpError), (lambda robot: robot.handoff.stop(), HandOffError)])
+def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(showing, end, error):
+    showing.localizer.off_m = math.nan
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(showing.hand_over)
+        showing.wait(lambda: showing.localizer.poses, 'the pose')
+        start = time.monotonic()
+        end(showing)
+        with pytest.raises(error):
+            handing_over.result()
+    assert time.monotonic() - start < 3.0
+    assert len(showing.localizer.poses) == 1
+
+
+@pytest.mark.parametrize(('x_m', 'yaw_deg', 'frame', 'is_taken_over'), [
+    (0.55, 0.0, '/map', True), (0.0, 24.0, 'map', True), (0.65, 0.0, 'map', False),
+    (0.0, 26.0, 'map', False), (0.0, 0.0, 'floor_2', False), (math.nan, 0.0, 'map', False),
+    (0.0, math.nan, 'map', False)])
+def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
+    """Limits: .3 m and three deviations of .1 m, 10 degrees and three deviations of 5."""
+    given, shown = make_pose(), make_pose()
+    given.pose.pose.orientation.w = 1.0
+    given.pose.covariance[0], given.pose.covariance[7] = 0.1**2, 0.02**2
+    given.pose.covariance[35] = math.radians(5.0)**2
+    shown.header.frame_id, shown.pose.pose.position.x = frame, x_m
+    shown.pose.pose.orientation.z = math.sin(math.radians(yaw_deg) / 2)
+    shown.pose.pose.orientation.w = math.cos(math.radians(yaw_deg) / 2)
+    assert (not difference(given, shown)) == is_taken_over
+    shown.pose.pose.orientation.y = 1e200
+    assert difference(given, shown)
+
+
+def test_a_pose_without_any_scatter_gets_a_centimetre():
+    covariance = usable_pose(make_pose(), Time()).pose.covariance
+    # x, xy, yx, y and yaw: the elements that AMCL reads
+    assert [covariance[i] for i in (0, 1, 6, 7, 35)] == [1e-4, 0.0, 0.0, 1e-4, 1e-5]
+
+
+@pytest.mark.parametrize(('now_s', 'published_s'), [(200, 100), (100, 100), (50, 50), (0, 100)])
+def test_the_stamp_is_the_images_but_not_later_than_now(now_s, published_s):
+    pose = make_pose()
+    usable = usable_pose(pose, Time(seconds=now_s))
+    assert usable.header.stamp.sec == published_s
+    assert (pose.header.stamp.sec, usable.header.frame_id) == (100, 'map')
+
+
+# ---- odometry shows whether the robot has moved since its image ---------------------------------
+
+@pytest.fixture
+def listening(robot, wheels):
+    """Return a robot whose localizer receives poses."""
+    robot.localizer.subscribe()
+    robot.meet()
+    return robot
+
+
+def is_withheld(robot, timeout_s=10.0):
+    """Hand a pose over; return the reason why it is withheld, or ''."""
+    try:
+        robot.hand_over(timeout_s)
+    except HandOffError as error:
+        assert not robot.localizer.poses
+        return str(error)
+    robot.wait(lambda: robot.localizer.poses, 'the pose')
+    return ''
+
+
+@pytest.mark.parametrize('moments_s', [ONE_HZ, (0.0, 0.5, 2.5)])
+@pytest.mark.parametrize('speeds', [{'speed_m_s': 0.5}, {'twist_m_s': 0.5}])
+def test_a_robot_that_drives_gets_no_pose_however_slow_its_odometry(listening, wheels, moments_s,
+                                                                    speeds):
+    """Motion shows in poses without a twist, or in a twist with constant poses."""
+    tell(listening, wheels, moments_s, **speeds)
+    assert 'moves at 0.50 m/s' in is_withheld(listening)
+
+
+@pytest.mark.parametrize(('moments_s', 'timeout_s'), [(ONE_HZ, 10.0), (TEN_HZ, -1.0)])
+def test_a_robot_at_rest_gets_its_pose_however_slow_its_odometry(listening, wheels, moments_s,
+                                                                 timeout_s):
+    """A source of twists only looks the same at rest. Late odometry will do."""
+    tell(listening, wheels, moments_s)
+    assert listening.hand_over(timeout_s) < 1.5, 'two messages at 1 Hz are enough'
+    listening.wait(lambda: listening.localizer.poses, 'the pose')
+
+
+@pytest.mark.parametrize(('x_m', 'rad_per_m', 'has_moved'), [
+    (-0.12, 0.0, True), (0.01, 10.0, True), (0.08, 0.8, False)])
+def test_a_robot_that_has_moved_since_its_image_gets_no_pose(listening, wheels, x_m, rad_per_m,
+                                                             has_moved):
+    """The robot stopped half a second before the hand-over."""
+    stand(listening, wheels, {tick / 10: min(1.0, tick / 5) * x_m for tick in range(11)},
+          rad_per_m=rad_per_m)
+    assert ('has moved' in is_withheld(listening)) == has_moved
+
+
+@pytest.mark.parametrize('places', [
+    {-1.5: 0.0, 0.5: 0.2, 1.5: 0.2}, {-0.5: 0.0, 0.6: 1.0, 0.8: 1.0, 1.0: 1.0}])
+def test_slow_odometry_tells_that_the_robot_has_moved_since_its_image(listening, wheels, places):
+    """It was between two places when the image was taken, and stands now."""
+    stand(listening, wheels, places)
+    assert 'has moved' in is_withheld(listening)
+
+
+@pytest.mark.parametrize(('x_m', 'has_moved'), [(1.0, True), (0.0, False)])
+def test_an_image_newer_than_odometry_waits_for_it(listening, wheels, x_m, has_moved):
+    stand(listening, wheels, {-2.0: 0.0, -1.0: 0.0})
+    with ThreadPoolExecutor(1) as pool:
+        handing_over = pool.submit(is_withheld, listening)
+        listening.wait(lambda: listening.odometry._heard._waiters, 'a wait for odometry')
+        stand(listening, wheels, {0.3: x_m})
+        assert ('has moved by 1.00 m' in handing_over.result()) == has_moved
+
+
+@pytest.mark.parametrize(('places', 'named'), [
+    # older than the image, newer, or with a gap around it
+    *((dict.fromkeys(moments_s, 0.0), 'does not cover') for moments_s in (
+        (-4.0, -3.5, -3.0), (1.0, 2.0), (-4.0, 0.5, 1.0))),
+    # the stamp is constant, or the poses are too far apart; the twist is empty
+    ({7.0: 0.0}, 'the speed is unknown'), ({0.0: 0.0, 10.0: 5.0}, 'the speed is unknown')])
+def test_odometry_that_does_not_tell_of_rest_withholds_the_pose(listening, wheels, places, named):
+    for _ in range(3 if len(places) == 1 else 1):
+        stand(listening, wheels, places)
+    assert named in is_withheld(listening, 2.5)
