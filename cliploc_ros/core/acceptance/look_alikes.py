@@ -72,17 +72,18 @@ class Alike(NamedTuple):
     def are_rooms(self) -> NDArray[np.bool_]:
         """Return which places (m,) are rooms of their own, or the other half of a symmetric room.
 
-        Their landmarks lie beyond the given place. If the places are so near that the given place
-        has landmarks of both, a move takes each landmark to another one. Moves that fit by chance
-        take several landmarks to one, or a landmark to itself. Rooms that are furnished alike
-        may have the same posters, too.
+        Many of their common landmarks lie beyond the given place. If the places are so near that
+        it has the landmarks of both, a move takes each landmark to another one. Moves that fit by
+        chance take several landmarks to one, or a landmark to itself. Rooms that are furnished
+        alike may have the same posters, too.
         """
+        common = self.found.sum(axis=1)
         beyond = self.found & ~np.isin(self.others, self.landmarks)
         moved = self.found & (self.others != self.landmarks)
         distinct = np.array([len({*others[found]})
                              for others, found in zip(self.others, moved, strict=True)])
-        return np.asarray((beyond.sum(axis=1) >= _TERMS.least_share * len(self.landmarks))
-                          | (distinct >= _TERMS.one_to_one * self.found.sum(axis=1)))
+        return np.asarray((beyond.sum(axis=1) >= _TERMS.least_share * common)
+                          | (distinct >= _TERMS.one_to_one * common))
 
 
 def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
