@@ -28,8 +28,9 @@ from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import Queries, save_queries
 from cliploc_ros.offline.evaluation.methods import parse_methods
+from cliploc_ros.offline.evaluation.recording import make_queries_of
 from cliploc_ros.offline.evaluation.run import compare_methods
-from cliploc_ros.offline.evaluation.trials import make_queries, make_queries_of
+from cliploc_ros.offline.evaluation.trials import make_queries
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.recorder import RunNetworks, record_every_frame
 from demo import ASSETS

@@ -19,8 +19,7 @@ from cliploc_ros.core.geometry.transforms import is_rigid, quaternion_from_trans
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.storage import read_file
-from cliploc_ros.offline.datasets import bag_messages, parsing
-from cliploc_ros.offline.datasets.bags import BagWriter
+from cliploc_ros.offline.datasets import parsing
 from cliploc_ros.offline.datasets.frames import ImageFile, read_color
 from cliploc_ros.offline.datasets.poses import TimedPoses
 
@@ -247,6 +246,9 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
     progress : callable
         Wraps the iterable of images, to show progress.
     """
+    # only this needs rosbags; core tests with few packages read trajectories
+    from cliploc_ros.offline.datasets import bag_messages
+    from cliploc_ros.offline.datasets.bags import BagWriter
     recorded = detections or {}
     if detections is not None and not any(stamp in detections for stamp in sequence.stamps_ns):
         raise DatasetError(
