@@ -25,7 +25,7 @@ from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.acceptance.verdict import RefusalKind
-from cliploc_ros.core.fit.covariance import FilterState, succeed
+from cliploc_ros.core.fit.succession import FilterState, succeed
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import SAME_VIEW, pose_error
 from cliploc_ros.core.keyframes.localization import (

@@ -12,12 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, looks_of
-from cliploc_ros.core.acceptance.comparison import (
-    Comparison,
-    Link,
-    search_contenders,
-    weakest_link,
-)
+from cliploc_ros.core.acceptance.comparison import Comparison, search_contenders
 from cliploc_ros.core.acceptance.confidence import Support
 from cliploc_ros.core.acceptance.contenders import (
     Contender,
@@ -26,6 +21,7 @@ from cliploc_ros.core.acceptance.contenders import (
     without_depth,
 )
 from cliploc_ros.core.acceptance.depth_check import DepthCheck, check_depth
+from cliploc_ros.core.acceptance.links import Link, weakest_link
 from cliploc_ros.core.acceptance.looks import Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.calibration import CALIBRATION
@@ -34,7 +30,8 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
-from cliploc_ros.core.keyframes.localization import ImageRecognizer, Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.localization import ImageRecognizer
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import refine
 from cliploc_ros.core.map.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap

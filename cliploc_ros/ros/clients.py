@@ -114,7 +114,8 @@ def check_name(name: str) -> None:
     try:
         validate_full_topic_name(expand_topic_name(name, 'node', '/'), is_service=True)
     except (InvalidServiceNameException, ValueError) as error:
-        raise OptionsError(f'--relocalizer: {str(error).partition(", at ")[0]}') from error
+        text = str(error).splitlines()[0].partition(', at ')[0].rstrip(':')
+        raise OptionsError(f'--relocalizer: {text}') from error
 
 
 def ask(node: Node, name: str, patience_s: float) -> tuple[RelocalizerStatus, list[Parameter]]:

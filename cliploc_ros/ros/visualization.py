@@ -24,7 +24,7 @@ from cliploc_ros.core.geometry.camera import frusta
 from cliploc_ros.core.geometry.ellipsoid import outline_points, project_ellipsoids, shape_matrices
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities

@@ -21,8 +21,8 @@ from cliploc_ros.core.keyframes.localization import (
     ImageFeatures,
     ImageRecognizer,
     KeyframeLocalizer,
-    Recognition,
 )
+from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions

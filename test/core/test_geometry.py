@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras, ellipses, ellipsoids and poses: exact cases, properties, and a room in fisheyes."""
 
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -16,7 +16,8 @@ from cliploc_ros.core.geometry.transforms import invert_transform, make_transfor
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT, Features, extract
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, save_layer
-from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, Recognition
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
+from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.keyframes.point_pose import find_pose, free_focal, refine
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
@@ -331,8 +332,6 @@ def test_a_constraint_excludes_by_height_and_tilt_and_tells_how_far_the_vertical
     assert known.tilt_error(tilted(20.0), covariance) == pytest.approx(4.0)
     assert known.tilt_error(tilted(-20.0), covariance) == pytest.approx(4.0)
     assert known.tilt_error(tilted(0.0), covariance) == pytest.approx(0.0)
-
-
 
 
 MANY = np.arange(40)

@@ -12,10 +12,10 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room, see_room
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.comparison import weakest_link
 from cliploc_ros.core.acceptance.confidence import Setting, none_right
 from cliploc_ros.core.acceptance.contenders import join_frames
 from cliploc_ros.core.acceptance.depth_check import DepthCheck
+from cliploc_ros.core.acceptance.links import weakest_link
 from cliploc_ros.core.acceptance.looks import EarlierLook, Look, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.calibration import CALIBRATION
@@ -23,7 +23,8 @@ from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.features import SIFT
-from cliploc_ros.core.keyframes.localization import LEAST_S, Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.localization import LEAST_S
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.localizer import KeptInstant, Localizer, instants_to_fuse
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -291,7 +292,8 @@ def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
     assert not any(relocalizer.relocalize([frame]).accepted for frame in frames)
     found = relocalizer.relocalize(frames)
     assert found.accepted, found.reason
-    assert pose_error(found.map_from_camera, walk[-1]) < (0.01, 0.2)
+    error_m, error_deg = pose_error(found.map_from_camera, walk[-1])
+    assert error_m < 0.01 and error_deg < 0.2
     # from the last frame only
     assert [match.detection for match in found.matches] == [0, 1]
     assert [match.landmark for match in found.matches] == shares[-1]

@@ -11,7 +11,7 @@ from cliploc_ros.core.acceptance.genuine import compare_motion
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.keyframes.layer import FROM_DEPTH
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
 #: Least score of a pose from keyframes.

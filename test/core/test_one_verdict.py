@@ -13,7 +13,8 @@ from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.fit.covariance import fuse
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN, Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import NEVER, Deadline, RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

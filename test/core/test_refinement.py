@@ -294,5 +294,3 @@ def test_a_map_states_what_its_landmarks_share():
     # the covariance does not shrink with the number of landmarks
     np.testing.assert_allclose(np.diag(shared - plain), [0.01] * 3 + [np.radians(3.0) ** 2] * 3,
                                rtol=0.1)
-
-

@@ -29,7 +29,8 @@ def test_every_method_finds_a_perfect_view(matching, algorithm, room, observatio
     result = Relocalizer(room, options).relocalize([observation])
     assert result.accepted
     # box centres and ellipsoid centres differ slightly by perspective
-    assert pose_error(result.map_from_camera, MAP_FROM_CAMERA) < (0.05, 1.0)
+    error_m, error_deg = pose_error(result.map_from_camera, MAP_FROM_CAMERA)
+    assert error_m < 0.05 and error_deg < 1.0
     assert len(result.matches) == 12
     assert all(match.detection == match.landmark for match in result.matches)
     assert result.stamp_ns == 123

@@ -33,11 +33,12 @@ from cliploc_ros.core.acceptance.look_alikes import lead_over_twin, turned_about
 from cliploc_ros.core.acceptance.looks import EarlierLook
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
 from cliploc_ros.core.calibration import CALIBRATION, FILE
-from cliploc_ros.core.fit.covariance import share_within, succeed
+from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import Match
+from cliploc_ros.core.fit.succession import succeed
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions

@@ -18,6 +18,7 @@ from cliploc_ros.core.map.visibility import Expected, Missing, expect
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.watch.camera import ImageFaults
 from cliploc_ros.core.watch.look import (
     LookEvidence,
     align,
@@ -26,7 +27,7 @@ from cliploc_ros.core.watch.look import (
     look_at,
     measure,
 )
-from cliploc_ros.core.watch.watch import Belief, ImageFaults, Watch, WatchState
+from cliploc_ros.core.watch.watch import Belief, Watch, WatchState
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Counts of refusals by kind, an answer that is withheld, and the hash of a map."""
-
+"""Counts of refusals by kind, and an answer that is withheld."""
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scene import CAMERA, make_layer, make_room, see_room
 
-from cliploc_ros.core.keyframes.localization import Recognition, RecognizedPlace
+from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer

@@ -15,7 +15,7 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
-from cliploc_ros.ros.inputs.robot_state import PriorSource
+from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.node.threads import Worker
 from cliploc_ros.ros.parameters import RelocalizerParameters
 

@@ -2,14 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests in a real node with a real frame source; the localizer is a function of the test."""
 
+import math
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image
@@ -19,6 +22,7 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.errors import MapError, StoppedError
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict
 from cliploc_ros.ros.handoff import HandOff
+from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumps
@@ -202,3 +206,28 @@ def test_a_start_that_is_cancelled_ends_the_wait_for_it(node, clients, wait):
     with pytest.raises(StoppedError):
         starting.result(10.0)
     release.set()
+
+
+class LateTransforms:
+    """Stands for tf2's buffer, which has no transform before some time; tf2 is not needed."""
+
+    def __init__(self, late_s):
+        self._known_at = time.monotonic() + late_s
+
+    def lookup_transform(self, target, source, stamp, timeout):
+        if time.monotonic() < self._known_at:
+            raise LookupError('extrapolation into the future')
+        return TransformStamped()
+
+
+def test_a_late_mount_is_waited_for_during_half_of_the_time(node, wait):
+    wait(lambda: node.active, 'the node to be active')
+    set_values(node, base_frame='base_link', tf_timeout_s=0.0)
+    parameters, image = node.settings.snapshot(), Header(frame_id='camera')
+    node.robot.transforms._buffer = LateTransforms(0.2)
+    state = node.robot.at(image, parameters, time.monotonic() + 60.0)
+    np.testing.assert_array_equal(state.camera_from_base, np.eye(4))
+    node.robot.transforms._buffer, begin = LateTransforms(math.inf), time.monotonic()
+    with pytest.raises(NoTransformError, match="'base_link' to 'camera'"):
+        node.robot.at(image, parameters, begin + 0.8)
+    assert time.monotonic() - begin > 0.35

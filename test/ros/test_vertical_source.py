@@ -52,6 +52,14 @@ def test_an_accelerometer_at_rest_points_up(source):
         np.testing.assert_allclose(up(source, gravity=gravity), [0, -1, 0], atol=1e-12)
 
 
+def test_a_sample_out_of_order_costs_nothing_and_a_jump_back_all_samples(source):
+    for seconds in (50.0, 49.99, 50.01):
+        source.take(imu(seconds=seconds))
+    assert len(source._samples) == 3
+    source.take(imu(seconds=48.0))
+    assert len(source._samples) == 1
+
+
 TILT = Rotation.from_euler('xyz', [5.0, -8.0, 30.0], degrees=True)
 GRAVITY = tuple(9.81 * TILT.inv().apply([0, 0, 1]))
 TILTED_UP = CAMERA_FROM_BASE[:3, :3] @ TILT.inv().apply([0, 0, 1])

@@ -78,17 +78,18 @@ def test_a_task_whose_time_is_up_before_its_turn_never_runs(worker, gate):
 
 def test_stop_drops_what_waits_and_ends_each_wait(worker, gate):
     """A long task cannot be ended: nobody waits for it."""
-    running, ran = gate.hold(worker), []
-    waiting = [worker.submit(lambda: ran.append('never')) for _ in range(3)]
+    ran = []
     with ThreadPoolExecutor(1) as pool:
-        asking = pool.submit(worker.run, lambda: ran.append('asked'))
+        asking = pool.submit(worker.run, gate)
+        assert gate.entered.wait(PATIENCE_S)
+        waiting = [worker.submit(lambda: ran.append('never')) for _ in range(3)]
         worker.stop()
-        with pytest.raises(StoppedError):
-            asking.result(PATIENCE_S / 2)  # before the gate times out
-    assert all(future.cancelled() for future in waiting)
-    gate.open()
-    assert running.result(PATIENCE_S) is None
-    assert ran == []
+        try:
+            with pytest.raises(StoppedError):
+                asking.result(PATIENCE_S / 2)  # before the gate times out
+        finally:
+            gate.open()
+    assert all(future.cancelled() for future in waiting) and ran == []
 
 
 @given(st.lists(st.booleans(), max_size=40))

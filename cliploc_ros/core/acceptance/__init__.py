@@ -12,10 +12,11 @@ confidence
     The evidence of the objects and of a prior region for a pose; the probability of each pose,
     given its rivals.
 comparison
-    All contenders in one list; the evidence about the leading pose; mirror images; whether
-    odometry links the frames of several instants.
+    All contenders in one list; the evidence about the leading pose; mirror images.
 look_alikes, genuine
     Other reasons why a pose may be wrong: a place that looks alike, a picture, a changed place.
+links
+    Whether odometry links the frames of several instants.
 looks
     The earlier looks of a moving robot.
 camera_check

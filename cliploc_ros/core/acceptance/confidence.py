@@ -41,7 +41,7 @@ from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.geometry.depth import depth_errors, depth_odds
 from cliploc_ros.core.geometry.ellipsoid import box_ious, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import SAME_ANSWER, invert_transform
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
 from cliploc_ros.core.map.similarities import Similarities, pair_similarities, sampled_spread

@@ -26,7 +26,7 @@ from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.search.frame_search import SearchedFrame

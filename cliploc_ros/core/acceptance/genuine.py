@@ -22,7 +22,8 @@ from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference
-from cliploc_ros.core.keyframes.localization import PER_RADIAN, RecognizedPlace
+from cliploc_ros.core.keyframes.localization import PER_RADIAN
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
 _TERMS = CALIBRATION.genuine

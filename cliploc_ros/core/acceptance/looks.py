@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import SAME_LOOK, invert_transform, pose_error
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.observation import Observation
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
 from cliploc_ros.core.acceptance.looks import EarlierLook
 from cliploc_ros.core.calibration import CALIBRATION
-from cliploc_ros.core.keyframes.localization import RecognizedPlace
+from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 
 _LOOK_ABOUT = 'turn the camera to more objects'
@@ -126,7 +126,7 @@ class Evidence:
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: The place that keyframes recognize at the pose
     prior: float = 0.0  #: Log odds, at most 0, of the pose given the prior region
-    #: Probability that odometry links all frames, see cliploc_ros.core.acceptance.comparison
+    #: Probability that odometry links all frames, see cliploc_ros.core.acceptance.links
     linked: float = 1.0
     #: The earlier looks and their confidence in this pose
     earlier: tuple[EarlierLook, ...] = ()

@@ -248,17 +248,18 @@ def _is_explained(poses: Sequence[_Pose], pose: _Pose) -> bool:
     so no acceleration is allowed. After a long silence, the robot must not have moved.
     """
     newest, at_rest = poses[-1], np.zeros((2, 3))
-    gap_s = (pose.stamp_ns - newest.stamp_ns) / NS_PER_S
+    gap_ns = pose.stamp_ns - newest.stamp_ns
+    gap_s = gap_ns / NS_PER_S
     row = bisect_right(poses, newest.stamp_ns - MOMENT_NS, key=_stamp_of)
     before = poses[max(row - 1, 0)]
     moment_s = (newest.stamp_ns - before.stamp_ns) / NS_PER_S
     speed = -_step(newest, before) / moment_s if moment_s else at_rest
     slack = _CHANGE * gap_s * min((moment_s + gap_s) / 2, _CHANGE_S)
-    # the gap is longer than a few lost messages
-    if gap_s * NS_PER_S > _MAX_GAP_NS and gap_s * NS_PER_S > _MOST_PERIODS * (
-            float(np.median(np.diff([each.stamp_ns for each in poses]))) if len(poses) > 1
-            else _SLOW_NS):
-        slack, speed = np.zeros(2), speed if gap_s <= LONG_NS / NS_PER_S else at_rest
+    period_ns = float(_SLOW_NS)
+    if gap_ns > _MAX_GAP_NS and len(poses) > 1:
+        period_ns = float(np.median(np.diff([each.stamp_ns for each in poses])))
+    if gap_ns > max(_MAX_GAP_NS, _MOST_PERIODS * period_ns):  # more than a few lost messages
+        slack, speed = np.zeros(2), speed if gap_ns <= LONG_NS else at_rest
     elif not row:  # the run has just begun: its poses are too close in time for a speed
         slack, speed = _FASTEST * gap_s, at_rest
     move, turn = gap_s * speed

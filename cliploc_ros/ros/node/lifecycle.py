@@ -289,7 +289,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         return self._attempt(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> Outcome:
-        """Free map and weights, at a shutdown from any state."""
+        """Free map and weights. A shutdown does the same, from any state."""
         return self._attempt(self._free)
 
     on_shutdown = on_cleanup
