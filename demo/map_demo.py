@@ -20,7 +20,8 @@ from cliploc_ros.offline.evaluation.recording import make_queries_of
 from cliploc_ros.offline.evaluation.run import run_methods
 from cliploc_ros.offline.evaluation.summary import Summary, summarize
 from cliploc_ros.offline.evaluation.trials import make_queries
-from cliploc_ros.offline.recording.recorder import LoadNetworks, record_every_frame
+from cliploc_ros.offline.recording.networks import LoadNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo.map_review import (
     PICTURE,
     console_lines,

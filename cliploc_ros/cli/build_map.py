@@ -239,7 +239,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
 
     from cliploc_ros.cli.sources import metres_of
     from cliploc_ros.offline.mapping.make_map import scale_of_objects
-    from cliploc_ros.offline.mapping.posed_detections import find_levelling
+    from cliploc_ros.offline.mapping.tilt import find_levelling
 
     scale, rotation = 1.0, np.eye(3)
     if folder_of(options) is None:  # folders are levelled when they are read

@@ -20,7 +20,7 @@ from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
-    from cliploc_ros.offline.datasets.map_recording import Images
+    from cliploc_ros.offline.datasets.images import Images
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 _ADVICE_SHOWN = 8
@@ -97,7 +97,7 @@ def check(options: argparse.Namespace) -> int:
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.evaluation.check_page import CHECK, figures_of, write_check
     from cliploc_ros.offline.mapping.check.checking import check_map
-    from cliploc_ros.offline.mapping.posed_detections import tilt_note
+    from cliploc_ros.offline.mapping.tilt import tilt_note
 
     begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)
@@ -157,7 +157,8 @@ def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections
 def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':
     """Return the recording of the command line or of the map, and its images if they are found."""
     from cliploc_ros.cli.sources import images_at
-    from cliploc_ros.offline.datasets.map_recording import images_of_recording, load_recording
+    from cliploc_ros.offline.datasets.images import images_of_recording
+    from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.recording.recorder import source_of
 

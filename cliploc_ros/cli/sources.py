@@ -34,12 +34,8 @@ from cliploc_ros.offline.datasets.frames import (
     join_frames,
     move_frames,
 )
-from cliploc_ros.offline.datasets.map_recording import (
-    Images,
-    MapRecording,
-    load_recording,
-    open_images,
-)
+from cliploc_ros.offline.datasets.images import Images, open_images
+from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
@@ -105,8 +101,8 @@ def images_at(options: argparse.Namespace, path: Path, cameras: Sequence[str]) -
 
     DatasetError: the path is neither, or a topic that the command line does not name is ambiguous.
     """
-    is_folder = path.exists() and find_layout(path) is not None
-    find_topics(options, None if is_folder or [*cameras] != [''] else path)
+    is_bag = path.exists() and find_layout(path) is None
+    find_topics(options, path if is_bag and [*cameras] == [''] else None)
     return open_images(path, bag_frames.BagTopics(
         options.image, options.camera_info, options.rectified), cameras)
 

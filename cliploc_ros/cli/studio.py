@@ -68,7 +68,7 @@ def make_parser() -> argparse.ArgumentParser:
 def serve(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C; return the exit code."""
     # Imported late, so that --help is fast.
-    from cliploc_ros.offline.mapping.posed_detections import tilt_note
+    from cliploc_ros.offline.mapping.tilt import tilt_note
     from cliploc_ros.offline.studio.page import serve_studio
     from cliploc_ros.offline.studio.web import once
 
@@ -104,11 +104,8 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
     from cliploc_ros.cli.sources import images_at
     from cliploc_ros.offline.datasets.folders import find_layout
-    from cliploc_ros.offline.datasets.map_recording import (
-        images_of_recording,
-        load_recording,
-        views_of_folder,
-    )
+    from cliploc_ros.offline.datasets.images import images_of_recording, views_of_folder
+    from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.studio.document import Document
     from cliploc_ros.offline.studio.recording import Recording

@@ -172,7 +172,7 @@ class Player:
                    on_message: Callable[[BagMessage], None]) -> tuple[Counter[str], float]:
         """Publish messages; return their number by topic, and the greatest delay [s]."""
         timeline = _Timeline(origin_ns, self.start_ns, self._options.rate, self._stop)
-        # /clock ticks on a regular grid of real time
+        # /clock ticks on a regular grid of real time; without a clock, nothing ticks
         step_ns = max(round(self._options.rate * NS_PER_S / (self._options.clock_hz or 1.0)), 1)
         tick_ns, counts, worst_lateness_s = self.start_ns, Counter[str](), 0.0
         for message in messages:

@@ -32,7 +32,8 @@ from cliploc_ros.offline.evaluation.recording import make_queries_of
 from cliploc_ros.offline.evaluation.run import compare_methods
 from cliploc_ros.offline.evaluation.trials import make_queries
 from cliploc_ros.offline.posed_query import PosedQuery
-from cliploc_ros.offline.recording.recorder import RunNetworks, record_every_frame
+from cliploc_ros.offline.recording.networks import RunNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo import ASSETS
 from demo.truth import SAME_OBJECT_IOU, TrueFrame, read_frames
 from demo.world import train_detector

@@ -33,7 +33,8 @@ from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions, RawFrame
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.offline.recording.recorder import MAX_DETECTIONS, RunNetworks, record_every_frame
+from cliploc_ros.offline.recording.networks import MAX_DETECTIONS, RunNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo import ASSETS
 from studies.keyframes.cases import (
     Case,

@@ -18,7 +18,8 @@ from cliploc_ros.cli.tum_to_bag import main as tum_to_bag
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets.map_recording import load_recording, open_images
+from cliploc_ros.offline.datasets.images import open_images
+from cliploc_ros.offline.datasets.map_recording import load_recording
 from cliploc_ros.offline.mapping.evidence import explained_boxes
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.views import make_views

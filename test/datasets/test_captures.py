@@ -44,8 +44,9 @@ from cliploc_ros.offline.datasets.observations import load_observations, save_ob
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.make_map import scale_of_objects
 from cliploc_ros.offline.mapping.options import MappingOptions
-from cliploc_ros.offline.mapping.posed_detections import find_vertical
-from cliploc_ros.offline.recording.recorder import RunNetworks, record_every_frame
+from cliploc_ros.offline.mapping.tilt import find_vertical
+from cliploc_ros.offline.recording.networks import RunNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
 
 pytestmark = pytest.mark.needs('pycolmap')
 METRES = FolderOptions(scale=1.0)

@@ -15,7 +15,7 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat, FolderOptions
-from cliploc_ros.offline.datasets.map_recording import open_images
+from cliploc_ros.offline.datasets.images import open_images
 from cliploc_ros.offline.datasets.parsing import (
     PRESETS,
     find_camera,

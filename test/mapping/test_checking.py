@@ -17,6 +17,7 @@ from cliploc_ros.cli.check_map import main
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError
@@ -406,6 +407,14 @@ def test_places_without_a_keyframe_are_counted_and_named(room_report):
     by_keyframes = replace(room_report, keyframes=full,
                            grid=replace(grid, accepted=0 * grid.accepted))
     assert any('only keyframes' in advice.text for advice in give_advice(by_keyframes))
+
+
+def test_a_map_that_leaves_no_free_position_is_checked():
+    hall = LandmarkMap('map', ('hall',), ('hall',), ('hall',), np.zeros((1, 3)),
+                       np.array([[4.0, 4.0, 3.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
+    report = check_map(hall, options=QUICK, layer=layer_at(view()))
+    assert len(report.grid.positions) == 0
+    assert report.keyframes.reached_positions == 0.0 and len(report.keyframes.headings) == 0
 
 
 def test_the_report_has_keyframes_only_where_there_are_some(tmp_path, run_here):

@@ -19,7 +19,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.views import make_views
-from cliploc_ros.offline.recording.recorder import RunNetworks
+from cliploc_ros.offline.recording.networks import RunNetworks
 
 ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.onnx')

@@ -29,7 +29,8 @@ from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.offline.recording.recorder import LoadNetworks, record_every_frame
+from cliploc_ros.offline.recording.networks import LoadNetworks
+from cliploc_ros.offline.recording.recorder import record_every_frame
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes

@@ -11,7 +11,7 @@ from browser import Person
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.offline.datasets.map_recording import open_images, views_of_folder
+from cliploc_ros.offline.datasets.images import open_images, views_of_folder
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio

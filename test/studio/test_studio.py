@@ -16,7 +16,7 @@ from websockets.http11 import Request
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.offline.datasets.map_recording import views_of_folder
+from cliploc_ros.offline.datasets.images import views_of_folder
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections

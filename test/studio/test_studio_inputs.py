@@ -14,7 +14,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bag_frames import BagTopics
 from cliploc_ros.offline.datasets.bags import BagWriter
-from cliploc_ros.offline.datasets.map_recording import open_images
+from cliploc_ros.offline.datasets.images import open_images
 from cliploc_ros.offline.studio import edits
 
 BAG_CAMERA = Camera(64, 48, 53.0, 53.0, 32.0, 24.0)

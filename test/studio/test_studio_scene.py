@@ -19,7 +19,7 @@ from cliploc_ros.core.geometry.depth import DepthImage
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.errors import MapError
 from cliploc_ros.offline.datasets.frames import RawFrame
-from cliploc_ros.offline.datasets.map_recording import Images
+from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio import viewpoint
 from cliploc_ros.offline.studio.edits import map_of

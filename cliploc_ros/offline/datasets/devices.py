@@ -261,14 +261,14 @@ def read_nerf(folder: Path, options: frames.FolderOptions) -> frames.Capture:
         full[:3, 3] /= scale
         depth = frame.text('depth_file_path', frame.text('depth_path', ''))
         files.append(frames.ImageFile(frames.NO_STAMP, color, cameras[shown], full,
-                               _file_of(path.parent, depth, None) if depth else None))
+                                      _file_of(path.parent, depth, None) if depth else None))
     # depth has the unit of the poses: metres, or the arbitrary unit of COLMAP; no field gives it
     unit = next((meta.number(name) for name in ('depth_unit_scale_factor', 'integer_depth_scale')
                  if name in meta), None)
     if unit is not None and unit <= 0.0:
         raise DatasetError(f'{path}: the unit of depth is {unit:g}, not above 0')
     return frames.Capture.of(files, path, 'opengl', frames.DepthFormat(unit, scale=1.0 / scale),
-                              is_metric=False)
+                             is_metric=False)
 
 
 def _file_of(folder: Path, name: str, images: Path | None) -> Path:

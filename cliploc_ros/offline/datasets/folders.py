@@ -43,7 +43,7 @@ from cliploc_ros.offline.datasets.parsing import (
 )
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_tum
-from cliploc_ros.offline.mapping.posed_detections import find_levelling, tilt_note
+from cliploc_ros.offline.mapping.tilt import find_levelling, tilt_note
 from cliploc_ros.units import NS_PER_S
 
 # Depth and colour of 7-Scenes are not registered, and its authors give no intrinsics for colour.

@@ -40,6 +40,8 @@ IMAGES = ('.jpg', '.jpeg', '.png')
 _INVENTED_STEP_NS = NS_PER_S
 # Files store rotations with few digits.
 _ROTATION_TOLERANCE = 1e-2
+
+
 @dataclass(frozen=True)
 class PosedImage:
     """An image (h, w, 3) uint8, RGB, with its camera, pose and depth.

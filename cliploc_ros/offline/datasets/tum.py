@@ -249,6 +249,7 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
     # only this needs rosbags; core tests with few packages read trajectories
     from cliploc_ros.offline.datasets import bag_messages
     from cliploc_ros.offline.datasets.bags import BagWriter
+
     recorded = detections or {}
     if detections is not None and not any(stamp in detections for stamp in sequence.stamps_ns):
         raise DatasetError(

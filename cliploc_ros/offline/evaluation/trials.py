@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Make queries, also with simulated sensors, and run methods on them: poses and their errors.
+"""Make queries, also with simulated sensors, and run methods on them: poses and their errors."""
 
-Every method gets the same input.
-"""
-
-import logging
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -41,7 +37,6 @@ from cliploc_ros.units import NS_PER_S
 GIVEN = 'given'
 #: Greatest difference in time between a query and its given pose [ms]: evo's default.
 GIVEN_TOLERANCE_MS = 10
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,7 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
     missing = [texts for texts, rows in found.items() if rows is None]
     if missing:
         all_texts = [text for texts in missing for text in texts]
-        logger.warning('CLIP encodes %d phrases of %d classes; later runs use the cache',
+        logger.warning('CLIP encodes %d phrases in %d groups; later runs use the cache',
                        len(all_texts), len(missing))
         ends = np.cumsum([len(texts) for texts in missing])
         for texts, rows in zip(missing, np.split(encode_labels(weights, all_texts, options),

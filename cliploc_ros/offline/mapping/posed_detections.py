@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The input of mapping: detections and poses of many frames, and the vertical of the poses."""
+"""The input of mapping: the detections of many frames, and the pose of each frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,12 +9,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.errors import DatasetError
 
 # Intrinsics that differ by a smaller share belong to one camera that refocuses.
 _SAME_CAMERA = 0.02
@@ -22,12 +20,6 @@ _PER_BOX = ('bboxes_xyxy', 'classes', 'scores', 'depths', 'depth_spreads', 'embe
             'open_edges')
 _PER_FRAME = ('map_from_camera', 'stamps_s', 'odom_from_camera', 'camera_rows', 'stamps_ns',
               'detector_ms', 'clip_ms')
-# Cameras look along the ground; one that only turns about its own x axis shows no vertical.
-_LEAST_SPREAD = np.sin(np.radians(8.0)) ** 2
-_MOST_SHARE = 0.25
-_LEAST_UPRIGHT = 0.5
-# Accuracy of a vertical that is estimated from the tilt of hand-held cameras.
-_MOST_TILT_DEG = 5.0
 
 
 @dataclass(frozen=True)
@@ -168,70 +160,3 @@ def names_of_group(cameras: Sequence[Camera]) -> tuple[str, ...]:
         return ('',)
     return tuple(f'{number}: {camera.width}x{camera.height}'
                  for number, camera in enumerate(cameras, 1))
-
-
-def find_vertical(poses: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the direction (3,) that points up in the poses' coordinate frame.
-
-    People hold a camera level, with its x axis horizontal. Up is therefore the direction along
-    which the x axes have the least extent, and in which the upper edge of the image points on
-    average.
-
-    Parameters
-    ----------
-    poses : ndarray (n, 4, 4)
-
-    Returns
-    -------
-    ndarray or None
-        None if the vertical is unknown: the cameras never turn, or are held on their side.
-    """
-    level, image_up = poses[:, :3, 0], -poses[:, :3, 1]
-    shares, directions = np.linalg.eigh(level.T @ level / len(level))
-    up = directions[:, 0] * (np.sign(image_up.mean(axis=0) @ directions[:, 0]) or 1.0)
-    if (shares[1] < _LEAST_SPREAD or shares[0] > _MOST_SHARE * shares[1]
-            or np.mean(image_up @ up) < _LEAST_UPRIGHT):
-        return None
-    return np.asarray(up)
-
-
-def rotation_to_z(up: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the least rotation (3, 3) of a direction to the z axis, and its angle [deg]."""
-    angle = float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0))))
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    if np.linalg.norm(axis) < 1e-9:
-        axis = np.array([1.0, 0.0, 0.0])
-    axis = axis / np.linalg.norm(axis)
-    return Rotation.from_rotvec(np.radians(angle) * axis).as_matrix(), angle
-
-
-def find_tilt(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], float] | None:
-    """Return the rotation (3, 3) that turns z up, and its angle [deg].
-
-    None if the vertical of the poses (n, 4, 4) is unknown, see find_vertical.
-    """
-    up = find_vertical(poses) if len(poses) else None
-    return None if up is None else rotation_to_z(up)
-
-
-def tilt_note(poses: NDArray[np.float64]) -> str:
-    """Return a note if z is off the vertical of the cameras, '' otherwise."""
-    found = find_tilt(poses)
-    return '' if found is None or found[1] < _MOST_TILT_DEG else (
-        f'z is {found[1]:.0f} degrees off the vertical of the cameras: heights and views from '
-        'above are meaningless; build_map --level corrects it')
-
-
-def find_levelling(poses: NDArray[np.float64], is_wanted: bool
-                   ) -> tuple[NDArray[np.float64], str]:
-    """Return the rotation (3, 3) that turns z up, the identity unless it is wanted, and a note.
-
-    DatasetError: it is wanted, but the vertical of the poses (n, 4, 4) is unknown.
-    """
-    if not is_wanted:
-        return np.eye(3), tilt_note(poses)
-    found = find_tilt(poses)
-    if found is None:
-        raise DatasetError('the vertical is unknown: the cameras turn too little, or were held on '
-                           'their side; leave out `level`')
-    return found[0], f'levelled: the vertical of the cameras was {found[1]:.1f} degrees off z'

@@ -9,7 +9,6 @@ continues. Every box is the seed of some hypotheses, so that rarely detected obj
 too.
 """
 
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -285,7 +285,7 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
         parts[0].changed(**shape_fields(*fit), **_NO_EVIDENCE,
                          class_weights=None if classes is None else dict(classes)),
         look=_merge_looks([part.look for part in parts],
-                         [part.details.support or 1 for part in parts]))
+                          [part.details.support or 1 for part in parts]))
     return _change_of(f'merge {", ".join(ids)}', landmarks,
                       {ids[0]: merged, **dict.fromkeys(ids[1:])})
 
@@ -319,7 +319,7 @@ def take_fits(landmarks: Landmarks, landmark_ids: Iterable[str], fitted: Landmar
 
 
 def _merge_looks(looks: Sequence[LandmarkEmbeddings | None], weights: Sequence[float]
-                ) -> LandmarkEmbeddings | None:
+                 ) -> LandmarkEmbeddings | None:
     """Merge the looks of several landmarks, of one encoder; None if no look is known.
 
     The weights are, for example, the numbers of boxes.

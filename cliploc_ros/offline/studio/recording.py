@@ -19,7 +19,7 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets.map_recording import Images
+from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.building import refit_map
 from cliploc_ros.offline.mapping.check.findings import Witness, hear_witness

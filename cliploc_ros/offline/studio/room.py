@@ -19,7 +19,7 @@ from cliploc_ros.core.geometry.depth import points_in_color
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import MapError
-from cliploc_ros.offline.datasets.map_recording import Images
+from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.viewpoint import Bounds, wxyz_of

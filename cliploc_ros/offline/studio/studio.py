@@ -204,22 +204,26 @@ class Studio:
 
     def lock(self, ids: Sequence[str] | None = None) -> str:
         """Lock landmarks, by default the selection; unlock them if all are locked."""
-        return self._toggle(ids, 'is_locked', 'locked', 'unlocked')
+        return self._toggle(ids, 'is_locked', ('lock', 'locked'), ('unlock', 'unlocked'))
 
     def hide(self, ids: Sequence[str] | None = None) -> str:
         """Hide landmarks, by default the selection; show them if all are hidden."""
-        return self._toggle(ids, 'is_hidden', 'hid', 'showed')
+        return self._toggle(ids, 'is_hidden', ('hide', 'hid'), ('show', 'showed'))
 
-    def _toggle(self, ids: Sequence[str] | None, name: str, on: str, off: str) -> str:
-        """Set a mark, or clear it if all landmarks have it. `on` and `off` say it in the log."""
+    def _toggle(self, ids: Sequence[str] | None, name: str, on: tuple[str, str],
+                off: tuple[str, str]) -> str:
+        """Set a mark, or clear it if all landmarks have it.
+
+        `on` and `off` are the verbs of both: in the history, and in the log.
+        """
         if ids is not None and not (isinstance(ids, list)
                                     and all(isinstance(key, str) for key in ids)):
-            raise EditError(f'{name}: expected a list of ids, not {ids!r:.60}')
+            raise EditError(f'{on[0]}: expected a list of ids, not {ids!r:.60}')
         ids, landmarks = ids or self.document.chosen(), self.document.landmarks
         have_it = all(getattr(landmarks[key], name) for key in ids if key in landmarks)
-        what = off if have_it else on
-        self.document.edit(edits.mark, ids, what, **{name: not have_it})
-        return f'{what} {", ".join(ids)}'
+        verb, past = off if have_it else on
+        self.document.edit(edits.mark, ids, verb, **{name: not have_it})
+        return f'{past} {", ".join(ids)}'
 
     def split(self) -> str:
         """Split the selected landmark along its longest axis, and select both halves."""

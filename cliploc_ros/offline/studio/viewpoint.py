@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.offline.mapping.posed_detections import find_tilt, rotation_to_z
+from cliploc_ros.offline.mapping.tilt import find_tilt, rotation_to_z
 
 #: The vertical angle of view [rad].
 FOV_RAD = 0.9

@@ -51,8 +51,9 @@ from cliploc_ros.offline.mapping.check.report import (
 )
 from cliploc_ros.offline.mapping.evidence import BoxQuality, best_ious, explained_boxes
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, Thresholds
-from cliploc_ros.offline.mapping.posed_detections import PosedDetections, tilt_note
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import find_corrections
+from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 from cliploc_ros.offline.simulation import DetectorModel, guess_detector
 from cliploc_ros.offline.vocabulary.vocabulary import size_of_class
@@ -70,7 +71,7 @@ _HEIGHT_MARGIN_M = 0.3
 # Least number of classes to estimate the scale of a map, and the least factor that is reported:
 # ellipsoids enclose objects loosely, or only parts of them. Chosen.
 _LEAST_CLASSES, _OFF = 3, 1.8
-_MOST_OF_A_KIND = 5
+_MOST_OF_A_KIND, _MOST_MISLED = 5, 3
 # Shorter runs of refused frames, and smaller areas of the grid, get no advice.
 _MIN_SPAN = 2
 # Cosine of the angle between views of one side: 45 degrees, chosen.
@@ -139,9 +140,8 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     tilt = '' if detections is None else tilt_note(detections.map_from_camera)
     notes.append(tilt or _where_cameras_can_be(recorded))  # a tilted map has no true heights
     overlaps = find_map_overlaps(landmark_map, witness, views)
-    places = make_grid(landmark_map, None if recorded is None or detections is None else recorded[
-        detections.frame_cameras == 0],
-                       options)
+    places = make_grid(landmark_map, None if detections is None else
+                       detections.map_from_camera[detections.frame_cameras == 0], options)
     trials = try_poses(model, landmark_map, places.poses, options,
                        partial(tell, 'relocalizing on the grid'))
     verdicts = np.array([trial.verdict for trial in trials], dtype=np.str_)
@@ -263,10 +263,10 @@ def give_advice(report: CheckReport) -> list[Advice]:
     return advice or [Advice('nothing to do: the map reaches all thresholds that were checked')]
 
 
-def _some(advice: Sequence[Advice], what: str) -> list[Advice]:
+def _some(advice: Sequence[Advice], what: str, most: int = _MOST_OF_A_KIND) -> list[Advice]:
     """Return the first pieces of advice, and how many more there are."""
-    more = len(advice) - _MOST_OF_A_KIND
-    return [*advice[:_MOST_OF_A_KIND], *[Advice(f'and {more} more {what}')] * (more > 0)]
+    more = len(advice) - most
+    return [*advice[:most], *[Advice(f'and {more} more {what}')] * (more > 0)]
 
 
 def _on_look_alike(pair: LookAlike, misled: Sequence[Trial]) -> Advice:
@@ -327,7 +327,7 @@ def _on_misled(report: CheckReport, misled: Sequence[Trial]) -> list[Advice]:
                          f'misled by {trial.error_m:.1f} m: raise the parameter min_confidence, '
                          'or map more distinct objects there', view=trial)
                   for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))],
-                 'views that mislead a robot')
+                 'views that mislead a robot', most=_MOST_MISLED)
 
 
 def _on_spans(report: CheckReport, trials: Sequence[Trial]) -> Iterator[Advice]:

@@ -301,6 +301,10 @@ def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
     Cameras are at positions (n, 3) [m] and look along unit vectors (n, 3).
     """
     places, axes = layer.map_from_camera[:, :3, 3], layer.map_from_camera[:, :3, 2]
-    angles = np.degrees(np.arccos(np.clip(forward @ axes.T, -1.0, 1.0)))
-    distances = np.linalg.norm(positions[:, None] - places, axis=2)
-    return np.asarray((distances / NEAR_M + angles / NEAR_DEG < 1.0).any(axis=1))
+    found = np.zeros(len(positions), dtype=np.bool_)
+    # one view at a time: a table of all pairs takes gigabytes
+    for row, (position, axis) in enumerate(zip(positions, forward, strict=True)):
+        angles = np.degrees(np.arccos(np.clip(axes @ axis, -1.0, 1.0)))
+        costs = np.linalg.norm(places - position, axis=1) / NEAR_M + angles / NEAR_DEG
+        found[row] = bool((costs < 1.0).any())
+    return found

@@ -34,17 +34,19 @@ from cliploc_ros.offline.mapping.update.alignment import (
     align,
     known_landmarks,
 )
-from cliploc_ros.offline.mapping.update.judging import (
-    LEAST_VIEWS,
+from cliploc_ros.offline.mapping.update.identity import (
     Fates,
-    Judgement,
-    Shown,
     compare_looks,
     decide_fates,
-    gather_objects,
-    judge,
     renew_embeddings,
     why_not_comparable,
+)
+from cliploc_ros.offline.mapping.update.judging import (
+    LEAST_VIEWS,
+    Judgement,
+    Shown,
+    gather_objects,
+    judge,
 )
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 
