@@ -66,7 +66,9 @@ def read_file(path: str | os.PathLike[str], most_bytes: int = MOST_BYTES) -> byt
     with open_file(path) as file:
         # check the size first: that of a sparse file is not limited by the disk
         size = os.fstat(file.fileno()).st_size
-        content = file.read(most_bytes + 1) if size <= most_bytes else b''
+        content: bytes | None = file.read(most_bytes + 1) if size <= most_bytes else b''
+    if content is None:  # a stream of the kernel, such as /proc/kmsg, with nothing to read now
+        raise OSError(errno.EINVAL, 'not a regular file')
     if max(size, len(content)) > most_bytes:
         raise OSError(errno.EFBIG, f'larger than {most_bytes // 2**20} MiB')
     return content

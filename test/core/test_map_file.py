@@ -153,7 +153,7 @@ def test_broken_and_hostile_files_are_refused(tmp_path, content, message):
 def test_what_has_no_end_is_not_read(tmp_path):
     pipe = tmp_path / 'pipe'
     os.mkfifo(pipe)
-    for path in ('/dev/zero', pipe, tmp_path):
+    for path in ('/dev/zero', '/proc/kmsg', pipe, tmp_path):
         with pytest.raises(MapError, match='regular file'):
             LandmarkMap.from_file(path)
 

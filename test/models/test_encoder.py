@@ -107,10 +107,10 @@ def test_each_class_is_encoded_once(clip, caplog):
     for texts, (own, rows) in found.items():
         assert own == texts
         np.testing.assert_allclose(rows, encode_labels(weights, texts, clip), atol=1e-6)
-    assert '3 phrases of 2 ' in caplog.text
+    assert '3 phrases in 2 groups' in caplog.text
     caplog.clear()
     more = embed_phrases(weights, clip, [MUG, BOX, CAN])
-    assert '2 phrases of 1 ' in caplog.text
+    assert '2 phrases in 1 groups' in caplog.text
     caplog.clear()
     again = embed_phrases(weights, clip, [CAN, MUG])
     assert caplog.text == ''
