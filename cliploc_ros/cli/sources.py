@@ -44,14 +44,11 @@ from cliploc_ros.offline.recording import recorder
 from cliploc_ros.units import NS_PER_S
 
 # Options that change how the frames of a recording are read.
-_READING = ('pose_topic', 'map_frame', 'camera_frame', 'trajectory', 'mount', 'max_gap', 'image',
-            'camera_info', 'rectified', 'depth', 'depth_unit', 'depth_intrinsics',
-            'depth_baseline', 'intrinsics')
+_READING = ('pose_topic', 'map_frame', 'camera_frame', 'tf', 'trajectory', 'mount', 'max_gap',
+            'stamp_tolerance', 'image', 'camera_info', 'rectified', 'depth', 'depth_unit',
+            'depth_intrinsics', 'depth_baseline', 'intrinsics', 'cameras')
 # Options that define the poses of a folder.
 _PLACING = ('axes', 'scale', 'known_distance', 'level')
-# Further such options that were added later: at their defaults, older observation files stay
-# valid.
-_READING_MORE = {'tf': None, 'stamp_tolerance': 0.02}
 
 
 def detector_options(options: argparse.Namespace, **more: Any) -> DetectorOptions:
@@ -142,10 +139,7 @@ def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeO
     They include a text with all options that affect reading, and with `more` from the program.
     Each text has its own observation file.
     """
-    reading = [*(str(getattr(options, name)) for name in _READING),
-               *(options.cameras if options.cameras != [''] else []), *map(str, more),
-               *(f'{name} {getattr(options, name)}' for name, usual in _READING_MORE.items()
-                 if getattr(options, name) != usual)]
+    reading = [*(str(getattr(options, name)) for name in _READING), *map(str, more)]
     conf = {'conf': options.conf} if 'conf' in options else {}
     return recorder.RecordingOptions(
         detector_options(options, **conf), clip_options(options) if options.clip else None,

@@ -280,10 +280,6 @@ def test_recordings_depend_on_the_vocabulary(folder):
         options_of(folder), options_of(folder, prompts=THREE[:2]),
         options_of(folder, text_model=''), options_of(folder, prompts=(), text_model=''))]
     assert len(set(described)) == 4
-    # files of earlier releases stay valid
-    assert json.loads(described[3])['yolo'] == {
-        'model': str(folder / 'world.pt'), 'conf': 0.0, 'iou': 0.7, 'imgsz': 320, 'max_det': 300,
-        'device': 'auto', 'precision': 'auto'}
 
 
 def test_profiles_name_published_networks():

@@ -102,10 +102,9 @@ def _data(report: CheckReport) -> dict[str, Any]:
                  'trials': [trial for trial in grid.trials if trial.verdict == 'misled']}}
     if recording is not None:
         data['recording'] = {
-            **vars(recording), 'simulated': None, 'judged_frames': len(recording.judged),
+            **vars(recording), 'judged_frames': len(recording.judged),
             'verdicts': count_verdicts(recording.trials),
-            'verdicts_by_objects': count_by_objects(recording.trials),
-            'verdicts_with_simulated_boxes': count_verdicts(recording.simulated)}
+            'verdicts_by_objects': count_by_objects(recording.trials)}
     if layer is not None:
         data['keyframes'] = {
             'keyframes': layer.keyframes, 'points': layer.points,
@@ -189,9 +188,7 @@ def figures_of(report: CheckReport) -> list[tuple[str, str]]:
             ('explained boxes, median IoU; map as given',
              f'{recording.as_given.explained:.1%}, {recording.as_given.median_iou:.3f} '
              '(optimistic if the map was built from this recording)'),
-            (f'recorded frames, cross-validated, {report.evidence}', _verdicts(recording.judged)),
-            ('the same poses with simulated boxes', _verdicts(recording.simulated)),
-            ('noise of box edges', f'{recording.edge_scale:.2f} times that assumed by build_map')]
+            (f'recorded frames, cross-validated, {report.evidence}', _verdicts(recording.judged))]
         if len(recording.judged) < len(recording.trials):
             rows.append(('also frames whose objects are in no other part of the recording',
                          _verdicts(recording.trials)))
@@ -213,33 +210,19 @@ def _verdicts(trials: Sequence[Trial]) -> str:
 
 
 def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
-    head = ('landmark', 'label', 'faults', '#frames', '#seen [%]', '#baseline [°]',
-            '#deviation [cm]', '#offset [cm]', '#IoU', '#thinness', 'overlaps with')
     rows: list[list[str | tuple[str, str]]] = []
     for check in landmarks[:_MOST_LANDMARKS]:
-        support = '' if check.support is None else (
-            str(check.support) if check.expected is None
-            else f'{check.support} of {check.expected}')
+        frames = '' if check.support is None else str(check.support)
+        if check.expected is not None:
+            frames += f' of {check.expected}'
         label = (check.class_id if check.label == check.class_id
                  else f'{check.label} ({check.class_id})')
-        numbers = [(check.seen_ratio, 100.0, 0), (check.baseline_deg, 1.0, 0),
-                   (check.position_sigma_m, 100.0, 1), (check.offset_m, 100.0, 1),
-                   (check.median_iou, 1.0, 2), (check.thinness, 1.0, 2)]
-        texts = [support, *('' if value is None else f'{value * factor:.{digits}f}'
-                            for value, factor, digits in numbers)]
         faults = '; '.join(check.faults) if check.faults else _GRADES['sound'][0]
-        rows.append([
-            (check.landmark_id, _grade(check)), (label, 'text'), (faults, 'text'), *texts,
-            ', '.join(f'{name} ({distance:.2f})' for name, distance in check.overlaps)])
-    rest = len(landmarks) - _MOST_LANDMARKS
-    more = html.note(f'{rest} more landmarks are in the JSON file') if rest > 0 else ''
-    return html.table(head, rows) + more + html.note(
+        rows.append([(check.landmark_id, _grade(check)), (label, 'text'), (faults, 'text'),
+                     frames])
+    return html.table(('landmark', 'label', 'faults', '#frames'), rows) + html.note(
         'frames: number of frames with a detection of the landmark, of the frames that should '
-        'show it. seen: their share. baseline: largest angle between two views. deviation: '
-        'standard deviation of the centre along its worst axis. offset: distance between the '
-        'centre and the centre of a fit to the boxes. IoU: median over the boxes. thinness: '
-        'smallest semi-axis divided by the largest. In brackets: normalized distance of '
-        'overlapping landmarks.')
+        f'show it. {CHECK_DATA} has all figures of all {len(landmarks)} landmarks.')
 
 
 # ---- the map from above -------------------------------------------------------------------------
@@ -253,8 +236,8 @@ def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
            'three. Ticks show the headings at which a wrong pose was accepted. Positions inside '
            'landmarks are omitted. Numbers refer to the advice.',
            _drawn(_draw_grid, landmark_map, report))
-    yield ('landmarks', 'Top view of the landmarks. Landmarks with a fault are named; if there '
-           'are many, only those with a serious fault. Arrows are recorded frames, each '
+    yield ('landmarks', f'Top view of the landmarks. The {_MOST_NAMES} worst with a fault are '
+           'named. Arrows are recorded frames, each '
            'relocalized in a map that was fitted without the frames of that time; a line leads to '
            'a wrong pose. Circles of one number are places that look alike.',
            _drawn(_draw_landmarks, landmark_map, report))
@@ -319,9 +302,7 @@ def _draw_landmarks(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) 
     for name, (words, color) in _GRADES.items():
         axes.plot([], [], 'o', color=color, alpha=0.6, markersize=9,
                   label=f'{words} ({counts[name]})')
-    is_many = len(landmark_map) - counts['sound'] > _MOST_NAMES
-    for check in [check for check in report.landmarks if check.faults and not (
-            is_many and grades[check.landmark_id] != 'faulty')][:_MOST_NAMES]:
+    for check in [check for check in report.landmarks if check.faults][:_MOST_NAMES]:
         write_name(axes, check.center[:2], check.landmark_id)
     trials = report.recording.trials if report.recording is not None else ()
     axes.set_title('Landmarks and recorded frames' if trials else 'Landmarks', fontsize=12)

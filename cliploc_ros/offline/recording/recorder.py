@@ -135,15 +135,13 @@ def source_of(observations: Path) -> Path | None:
 def describe(frames: Frames, options: RecordingOptions) -> str:
     """Return everything that the observations depend on, as JSON."""
     clip = options.clip
-    files = [options.detector.model]
-    if options.detector.text_model:
-        files.append(options.detector.text_model)
+    files = [options.detector.model, options.detector.text_model]
     if clip is not None:
         files += [clip.model, clip.pretrained, clip.checkpoint_path]
     return json.dumps({
         'source': [frames.source.name, _state(frames.source.resolve()), frames.count,
                    *([frames.digest] if frames.digest else [])],
-        'yolo': _settings(options.detector), 'clip': None if clip is None else _settings(clip),
+        'detector': _settings(options.detector), 'clip': None if clip is None else _settings(clip),
         # Path('') is the working folder, whose state changes with every file written there
         'files': [_state(Path(file)) if file else None for file in files],
         'keyframes': asdict(options.keyframes), 'reading': options.reading})
@@ -388,10 +386,7 @@ def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> 
 
 def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
     """Return the options that change the output of a network."""
-    # as in files of older versions
-    settings = asdict(options) | {'device': 'auto', 'precision': 'auto'}
-    return {name: value for name, value in settings.items() if name != 'cache_dir'
-            and (value or name not in ('prompts', 'text_model'))}
+    return {name: value for name, value in asdict(options).items() if name != 'cache_dir'}
 
 
 def _state(path: Path) -> tuple[int, int] | None:

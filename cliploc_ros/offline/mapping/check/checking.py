@@ -36,7 +36,6 @@ from cliploc_ros.offline.mapping.check.relocalization import (
     make_folds,
     measure_detector,
     refused_spans,
-    sample_frames,
     try_poses,
     try_recording,
 )
@@ -55,7 +54,7 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.tilt import tilt_note
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
-from cliploc_ros.offline.simulation import DetectorModel, guess_detector
+from cliploc_ros.offline.simulation import guess_detector
 from cliploc_ros.offline.vocabulary.vocabulary import size_of_class
 
 _NOTES = (
@@ -127,14 +126,12 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         witness = hear_witness(views, landmark_map, detections.class_names)
         if not (witness.shown >= 0).any():
             raise MappingError(_unrelated(landmark_map, detections))
-        models = [measure_detector(landmark_map, detections, views, witness, number)
-                  for number in range(len(detections.cameras))]
-        model = models[0]
-        if len(models) > 1:
+        model = measure_detector(landmark_map, detections, views, witness)
+        if len(detections.cameras) > 1:
             notes.append(f'the grid uses one camera, {detections.camera_names[0]}, the first of '
-                         f'{len(models)}')
+                         f'{len(detections.cameras)}')
         recording = _check_recording(
-            landmark_map, detections, views, witness, models, options, tell,
+            landmark_map, detections, views, witness, options, tell,
             None if layer is None or image_of is None else RecordedKeyframes(layer, image_of))
         notes += _notes_on(recording)
     tilt = '' if detections is None else tilt_note(detections.map_from_camera)
@@ -163,8 +160,8 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
 
 
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
-                     witness: Witness, models: Sequence[DetectorModel], options: CheckOptions,
-                     tell: Progress, keyframes: RecordedKeyframes | None) -> RecordingCheck:
+                     witness: Witness, options: CheckOptions, tell: Progress,
+                     keyframes: RecordedKeyframes | None) -> RecordingCheck:
     tell('cross-validating', 0.0)
     folds, held_out = [], []
     for fold in make_folds(views, witness, options):
@@ -176,11 +173,6 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         tell('cross-validating', len(folds) / options.folds)
     trials = try_recording(landmark_map, detections, witness.shown, folds, options,
                            partial(tell, 'relocalizing recorded frames'), keyframes)
-    sampled = sample_frames(detections, options.frames)
-    own = [sampled[detections.frame_cameras[sampled] == number] for number in range(len(models))]
-    simulated = [trial for model, frames in zip(models, own, strict=True) for trial in try_poses(
-        model, landmark_map, detections.map_from_camera[frames], options,
-        partial(tell, 'relocalizing simulated frames'))]
     tell('looking for systematic errors', 0.0)
     return RecordingCheck(
         frames=len(detections), boxes=len(detections.classes),
@@ -188,9 +180,8 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         path_xyz=detections.map_from_camera[:, :3, 3],
         as_given=explained_boxes(views, witness.landmarks),
         held_out=BoxQuality.of(np.concatenate(held_out)),
-        trials=tuple(trials), simulated=tuple(simulated),
-        corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
-        edge_scale=models[0].edge_scale)
+        trials=tuple(trials),
+        corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)))
 
 
 def _where_cameras_can_be(recorded: NDArray[np.float64] | None) -> str:
@@ -213,7 +204,7 @@ def _notes_on(recording: RecordingCheck) -> list[str]:
     if not recording.can_judge_frames:
         notes.append(f'cross-validation cannot judge frames: other parts of the recording show '
                      f'the objects of {len(recording.judged)} of {len(recording.trials)}; the '
-                     'verdict uses simulated boxes; pass each place twice for a better test')
+                     'verdict uses the grid alone; pass each place twice for a better test')
     return notes
 
 

@@ -116,8 +116,8 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
 
 
 def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
-                     witness: Witness, camera: int = 0) -> DetectorModel:
-    """Return a model of the detector of a recording, for the images of one of its cameras.
+                     witness: Witness) -> DetectorModel:
+    """Return a model of the detector of a recording, for the images of its first camera.
 
     The model never detects a landmark that was never detected in the recording.
     """
@@ -135,7 +135,7 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
                            & (distances > 0.0))[frames]]
         sightings.append(Sightings(offsets[expected] / distances[expected, None],
                                     np.isin(expected, views.frames[rows])))
-    own = detections.frame_cameras == camera
+    own = detections.frame_cameras == 0
     sides = np.diff(detections.bboxes_xyxy[own[views.frames]].reshape(-1, 2, 2), axis=1
                     ).min(axis=(1, 2))
     min_side = float(np.quantile(sides, 0.01)) if len(sides) else GUESSED_MIN_SIDE_PX
@@ -151,7 +151,7 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
     residuals = np.abs(linear.residuals[linear.weights > 0.0])
     scale = float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
     return DetectorModel(
-        landmark_map, detections.cameras[camera], tuple(sightings), witness.evidence.seen_ratio,
+        landmark_map, detections.cameras[0], tuple(sightings), witness.evidence.seen_ratio,
         reach, scale, min_side, tuple(clutter))
 
 

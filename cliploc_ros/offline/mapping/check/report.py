@@ -69,11 +69,7 @@ class RecordingCheck:
     as_given: BoxQuality
     held_out: BoxQuality  #: Cross-validated over time
     trials: tuple[Trial, ...]  #: Recorded frames in cross-validated maps, in the order of time
-    #: The same poses in the map as it is, with simulated boxes. As many should be accepted as with
-    #: recorded boxes: otherwise the grid is too optimistic or too pessimistic.
-    simulated: tuple[Trial, ...]
     corrections: tuple[Correction, ...]
-    edge_scale: float  #: Deviation of box edges, relative to the assumption of build_map
 
     @property
     def judged(self) -> tuple[Trial, ...]:
@@ -250,11 +246,10 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
                                  limits.min_explained, False),
                          Measure('held-out median IoU', recording.held_out.median_iou,
                                  limits.min_iou, False, 'number')]
-        # with too few judged frames (each object was passed only once), simulated ones count
-        how, trials = ((report.evidence, recording.judged) if recording.can_judge_frames else
-                       ('with simulated boxes', recording.simulated))
-        measures.append(Measure(f'recorded frames accepted {how}', share(trials, 'accepted'),
-                                limits.min_accepted, False))
+        if recording.can_judge_frames:
+            measures.append(Measure(f'recorded frames accepted {report.evidence}',
+                                    share(recording.judged, 'accepted'), limits.min_accepted,
+                                    False))
     if report.keyframes is not None and report.evidence != 'by objects':
         measures.append(Measure(BY_OBJECTS, report.grid.accepted_positions,
                                 limits.min_by_objects, False))
