@@ -17,14 +17,7 @@ from cliploc_ros.core.geometry.depth import DepthCamera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, OptionsError
-from cliploc_ros.models.protocols import (
-    ClipOptions,
-    DetectorOptions,
-    prompts_of_map,
-    prompts_of_names,
-    with_detector,
-    with_encoder,
-)
+from cliploc_ros.models import protocols
 from cliploc_ros.offline.datasets import bag_frames, bag_poses
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import (
@@ -51,21 +44,21 @@ _READING = ('pose_topic', 'map_frame', 'camera_frame', 'tf', 'trajectory', 'moun
 _PLACING = ('axes', 'scale', 'known_distance', 'level')
 
 
-def detector_options(options: argparse.Namespace, **more: Any) -> DetectorOptions:
+def detector_options(options: argparse.Namespace, **more: Any) -> protocols.DetectorOptions:
     """Return the detector that the command line names."""
     words = options.detector_vocabulary
     prompts = () if not words else (
-        prompts_of_map(LandmarkMap.from_file(words), words) if words.endswith('.yaml')
-        else prompts_of_names(words))
-    return with_detector(DetectorOptions(
+        protocols.prompts_of_map(LandmarkMap.from_file(words), words) if words.endswith('.yaml')
+        else protocols.prompts_of_names(words))
+    return protocols.with_detector(protocols.DetectorOptions(
         model=options.model, prompts=prompts, text_model=options.text_model, **more),
         options.profile)
 
 
-def clip_options(options: argparse.Namespace) -> ClipOptions:
+def clip_options(options: argparse.Namespace) -> protocols.ClipOptions:
     """Return the CLIP that the command line names."""
-    return with_encoder(ClipOptions(model=options.clip_model, pretrained=options.clip_pretrained),
-                        options.profile)
+    return protocols.with_encoder(protocols.ClipOptions(
+        model=options.clip_model, pretrained=options.clip_pretrained), options.profile)
 
 
 def metres_of(text: str, option: str) -> float:

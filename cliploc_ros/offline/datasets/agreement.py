@@ -13,28 +13,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    make_transform,
-    quaternion_from_transform,
-    rotation_angle_deg,
-    transform_from_pose,
-)
 from cliploc_ros.core.keyframes.features import SIFT, extract
 from cliploc_ros.errors import DatasetError
 
 _Pose = NDArray[np.float64]
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # A camera that looks forward, on a body with the axes forward, left, up (REP 103).
-_BODY_FROM_CAMERA = make_transform(
+_BODY_FROM_CAMERA = transforms.make_transform(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 #: Conventions of a stored pose; each function converts to map_from_camera with OpenCV's axes.
 AXES: Mapping[str, Callable[[_Pose], _Pose]] = {
     'opencv': lambda pose: pose,
     'opengl': lambda pose: pose @ _FLIP,
-    'opencv-inverse': invert_transform,
-    'opengl-inverse': lambda pose: invert_transform(pose) @ _FLIP,
+    'opencv-inverse': transforms.invert_transform,
+    'opengl-inverse': lambda pose: transforms.invert_transform(pose) @ _FLIP,
     'ros': lambda pose: pose @ _BODY_FROM_CAMERA}
 
 # Number of image pairs to compare, of first images to try, and of later images to try with each.
@@ -75,7 +69,8 @@ class Reading(NamedTuple):
 
 def w_first(pose: _Pose) -> _Pose:
     """Correct a pose (4, 4) whose quaternion w x y z was read as x y z w."""
-    return transform_from_pose(pose[:3, 3], np.roll(quaternion_from_transform(pose), -1))
+    return transforms.transform_from_pose(
+        pose[:3, 3], np.roll(transforms.quaternion_from_transform(pose), -1))
 
 
 def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], where: object) -> str:
@@ -123,7 +118,7 @@ def _pairs(views: Sequence[View], given: Reading) -> Iterator[tuple[View, View]]
     turns = [given.pose(view.pose)[:3, :3] for view in views if view.pose is not None]
     last = len(views) - 1
     for start in np.unique(np.linspace(0, max(0, last - 1), _TRIED).astype(int)).tolist():
-        angles = [rotation_angle_deg(turns[start].T @ turn)
+        angles = [transforms.rotation_angle_deg(turns[start].T @ turn)
                   for turn in turns[start + 1:start + 1 + _REACH]]
         fit = [place for place, angle in enumerate(angles)
                if _TURN_DEG[0] < angle < _TURN_DEG[1]]
@@ -150,7 +145,7 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
         first, second = (view.pose if view.pose_at is None or not reading.shift_ns
                          else view.pose_at(view.stamp_ns + reading.shift_ns) for view in pair)
         if len(points[0]) and first is not None and second is not None:
-            step = invert_transform(reading.pose(second)) @ reading.pose(first)
+            step = transforms.invert_transform(reading.pose(second)) @ reading.pose(first)
             errors[name] = focal_px * float(np.median(_sampson(points[0], points[1], step)))
     return errors
 

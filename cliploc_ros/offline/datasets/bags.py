@@ -17,16 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag2,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags import interfaces
 from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -41,14 +32,16 @@ STORAGES: Mapping[str, StoragePlugin] = {'sqlite3': StoragePlugin.SQLITE3,
 
 #: Greatest share of a topic's messages that may be unusable and left out.
 MOST_LEFT_OUT = 0.2
-_INFINITE = QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
+_INFINITE = interfaces.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
 
 #: The default of rclcpp, which camera drivers and detectors offer. It matches best-effort and
 #: reliable subscribers.
-RELIABLE_QOS = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE,
-                   _INFINITE, _INFINITE, QosLiveliness.AUTOMATIC, _INFINITE, False)
+RELIABLE_QOS = interfaces.Qos(
+    interfaces.QosHistory.KEEP_LAST, 10, interfaces.QosReliability.RELIABLE,
+    interfaces.QosDurability.VOLATILE, _INFINITE, _INFINITE, interfaces.QosLiveliness.AUTOMATIC,
+    _INFINITE, False)
 #: For maps and static transforms: a late subscriber receives the last message.
-LATCHED_QOS = RELIABLE_QOS._replace(depth=1, durability=QosDurability.TRANSIENT_LOCAL)
+LATCHED_QOS = RELIABLE_QOS._replace(depth=1, durability=interfaces.QosDurability.TRANSIENT_LOCAL)
 
 
 @cache
@@ -82,7 +75,7 @@ class BagTopic:
     msgtype: str
     message_count: int  #: Number of messages according to the metadata
     #: QoS of its publishers during the recording; empty if unknown
-    offered_qos: tuple[Qos, ...] = ()
+    offered_qos: tuple[interfaces.Qos, ...] = ()
     type_hash: str = ''  #: RIHS01 hash of the type; empty if not recorded
 
 
@@ -242,10 +235,11 @@ class BagReader:
         return deserialize(message.data, topic.msgtype,
                            f'{self.path}: {topic.name} at {message.stamp_ns}')
 
-    def _collect_topics(self, connections: Collection[Connection]) -> dict[str, BagTopic]:
+    def _collect_topics(self, connections: Collection[interfaces.Connection]
+                        ) -> dict[str, BagTopic]:
         topics: dict[str, BagTopic] = {}
         for connection in connections:
-            assert isinstance(connection.ext, ConnectionExtRosbag2)
+            assert isinstance(connection.ext, interfaces.ConnectionExtRosbag2)
             name, msgtype = connection.topic, connection.msgtype
             known = topics.get(name, BagTopic(name, msgtype, 0))
             if known.msgtype != msgtype:
@@ -257,7 +251,7 @@ class BagReader:
                 known.type_hash or connection.digest)
         return topics
 
-    def _connections(self, names: Collection[str]) -> list[Connection]:
+    def _connections(self, names: Collection[str]) -> list[interfaces.Connection]:
         """Return the library's connections of topics, for the recording and each of its files.
 
         The library silently drops the messages of a file whose QoS differs from that in
@@ -294,7 +288,7 @@ class BagWriter:
             raise DatasetError(f'storage {storage!r} is not one of {", ".join(STORAGES)}')
         self._storage = STORAGES[storage]
         self._writer: Writer  # while it is open
-        self._connections: dict[str, Connection] = {}
+        self._connections: dict[str, interfaces.Connection] = {}
 
     def __enter__(self) -> Self:
         """Begin the recording next to its final path."""
@@ -323,7 +317,7 @@ class BagWriter:
         with suppress(Exception):  # the first exception is the one to report
             self._writer.abort()  # does nothing after close
 
-    def add_topic(self, name: str, msgtype: str, qos: Qos = RELIABLE_QOS) -> None:
+    def add_topic(self, name: str, msgtype: str, qos: interfaces.Qos = RELIABLE_QOS) -> None:
         """Declare a topic before its first message.
 
         Parameters

@@ -15,15 +15,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.storage import open_file
-from cliploc_ros.offline.datasets import parsing
-from cliploc_ros.offline.datasets.frames import (
-    IMAGES,
-    NO_STAMP,
-    Capture,
-    FolderOptions,
-    ImageFile,
-    beside,
-)
+from cliploc_ros.offline.datasets import frames, parsing
 
 _PLACES = ('.', 'sparse', 'sparse/0', 'sparse/1', 'colmap/sparse/0', 'model', 'colmap',
            'distorted/sparse', 'distorted/sparse/0')  # the last two of 3D Gaussian splatting
@@ -71,7 +63,7 @@ class _Posed(NamedTuple):
     pose: NDArray[np.float64] | None  #: (4, 4): map_from_camera
 
 
-def read_colmap(folder: Path, options: FolderOptions) -> Capture:
+def read_colmap(folder: Path, options: frames.FolderOptions) -> frames.Capture:
     """Read the images of a model, or of the largest model of a project.
 
     The folder is that of the model (cameras and images, .bin or .txt), or that of the project.
@@ -103,7 +95,7 @@ def read_colmap(folder: Path, options: FolderOptions) -> Capture:
     roots = [options.images] if options.images else [
         *(above / name for above in (folder, *model.resolve().parents[:3]) for name in names),
         folder]
-    root = next((path for path in roots if beside(path / first)),
+    root = next((path for path in roots if frames.beside(path / first)),
                 next((path for path in roots if path.is_dir()), folder))
     files = []
     for image in found[model]:
@@ -111,12 +103,13 @@ def read_colmap(folder: Path, options: FolderOptions) -> Capture:
             raise DatasetError(f'{model}: image {image.name} is of camera {image.camera_id}, '
                                'which the model does not have')
         color = root / image.name
-        if beside(color) is None:  # a path of another operating system
-            color = next(filter(None, (beside(root / name) for name in (
+        if frames.beside(color) is None:  # a path of another operating system
+            color = next(filter(None, (frames.beside(root / name) for name in (
                 image.name.replace('\\', '/'), PureWindowsPath(image.name).name))), color)
-        files.append(ImageFile(NO_STAMP, color, cameras[image.camera_id], image.pose))
-    there = sum(file.suffix.lower() in IMAGES for file in root.rglob('*'))
-    return Capture.of(files, model, 'opencv', is_metric=False, notes=notes, images=there)
+        files.append(frames.ImageFile(frames.NO_STAMP, color, cameras[image.camera_id],
+                                      image.pose))
+    there = sum(file.suffix.lower() in frames.IMAGES for file in root.rglob('*'))
+    return frames.Capture.of(files, model, 'opencv', is_metric=False, notes=notes, images=there)
 
 
 def _check_same(model: Path, cameras: Mapping[int, Camera], images: Sequence[_Posed]) -> None:

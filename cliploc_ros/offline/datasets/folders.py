@@ -23,24 +23,8 @@ from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import MILLIMETRE, TUM_UNIT, DepthCamera
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets import colmap, devices
+from cliploc_ros.offline.datasets import colmap, devices, frames, parsing
 from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_agreement, w_first
-from cliploc_ros.offline.datasets.frames import (
-    Capture,
-    DepthFormat,
-    FolderOptions,
-    Frames,
-    ImageFile,
-    folder_frames,
-    read_color,
-)
-from cliploc_ros.offline.datasets.parsing import (
-    find_camera,
-    naming,
-    parse_all,
-    read_camera,
-    read_lines,
-)
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import TumSequence, read_image_list, read_tum
 from cliploc_ros.offline.mapping.tilt import find_levelling, tilt_note
@@ -62,7 +46,7 @@ _MOST_M = 1e7
 # Number of images whose EXIF orientation is checked.
 _ORIENTED = 3
 
-_NO_OPTIONS = FolderOptions()
+_NO_OPTIONS = frames.FolderOptions()
 # Incomplete layouts: name, a file that identifies the layout, and the file that is missing.
 _NEARLY = (('TUM RGB-D', 'groundtruth.txt', 'rgb.txt'), ('TUM RGB-D', 'depth.txt', 'rgb.txt'),
            ('Stray Scanner', 'camera_matrix.csv', 'odometry.csv'),
@@ -78,13 +62,13 @@ class Layout(NamedTuple):
     key: str
     name: str  #: Name in messages
     is_layout: Callable[[Path], bool]  #: Returns whether a folder has this layout
-    read: Callable[[Path, FolderOptions], Capture]
+    read: Callable[[Path, frames.FolderOptions], frames.Capture]
     #: The options among intrinsics, trajectory, mount and images that the reader uses; the others
     #: are refused
     takes: tuple[str, ...] = ()
 
 
-def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
+def read_folder(folder: Path, options: frames.FolderOptions = _NO_OPTIONS) -> frames.Frames:
     """Read a folder of any known layout, with poses in metres and OpenCV's camera axes.
 
     Images are checked against poses, to refuse a wrong choice of axes.
@@ -112,7 +96,7 @@ def read_folder(folder: Path, options: FolderOptions = _NO_OPTIONS) -> Frames:
             able = sorted({other.name for other in LAYOUTS if name in other.takes})
             raise DatasetError(f'{folder}: {layout.name} takes no `{name}`: it is for '
                                f'{" and ".join(able)}')
-    with naming(folder, OSError, what='cannot be read: '):
+    with parsing.naming(folder, OSError, what='cannot be read: '):
         return _placed(folder, layout, layout.read(folder, options), options)
 
 
@@ -123,8 +107,8 @@ def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Ca
     """
     layout = find_layout(folder)
     if layout is None or layout.key == 'rgbd':
-        return read_tum(folder), *find_camera(intrinsics, folder)
-    capture = layout.read(folder, FolderOptions(intrinsics))
+        return read_tum(folder), *parsing.find_camera(intrinsics, folder)
+    capture = layout.read(folder, frames.FolderOptions(intrinsics))
     cameras = {file.camera for file in capture.files}
     if len(cameras) > 1 or not capture.is_metric or any(
             file.number is not None for file in capture.files):
@@ -152,7 +136,8 @@ def find_layout(folder: Path, key: str = '') -> Layout | None:
                  if layout.key == key or (not key and layout.is_layout(folder))), None)
 
 
-def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptions) -> Frames:
+def _placed(folder: Path, layout: Layout, capture: frames.Capture, options: frames.FolderOptions
+            ) -> frames.Frames:
     """Return the frames of a capture, in the map's coordinate frame."""
     if capture.trajectory is not None:
         if not len(capture.trajectory):
@@ -175,7 +160,7 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
     files = _place_images(capture.files, axes, scale or 1.0, turn)
     poses = np.array([file.pose for file in files if file.pose is not None]).reshape(-1, 4, 4)
     if options.level:
-        with naming(folder, DatasetError):
+        with parsing.naming(folder, DatasetError):
             rotation, note = find_levelling(poses, True)
         files = _place_images(capture.files, axes, scale or 1.0, rotation @ turn)
         notes.append(note)
@@ -185,7 +170,7 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
                    camera=options.depth.camera or capture.depth.camera)
     if not capture.is_metric:  # depth has the unit of the poses
         form = replace(form, scale=1.0 if options.depth.unit_m else form.scale * (scale or 1.0))
-    frames = folder_frames(folder, files, form)
+    found = frames.folder_frames(folder, files, form)
     flat = sum(file.depth is None for file in files)
     if 0 < flat < len(files):
         notes.append(f'{flat} of {len(files)} images have no depth image')
@@ -193,10 +178,10 @@ def _placed(folder: Path, layout: Layout, capture: Capture, options: FolderOptio
     digest = ' '.join(hashlib.sha256(repr(known).encode()).hexdigest()[:12] for known in (
         [(file.color.name, file.stamp_ns, file.camera) for file, _ in posed],
         [np.round(pose, 6).tolist() for _, pose in posed]))
-    return replace(frames, digest=digest, notes=(*filter(None, notes), *frames.notes))
+    return replace(found, digest=digest, notes=(*filter(None, notes), *found.notes))
 
 
-def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
+def rgbd_frames(folder: Path, options: frames.FolderOptions) -> frames.Frames:
     """Return the frames of a folder with depth: 7-Scenes or TUM RGB-D.
 
     DatasetError: the folder has neither layout, or poses or intrinsics are missing.
@@ -207,8 +192,8 @@ def rgbd_frames(folder: Path, options: FolderOptions) -> Frames:
     return read_folder(folder, replace(options, layout='rgbd' if is_tum else '7scenes'))
 
 
-def _place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
-                 map_from_stored: NDArray[np.float64] = _UP['z']) -> tuple[ImageFile, ...]:
+def _place_images(files: Sequence[frames.ImageFile], axes: str, scale: float = 1.0,
+                 map_from_stored: NDArray[np.float64] = _UP['z']) -> tuple[frames.ImageFile, ...]:
     """Replace the stored poses of images by map_from_camera.
 
     Parameters
@@ -232,8 +217,8 @@ def _place_images(files: Sequence[ImageFile], axes: str, scale: float = 1.0,
     return placed
 
 
-def _find_scale(files: Sequence[ImageFile], first: str, second: str, metres: float, where: object
-               ) -> float:
+def _find_scale(files: Sequence[frames.ImageFile], first: str, second: str, metres: float,
+                where: object) -> float:
     """Compute the metres per unit of the poses from the distance between two cameras [m].
 
     `first` and `second` are the names of the two images. DatasetError: an image is unknown, or
@@ -256,7 +241,7 @@ def _find_scale(files: Sequence[ImageFile], first: str, second: str, metres: flo
     return metres / distance
 
 
-def check_axes(files: Sequence[ImageFile], axes: str, where: object) -> str:
+def check_axes(files: Sequence[frames.ImageFile], axes: str, where: object) -> str:
     """Return a note if images and stored poses do not fit; see check_agreement.
 
     DatasetError: they fit well under another convention; the message names it.
@@ -267,21 +252,21 @@ def check_axes(files: Sequence[ImageFile], axes: str, where: object) -> str:
         'name the columns in the first line, such as `# timestamp tx ty tz qw qx qy qz`',
         lambda pose: AXES[axes](w_first(pose)))
     stored = [file for file in files if file.number is None][::max(1, len(files) // _ORIENTED)]
-    has_orientation = any(not np.array_equal(read_color(file)[0], read_color(file, True)[0])
-                          for file in stored)
+    has_orientation = any(not np.array_equal(
+        frames.read_color(file)[0], frames.read_color(file, True)[0]) for file in stored)
     if has_orientation:
         readings['turned by EXIF'] = Reading(
             'rotate the pixels, for example with mogrify -auto-orient', AXES[axes], upright=True)
-    note = check_agreement([View(file.pose, partial(read_color, file),
-                                 partial(read_color, file, True)) for file in files],
+    note = check_agreement([View(file.pose, partial(frames.read_color, file),
+                                 partial(frames.read_color, file, True)) for file in files],
                            readings, where)
     return note or ('the EXIF orientation of the images is ignored: poses and intrinsics must '
                     'refer to the stored pixels' if has_orientation else '')
 
 
-def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Capture:
+def _tum(folder: Path, options: frames.FolderOptions, with_depth: bool = True) -> frames.Capture:
     """Read a TUM folder; each image gets the depth image nearest in time."""
-    sequence, camera = read_tum(folder), find_camera(options.intrinsics, folder)[0]
+    sequence, camera = read_tum(folder), parsing.find_camera(options.intrinsics, folder)[0]
     depths: dict[int, Path] = {}
     if with_depth and (folder / 'depth.txt').exists():
         stamps, paths = read_image_list(folder / 'depth.txt')
@@ -294,24 +279,24 @@ def _tum(folder: Path, options: FolderOptions, with_depth: bool = True) -> Captu
         sequence.trajectory if options.trajectory is None else options.trajectory,
         max_gap_ns=options.max_gap_ns, body_from_camera=options.body_from_camera,
         tolerance_ns=options.tolerance_ns)
-    return Capture(tuple(
-        ImageFile(stamp, path, camera, trajectory.pose_at(stamp), depths.get(stamp))
+    return frames.Capture(tuple(
+        frames.ImageFile(stamp, path, camera, trajectory.pose_at(stamp), depths.get(stamp))
         for stamp, path in zip(sequence.stamps_ns, sequence.image_paths, strict=True)),
-        depth=DepthFormat(TUM_UNIT), trajectory=trajectory)
+        depth=frames.DepthFormat(TUM_UNIT), trajectory=trajectory)
 
 
-def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
+def _seven_scenes(folder: Path, options: frames.FolderOptions) -> frames.Capture:
     """Read a folder of 7-Scenes; its poses are those of the depth camera."""
     camera = (_SEVEN_SCENES_COLOR if options.intrinsics is None
-              else read_camera(options.intrinsics))
+              else parsing.read_camera(options.intrinsics))
     images = {int(match[1]): path for path in folder.iterdir()
               if (match := _SEVEN_SCENES_NAME.fullmatch(path.name))}
     if not images:
         raise DatasetError(f'{folder}: has neither rgb.txt (TUM RGB-D) nor frame-000000.color.jpg '
                            '(7-Scenes); give a folder of one of these layouts')
     files = []
-    form = DepthFormat(options.depth.unit_m or MILLIMETRE,
-                       options.depth.camera or _SEVEN_SCENES_DEPTH)
+    form = frames.DepthFormat(options.depth.unit_m or MILLIMETRE,
+                              options.depth.camera or _SEVEN_SCENES_DEPTH)
     assert form.camera is not None
     depth_from_color = transforms.invert_transform(form.camera.color_from_depth)
     for number, path in sorted(images.items()):
@@ -319,18 +304,18 @@ def _seven_scenes(folder: Path, options: FolderOptions) -> Capture:
         depth, pose = folder / f'{stem}.depth.png', folder / f'{stem}.pose.txt'
         stamp = number * NS_PER_S // _SEVEN_SCENES_HZ
         map_from_depth = _read_pose(pose) if pose.exists() else None
-        files.append(ImageFile(
+        files.append(frames.ImageFile(
             stamp, path, camera, None if map_from_depth is None
             else map_from_depth @ depth_from_color, depth if depth.exists() else None))
     if all(file.pose is None for file in files):
         raise DatasetError(f'{folder}: no image has a valid .pose.txt beside it')
-    return Capture(tuple(files), depth=form)
+    return frames.Capture(tuple(files), depth=form)
 
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:
     """Read a pose (4, 4); None where tracking was lost: the file has NaN or infinite numbers."""
-    rows = [parse_all(line.partition('#')[0].split(), float, where)
-            for where, line in read_lines(path)]
+    rows = [parsing.parse_all(line.partition('#')[0].split(), float, where)
+            for where, line in parsing.read_lines(path)]
     if [len(row) for row in rows] != [4] * 4:
         raise DatasetError(f'{path}: is not a 4x4 matrix')
     pose = np.array(rows)

@@ -26,13 +26,7 @@ from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.files.storage import write_text
 from cliploc_ros.offline import page as html
-from cliploc_ros.offline.evaluation.figures import (
-    EDGED,
-    draw_outline,
-    new_top_view,
-    png_of,
-    write_name,
-)
+from cliploc_ros.offline.evaluation import figures
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.check.findings import RADIUS_M, LandmarkCheck
 from cliploc_ros.offline.mapping.check.relocalization import ImageOf, Trial, count_verdicts
@@ -250,15 +244,15 @@ def _drawn(draw: Callable[[Axes, LandmarkMap, CheckReport], None], landmark_map:
     points = [landmark_map.centers[:, :2], positions - half, positions + half]
     if report.recording is not None:
         points.append(report.recording.path_xyz[:, :2])
-    figure, axes = new_top_view(np.concatenate(points), landmark_map.frame_id)
+    figure, axes = figures.new_top_view(np.concatenate(points), landmark_map.frame_id)
     if report.recording is not None:
         axes.plot(*points[-1].T, color=_INK, linewidth=1.0, linestyle=(0, (4, 2)), zorder=4,
-                  path_effects=EDGED, label='path of the recording')
+                  path_effects=figures.EDGED, label='path of the recording')
     draw(axes, landmark_map, report)
     handles = axes.get_legend_handles_labels()[0]
     figure.legend(handles=handles, loc='outside lower center', ncols=min(3, len(handles)),
                   frameon=False, fontsize=9)
-    return png_of(figure, _DPI)
+    return figures.png_of(figure, _DPI)
 
 
 def _draw_grid(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) -> None:
@@ -275,8 +269,8 @@ def _draw_grid(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) -> No
     axes.figure.colorbar(cells, ax=axes, shrink=0.7, pad=0.02).set_label(
         'correct pose accepted\n[% of headings that show 3 landmarks]', fontsize=9)
     for center, shape in zip(landmark_map.centers, landmark_map.shapes, strict=True):
-        draw_outline(axes, center, shape, facecolor='none', edgecolor=_INK, linewidth=0.7,
-                     zorder=3, path_effects=EDGED)
+        figures.draw_outline(axes, center, shape, facecolor='none', edgecolor=_INK, linewidth=0.7,
+                             zorder=3, path_effects=figures.EDGED)
     ticks = [(trial.position, trial.position + 0.45 * side * trial.forward, np.full(3, np.nan))
              for trial in grid.trials if trial.verdict == 'misled']
     axes.plot(*np.reshape(ticks, (-1, 3)).T[:2], 'X-', color=html.MISLED, markevery=3, zorder=7,
@@ -296,14 +290,14 @@ def _draw_landmarks(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) 
     grades = {check.landmark_id: _grade(check) for check in report.landmarks}
     for name, center, shape in zip(landmark_map.landmark_ids, landmark_map.centers,
                                    landmark_map.shapes, strict=True):
-        draw_outline(axes, center, shape, facecolor=_GRADES[grades[name]][1], alpha=0.6,
-                     edgecolor=_INK, linewidth=0.7, zorder=3)
+        figures.draw_outline(axes, center, shape, facecolor=_GRADES[grades[name]][1], alpha=0.6,
+                             edgecolor=_INK, linewidth=0.7, zorder=3)
     counts = Counter(grades.values())
     for name, (words, color) in _GRADES.items():
         axes.plot([], [], 'o', color=color, alpha=0.6, markersize=9,
                   label=f'{words} ({counts[name]})')
     for check in [check for check in report.landmarks if check.faults][:_MOST_NAMES]:
-        write_name(axes, check.center[:2], check.landmark_id)
+        figures.write_name(axes, check.center[:2], check.landmark_id)
     trials = report.recording.trials if report.recording is not None else ()
     axes.set_title('Landmarks and recorded frames' if trials else 'Landmarks', fontsize=12)
     for verdict, (color, marker) in _MARKERS.items() if trials else ():
@@ -320,7 +314,7 @@ def _draw_landmarks(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) 
             axes.add_patch(Circle((x, y), RADIUS_M, fill=False, edgecolor=html.LOOK_ALIKE,
                                   linewidth=1.8, zorder=5))
             axes.text(x, y + 0.8 * RADIUS_M, str(number), fontsize=11, fontweight='bold',
-                      ha='center', va='center', zorder=9, path_effects=EDGED, clip_on=True)
+                      ha='center', va='center', zorder=9, path_effects=figures.EDGED, clip_on=True)
 
 
 # ---- recorded views -----------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping import joint
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.doubles import close_pairs, merge_doubles, resolve_doubles
 from cliploc_ros.offline.mapping.evidence import (
@@ -23,16 +24,6 @@ from cliploc_ros.offline.mapping.evidence import (
     reasons_against,
 )
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
-from cliploc_ros.offline.mapping.joint import (
-    estimate_pose_errors,
-    estimated_note,
-    left_by_poses,
-    pose_changes,
-    pose_errors,
-    refine_jointly,
-    shared_by_neighbours,
-    significant_pose_errors,
-)
 from cliploc_ros.offline.mapping.landmarks import (
     Landmarks,
     group_boxes,
@@ -231,7 +222,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
         len(detections), int(views.viewpoints.max()) + 1, quality.boxes, len(landmarks.centers),
         quality.explained, quality.median_iou,
         quality.explained / float(np.isin(views.classes, landmarks.classes).mean()),
-        *pose_changes(given, views), left_out,
+        *joint.pose_changes(given, views), left_out,
         tuple(notes + pose_notes))
     landmark_map = builder.map_of(landmarks, shown, given, views, errors)
     return BuiltMap(landmark_map, report, shown, views.poses, mount)
@@ -320,7 +311,7 @@ class _Builder(NamedTuple):
         is_estimated = errors is None and self.options.estimate_pose_errors
         if is_estimated:
             self.tell('estimating pose errors', 0.0)
-            errors = significant_pose_errors(given, draft.landmarks, draft.shown)
+            errors = joint.significant_pose_errors(given, draft.landmarks, draft.shown)
         if errors is None:
             return views, draft, None, [] if odometry is None else [
                 'odometry is not used: the poses are taken as they are']
@@ -334,18 +325,18 @@ class _Builder(NamedTuple):
             # the
             # parts merge.
             for _ in range(REFINEMENTS):
-                views, landmarks = refine_jointly(given, views, draft.landmarks, draft.shown,
-                                                  errors, steps=steps)
+                views, landmarks = joint.refine_jointly(given, views, draft.landmarks, draft.shown,
+                                                        errors, steps=steps)
                 landmarks, shown = self._settle(views, landmarks)
                 draft = draft._replace(landmarks=landmarks, shown=shown)
             if number < _REBUILDS:
                 draft = self.draft(views)
                 if is_estimated:
                     # objects that were split before give a better estimate now
-                    errors = estimate_pose_errors(given, draft.landmarks, draft.shown,
-                                                  views) or errors
+                    errors = joint.estimate_pose_errors(given, draft.landmarks, draft.shown,
+                                                        views) or errors
         if is_estimated:
-            notes.append(estimated_note(errors))
+            notes.append(joint.estimated_note(errors))
         return views, draft, errors, notes + ([link_note] if link_note else [])
 
     def map_of(self, landmarks: Landmarks, shown: NDArray[np.int64], given: Views, views: Views,
@@ -355,8 +346,9 @@ class _Builder(NamedTuple):
         evidence = gather_evidence(views, landmarks, shown)
         evidence = evidence._replace(position_sigma=np.hypot(
             evidence.position_sigma,
-            left_by_poses(views, np.square(pose_errors(given, views)), shown, count)))
-        shared = None if errors is None else shared_by_neighbours(views, shown, count, errors)
+            joint.left_by_poses(views, np.square(joint.pose_errors(given, views)), shown, count)))
+        shared = None if errors is None else joint.shared_by_neighbours(
+            views, shown, count, errors)
         class_names, weights = self.detections.class_names, list[tuple[tuple[str, float], ...]]()
         for boxes in group_boxes(shown, count):  # the greatest share first
             counts = np.bincount(self.detections.classes[boxes], minlength=len(class_names))

@@ -17,14 +17,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.storage import parse_json
-from cliploc_ros.offline.studio.edits import (
-    Change,
-    EditError,
-    Landmark,
-    Landmarks,
-    change_from_json,
-    map_of,
-)
+from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.map_file import MapFile, read_map_file, text_on_disk
 
 _MAX_HISTORY = 10_000
@@ -53,14 +46,14 @@ class Document:
         #: Whether another program changed the file, until the user decides
         self.has_conflict = False
         self.selection: tuple[str, ...] = ()
-        self._done: list[Change] = []
-        self._undone: list[Change] = []
+        self._done: list[edits.Change] = []
+        self._undone: list[edits.Change] = []
         #: The gesture of the last edit, such as a drag, if it may continue
         self.gesture: object = None
         self.file = read_map_file(path)
         self.notes = self.file.notes
-        self.landmarks: Landmarks = self.file.landmarks
-        self._saved: Landmarks = self.landmarks
+        self.landmarks: edits.Landmarks = self.file.landmarks
+        self._saved: edits.Landmarks = self.landmarks
         # Edits that are not yet in the file. Before the map is written, the digest of its new
         # content is added to the journal, so that replay works with the old and the new file.
         self._journal = Log(self.path.with_name(f'.{self.path.name}.studio'), DatasetError,
@@ -89,7 +82,7 @@ class Document:
                 self.file = replace(self.file, encoder_key=encoder_key)
 
     @property
-    def selected(self) -> tuple[str, Landmark] | None:
+    def selected(self) -> tuple[str, edits.Landmark] | None:
         """Id and landmark of the selection; None unless it is exactly one landmark."""
         with self.lock:
             one = self.selection[0] if len(self.selection) == 1 else None
@@ -98,13 +91,13 @@ class Document:
     def chosen(self) -> tuple[str, ...]:
         """Return the selection; EditError: it is empty."""
         if not self.selection:
-            raise EditError('select a landmark first')
+            raise edits.EditError('select a landmark first')
         return self.selection
 
-    def only_chosen(self) -> tuple[str, Landmark]:
+    def only_chosen(self) -> tuple[str, edits.Landmark]:
         """Return id and landmark of the selection; EditError: it is not exactly one landmark."""
         if (selected := self.selected) is None:
-            raise EditError('select exactly one landmark first')
+            raise edits.EditError('select exactly one landmark first')
         return selected
 
     @property
@@ -124,12 +117,12 @@ class Document:
 
     def to_map(self) -> LandmarkMap:
         """Return the map of the relocalizer; MapError: there are no landmarks."""
-        return replace(map_of(self.landmarks, self.file.frame_id, self.path.name),
+        return replace(edits.map_of(self.landmarks, self.file.frame_id, self.path.name),
                        map_set=self.file.map_set)
 
     # ---- edits ----------------------------------------------------------------------------------
 
-    def apply(self, change: Change, gesture: object = None) -> None:
+    def apply(self, change: edits.Change, gesture: object = None) -> None:
         """Apply a change. Successive changes of one gesture, such as a drag, are undone together.
 
         CliplocError: the journal cannot be written.
@@ -141,8 +134,8 @@ class Document:
             self._do('join' if joins else 'edit', change)
             self.gesture = gesture
 
-    def edit(self, edit: Callable[..., Change], *arguments: Any, gesture: object = None,
-             **values: Any) -> Change:
+    def edit(self, edit: Callable[..., edits.Change], *arguments: Any, gesture: object = None,
+             **values: Any) -> edits.Change:
         """Apply an edit to the current landmarks; return its change.
 
         Errors: see `edit` and `apply`.
@@ -175,12 +168,12 @@ class Document:
                 key for key in landmark_ids if key in self.landmarks))
             self.changed.set()
 
-    def _do(self, kind: str, change: Change) -> None:
+    def _do(self, kind: str, change: edits.Change) -> None:
         self._journal.append({'do': kind, **change.to_json()})
         self._take(kind, change)
         self.changed.set()
 
-    def _take(self, kind: str, change: Change) -> None:
+    def _take(self, kind: str, change: edits.Change) -> None:
         """Apply a change, and update the history."""
         back, self.landmarks = change.undoing(self.landmarks), change.apply(self.landmarks)
         self.gesture = None
@@ -213,8 +206,8 @@ class Document:
         """Save the map over the content of another program."""
         with self.lock:
             if not self.landmarks:
-                raise EditError(f'{self.path}: a map without landmarks is not saved; create one, '
-                                'or delete the file')
+                raise edits.EditError(f'{self.path}: a map without landmarks is not saved; create '
+                                      'one, or delete the file')
             file = self.file.with_landmarks(self.landmarks)
             self._journal.append({'writing': file.digest})
             file.write(self.file)
@@ -233,12 +226,12 @@ class Document:
             before = self.landmarks
             found = {key: replace(before.get(key, one), fields=one.fields, look=one.look)
                      for key, one in file.landmarks.items()}
-            self._take('edit', Change('reload the file', {**dict.fromkeys(before), **found}))
+            self._take('edit', edits.Change('reload the file', {**dict.fromkeys(before), **found}))
             self._take_file(file, found)
             self.notes += file.notes
             return f'reloaded {self.path.name}; undo reverts this'
 
-    def _take_file(self, file: MapFile, landmarks: Landmarks) -> None:
+    def _take_file(self, file: MapFile, landmarks: edits.Landmarks) -> None:
         """Note that a file contains the landmarks, and begin a new journal."""
         self.file, self._saved = file, landmarks
         self.gesture, self.has_conflict = None, False
@@ -255,17 +248,17 @@ class Document:
         digest, done = self.file.digest, list[dict[str, Any]]()
         starts = [row for row, entry in enumerate(entries)
                   if digest in (entry.get('base'), entry.get('writing'))]
-        edits = [entry for entry in entries[starts[-1] + 1 if starts else 0:] if 'do' in entry]
+        unsaved = [entry for entry in entries[starts[-1] + 1 if starts else 0:] if 'do' in entry]
         is_whole = bool(starts)
         try:
-            if edits and not starts:
-                raise EditError('another program changed the file, so they do not match it')
-            for entry in edits:
-                self._take(str(entry['do']), change_from_json(entry, self.landmarks))
+            if unsaved and not starts:
+                raise edits.EditError('another program changed the file, so they do not match it')
+            for entry in unsaved:
+                self._take(str(entry['do']), edits.change_from_json(entry, self.landmarks))
                 done.append(entry)
         except (LookupError, TypeError, AttributeError, ValueError, CliplocError) as error:
             is_whole, aside = False, self._journal.set_aside()
-            self.notes += (f'could not restore the last {len(edits) - len(done)} edits of an '
+            self.notes += (f'could not restore the last {len(unsaved) - len(done)} edits of an '
                            f'earlier session ({error}); they are kept in {aside.name}',)
         if not is_whole:
             self._journal.restart([{'base': digest}, *done])

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from cliploc_ros.core.map import parameter_file
 from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
     concatenated,
@@ -32,13 +33,6 @@ from cliploc_ros.core.map.landmark_embeddings import (
 )
 from cliploc_ros.core.map.landmark_map import find_map_node
 from cliploc_ros.core.map.map_file import quoted
-from cliploc_ros.core.map.parameter_file import (
-    MapSet,
-    check_set,
-    parse_parameters,
-    read_text,
-    set_of,
-)
 from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import finish_set, write_file
 from cliploc_ros.offline.studio.edits import KNOWN_FIELDS, Landmark, Landmarks, map_of
@@ -71,9 +65,9 @@ class MapFile:
         return hashlib.sha256(self.text.encode()).hexdigest() if self.text else ''
 
     @property
-    def map_set(self) -> MapSet:
+    def map_set(self) -> parameter_file.MapSet:
         """The identity that the files next to the map must have."""
-        return set_of(self.text)
+        return parameter_file.set_of(self.text)
 
     @property
     def frame_id(self) -> str:
@@ -110,7 +104,7 @@ class MapFile:
         texts.append(''.join(f'{line}\n' for line in _emit(tree, 0)))
         for text in texts:
             with suppress(MapError):
-                if _normalized(parse_parameters(text, 'map')) == _normalized(tree):
+                if _normalized(parameter_file.parse_parameters(text, 'map')) == _normalized(tree):
                     return replace(self, text=text, tree=tree, looks={
                         key: landmark.look for key, landmark in landmarks.items()
                         if landmark.look is not None})
@@ -138,7 +132,7 @@ class MapFile:
 
 def text_on_disk(path: Path) -> str:
     """Return the text of a map file, '' if it does not exist; MapError: it cannot be read."""
-    return read_text(path) if os.path.exists(path) else ''  # noqa: PTH110 - never raises
+    return parameter_file.read_text(path) if os.path.exists(path) else ''  # noqa: PTH110 - never raises
 
 
 def read_map_file(path: Path) -> MapFile:
@@ -151,8 +145,8 @@ def read_map_file(path: Path) -> MapFile:
     if not (text := text_on_disk(path)):
         return _with_looks(MapFile(path, '', '/**', {'/**': {_PARAMETERS: {'map': {
             'frame_id': 'map', 'landmarks': {}}}}}))
-    finish_set(path, set_of(text).digest)
-    tree = parse_parameters(text, path)
+    finish_set(path, parameter_file.set_of(text).digest)
+    tree = parameter_file.parse_parameters(text, path)
     node = find_map_node(tree, path)
     found = tree[node][_PARAMETERS]['map']
     if not isinstance(found, Mapping) or not isinstance(found.get('landmarks'), Mapping):
@@ -177,7 +171,7 @@ def _with_looks(file: MapFile) -> MapFile:
         return file
     try:
         found = load_landmark_embeddings(path)
-        check_set(found.set_digest, file.map_set.digest)
+        parameter_file.check_set(found.set_digest, file.map_set.digest)
     except (MapError, ValueError) as error:
         text = str(error).removeprefix(f'{path}: ')
         return replace(file, notes=(

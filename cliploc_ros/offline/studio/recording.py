@@ -22,14 +22,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.building import refit_map
+from cliploc_ros.offline.mapping.check import relocalization
 from cliploc_ros.offline.mapping.check.findings import Witness, hear_witness
-from cliploc_ros.offline.mapping.check.relocalization import (
-    RecordedKeyframes,
-    Trial,
-    make_relocalizer,
-    simulated,
-    try_view,
-)
 from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
 from cliploc_ros.offline.mapping.labelling import embed_landmarks
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
@@ -165,24 +159,26 @@ class Recording:
         return edits.merge(landmarks, landmark_ids, (fit.center, fit.basis)), 'by boxes'
 
     def relocalize(self, landmarks: Landmarks, views: Sequence[int],
-                   layer: KeyframeLayer | None = None) -> dict[int, Trial]:
+                   layer: KeyframeLayer | None = None) -> dict[int, relocalization.Trial]:
         """Return the relocalizer's answers in some views; MapError: there are no landmarks.
 
         Each view is an independent question to a new localizer, so that only edits change the
         answers. Keyframes recorded at about the time of a view are not used for it.
         """
-        keyframes = None if layer is None or self.images is None else RecordedKeyframes(
-            layer, self.image)
+        keyframes = None
+        if layer is not None and self.images is not None:
+            keyframes = relocalization.RecordedKeyframes(layer, self.image)
         landmark_map, options, detections = map_of(landmarks), CheckOptions(), self.detections
-        relocalizer, labels = make_relocalizer(landmark_map, options), LabelModel.of(landmark_map)
+        relocalizer = relocalization.make_relocalizer(landmark_map, options)
+        labels = LabelModel.of(landmark_map)
         shown, answers = self._shown(landmarks), {}
         for view in views:
-            query = simulated(detections, view, shown, labels, options.random_seed)
+            query = relocalization.simulated(detections, view, shown, labels, options.random_seed)
             localizer = Localizer(relocalizer)
             if keyframes is not None:
                 query = keyframes.with_image(query)
                 localizer = Localizer(relocalizer, keyframes.elsewhere(detections, view))
-            answers[view] = try_view(localizer, query, 0, options)
+            answers[view] = relocalization.try_view(localizer, query, 0, options)
         return answers
 
 

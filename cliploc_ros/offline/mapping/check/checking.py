@@ -19,26 +19,7 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.building import Progress
-from cliploc_ros.offline.mapping.check.findings import (
-    RADIUS_M,
-    LookAlike,
-    Witness,
-    check_landmarks,
-    find_look_alikes,
-    find_map_overlaps,
-    hear_witness,
-    make_grid,
-)
-from cliploc_ros.offline.mapping.check.relocalization import (
-    ImageOf,
-    RecordedKeyframes,
-    Trial,
-    make_folds,
-    measure_detector,
-    refused_spans,
-    try_poses,
-    try_recording,
-)
+from cliploc_ros.offline.mapping.check import findings, relocalization
 from cliploc_ros.offline.mapping.check.report import (
     SERIOUS,
     Advice,
@@ -87,13 +68,13 @@ _REMEDIES = {
     'mount': 'measure how the camera is mounted on the robot',
     'stamps': 'check the clock and the delay of the images'}
 # Distance from which a camera sees a place: twice the radius of a place [m].
-_SIGHT_M = 2.0 * RADIUS_M
+_SIGHT_M = 2.0 * findings.RADIUS_M
 
 
 def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = None,
               options: CheckOptions | None = None, thresholds: Thresholds | None = None,
               progress: Progress | None = None, layer: KeyframeLayer | None = None,
-              image_of: ImageOf | None = None) -> CheckReport:
+              image_of: relocalization.ImageOf | None = None) -> CheckReport:
     """Check a map.
 
     Parameters
@@ -123,24 +104,25 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         tell('judging landmarks', 0.0)
         views = make_views(detections)
         notes += check_input(detections, views)
-        witness = hear_witness(views, landmark_map, detections.class_names)
+        witness = findings.hear_witness(views, landmark_map, detections.class_names)
         if not (witness.shown >= 0).any():
             raise MappingError(_unrelated(landmark_map, detections))
-        model = measure_detector(landmark_map, detections, views, witness)
+        model = relocalization.measure_detector(landmark_map, detections, views, witness)
         if len(detections.cameras) > 1:
             notes.append(f'the grid uses one camera, {detections.camera_names[0]}, the first of '
                          f'{len(detections.cameras)}')
         recording = _check_recording(
             landmark_map, detections, views, witness, options, tell,
-            None if layer is None or image_of is None else RecordedKeyframes(layer, image_of))
+            None if layer is None or image_of is None else relocalization.RecordedKeyframes(
+                layer, image_of))
         notes += _notes_on(recording)
     tilt = '' if detections is None else tilt_note(detections.map_from_camera)
     notes.append(tilt or _where_cameras_can_be(recorded))  # a tilted map has no true heights
-    overlaps = find_map_overlaps(landmark_map, witness, views)
-    places = make_grid(landmark_map, None if detections is None else
-                       detections.map_from_camera[detections.frame_cameras == 0], options)
-    trials = try_poses(model, landmark_map, places.poses, options,
-                       partial(tell, 'relocalizing on the grid'))
+    overlaps = findings.find_map_overlaps(landmark_map, witness, views)
+    places = findings.make_grid(landmark_map, None if detections is None else
+                                detections.map_from_camera[detections.frame_cameras == 0], options)
+    trials = relocalization.try_poses(model, landmark_map, places.poses, options,
+                                      partial(tell, 'relocalizing on the grid'))
     verdicts = np.array([trial.verdict for trial in trials], dtype=np.str_)
     verdicts = verdicts.reshape(-1, options.headings)
     grid = GridCheck(
@@ -148,8 +130,8 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         misled=(verdicts == 'misled').sum(axis=1), trials=tuple(trials), visible=np.array(
             [model.expected_detections(pose) for pose in places.poses]).reshape(verdicts.shape))
     report = CheckReport(
-        landmarks=tuple(check_landmarks(landmark_map, witness, overlaps)),
-        overlaps=tuple(overlaps), look_alikes=tuple(find_look_alikes(landmark_map)),
+        landmarks=tuple(findings.check_landmarks(landmark_map, witness, overlaps)),
+        overlaps=tuple(overlaps), look_alikes=tuple(findings.find_look_alikes(landmark_map)),
         grid=grid, recording=recording,
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
         keyframes=None if layer is None else check_keyframes(layer, grid, recorded),
@@ -160,19 +142,19 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
 
 
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
-                     witness: Witness, options: CheckOptions, tell: Progress,
-                     keyframes: RecordedKeyframes | None) -> RecordingCheck:
+                     witness: findings.Witness, options: CheckOptions, tell: Progress,
+                     keyframes: relocalization.RecordedKeyframes | None) -> RecordingCheck:
     tell('cross-validating', 0.0)
     folds, held_out = [], []
-    for fold in make_folds(views, witness, options):
+    for fold in relocalization.make_folds(views, witness, options):
         # a box whose landmark no other part of the recording shows does not test the map
         is_known = (witness.shown < 0) | np.isin(witness.shown, fold.rows)
         ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames) & is_known]
         folds.append(fold)
         held_out.append(ious)
         tell('cross-validating', len(folds) / options.folds)
-    trials = try_recording(landmark_map, detections, witness.shown, folds, options,
-                           partial(tell, 'relocalizing recorded frames'), keyframes)
+    trials = relocalization.try_recording(landmark_map, detections, witness.shown, folds, options,
+                                          partial(tell, 'relocalizing recorded frames'), keyframes)
     tell('looking for systematic errors', 0.0)
     return RecordingCheck(
         frames=len(detections), boxes=len(detections.classes),
@@ -260,7 +242,7 @@ def _some(advice: Sequence[Advice], what: str, most: int = _MOST_OF_A_KIND) -> l
     return [*advice[:most], *[Advice(f'and {more} more {what}')] * (more > 0)]
 
 
-def _on_look_alike(pair: LookAlike, misled: Sequence[Trial]) -> Advice:
+def _on_look_alike(pair: findings.LookAlike, misled: Sequence[relocalization.Trial]) -> Advice:
     matched = len(pair.matched)
     what_to_do = ('their labels are equal, so nothing tells them apart: map an object that '
                   'only one of them has') if pair.same_labels == matched else (
@@ -312,7 +294,7 @@ def _on_corrections(report: CheckReport) -> Iterator[Advice]:
     yield Advice(f'{_REMEDIES[best.cause]}: the boxes fit better if you change {changes}{then}')
 
 
-def _on_misled(report: CheckReport, misled: Sequence[Trial]) -> list[Advice]:
+def _on_misled(report: CheckReport, misled: Sequence[relocalization.Trial]) -> list[Advice]:
     wrong = [trial for trial in misled if not _sees_double(trial.position, report.look_alikes)]
     return _some([Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be '
                          f'misled by {trial.error_m:.1f} m: raise the parameter min_confidence, '
@@ -321,13 +303,13 @@ def _on_misled(report: CheckReport, misled: Sequence[Trial]) -> list[Advice]:
                  'views that mislead a robot', most=_MOST_MISLED)
 
 
-def _on_spans(report: CheckReport, trials: Sequence[Trial]) -> Iterator[Advice]:
+def _on_spans(report: CheckReport, trials: Sequence[relocalization.Trial]) -> Iterator[Advice]:
     """Yield advice on runs of refused frames, once for each side of a place."""
-    middles: list[Trial] = []
-    for run in refused_spans(trials):
+    middles: list[relocalization.Trial] = []
+    for run in relocalization.refused_spans(trials):
         middle, seen = run[len(run) // 2], int(np.median([trial.landmarks for trial in run]))
         if len(run) < _MIN_SPAN or middle.stamp_s is None or any(
-                np.linalg.norm(middle.position - other.position) < RADIUS_M
+                np.linalg.norm(middle.position - other.position) < findings.RADIUS_M
                 and middle.forward @ other.forward > _ONE_SIDE for other in middles):
             continue
         middles.append(middle)
@@ -362,7 +344,7 @@ def _on_grid(report: CheckReport) -> Iterator[Advice]:
             for rows in _areas(grid, keyframes.without)], 'areas that no keyframe reaches')
 
 
-def _sees_double(position: NDArray[np.float64], pairs: Sequence[LookAlike]) -> bool:
+def _sees_double(position: NDArray[np.float64], pairs: Sequence[findings.LookAlike]) -> bool:
     """Return whether a camera is near a place that looks like another one."""
     return any(np.hypot(position[0] - place[0], position[1] - place[1]) < _SIGHT_M
                for pair in pairs for place in (pair.first, pair.second))
@@ -388,6 +370,6 @@ def _place(point: NDArray[np.float64] | tuple[float, ...]) -> str:
     return f'x {point[0]:.1f}, y {point[1]:.1f}'
 
 
-def _heading(trial: Trial) -> str:
+def _heading(trial: relocalization.Trial) -> str:
     """Describe the heading of a camera as an angle from the map's x axis."""
     return f'to {np.degrees(np.arctan2(trial.forward[1], trial.forward[0])):.0f} degrees'
