@@ -122,7 +122,7 @@ def build(options: argparse.Namespace) -> int:
             note = ('the new map has no keyframes, which need all images: it localizes by objects '
                     'alone; build a new map to have both') if layer_path(update).exists() else ''
         else:
-            frames = source.frames and move_frames(source.frames, scale, rotation)
+            frames = source.images and move_frames(source.images, scale, rotation)
             with command.StageBar() as bar:
                 made = make_map.make_map(detections, labeller, mapping, frames, layer, bar.show)
             note = note or made.note

@@ -18,15 +18,8 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.models import protocols
-from cliploc_ros.offline.datasets import bag_frames, bag_poses
+from cliploc_ros.offline.datasets import bag_frames, bag_poses, frames
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
-from cliploc_ros.offline.datasets.frames import (
-    DepthFormat,
-    FolderOptions,
-    Frames,
-    join_frames,
-    move_frames,
-)
 from cliploc_ros.offline.datasets.images import Images, open_images
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
 from cliploc_ros.offline.datasets.observations import load_observations
@@ -102,7 +95,7 @@ class Source(NamedTuple):
 
     recorded: PosedDetections
     file: Path
-    frames: Frames | None
+    images: frames.Frames | None
 
 
 def read_source(options: argparse.Namespace) -> Source:
@@ -118,11 +111,11 @@ def read_source(options: argparse.Namespace) -> Source:
     if options.observations is not None:
         return Source(load_observations(options.observations), options.observations, None)
     of_cameras = read_cameras(options)
-    frames = of_cameras[''] if '' in of_cameras else join_frames(of_cameras)
-    print(''.join(f'{note}\n' for note in frames.notes), end='', flush=True)
+    images = of_cameras[''] if '' in of_cameras else frames.join_frames(of_cameras)
+    print(''.join(f'{note}\n' for note in images.notes), end='', flush=True)
     recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))
-    file = options.record_to or recorder.observation_file(frames, recording)
-    return Source(recorder.record_once(frames, recording, file, _odometry(options)), file, frames)
+    file = options.record_to or recorder.observation_file(images, recording)
+    return Source(recorder.record_once(images, recording, file, _odometry(options)), file, images)
 
 
 def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeOptions,
@@ -156,7 +149,7 @@ def recording_of(options: argparse.Namespace, file: Path, scale: float,
                         scale=scale, rotation=rotation.tolist())
 
 
-def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str, Frames]:
+def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str, frames.Frames]:
     """Return the images of the source by camera, with their poses in a map, see read_cameras.
 
     A map that was levelled or scaled has different poses than its recording. If the source is this
@@ -173,11 +166,11 @@ def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str
         for name, value in built_from.placing.items():
             setattr(options, name, value)
     is_scaled = built_from.scale != 1.0  # by --object-size
-    frames = read_cameras(options, gap_s=0.0, any_unit=is_scaled)
+    images = read_cameras(options, gap_s=0.0, any_unit=is_scaled)
     if not built_from.is_moved:
-        return frames
-    return {name: move_frames(frame, built_from.scale, np.array(built_from.rotation))
-            for name, frame in frames.items()}
+        return images
+    return {name: frames.move_frames(own, built_from.scale, np.array(built_from.rotation))
+            for name, own in images.items()}
 
 
 def source_of(options: argparse.Namespace) -> Path:
@@ -187,7 +180,7 @@ def source_of(options: argparse.Namespace) -> Path:
 
 
 def read_cameras(options: argparse.Namespace, gap_s: float | None = None, *,
-                 any_unit: bool = False) -> dict[str, Frames]:
+                 any_unit: bool = False) -> dict[str, frames.Frames]:
     """Return the images of the source with their poses, by camera name, '' for a single camera.
 
     The poses of a topic or a folder are interpolated over gaps of `gap_s` [s]; None: of --max-gap,
@@ -207,7 +200,7 @@ def read_cameras(options: argparse.Namespace, gap_s: float | None = None, *,
         if options.scale is not None:
             raise OptionsError('give --scale or --known-distance, not both')
     path, key = found
-    folder = FolderOptions(
+    folder = frames.FolderOptions(
         options.intrinsics, options.trajectory and read_tum_trajectory(options.trajectory), gap_ns,
         mounts[''], _depth_format(options), key, options.images, options.axes, options.scale,
         distance, any_unit or getattr(options, 'object_size', None) is not None, options.level,
@@ -236,7 +229,7 @@ def _mounts(options: argparse.Namespace) -> dict[str, NDArray[np.float64] | None
 
 
 def _frames_of(options: argparse.Namespace, name: str, mount: NDArray[np.float64] | None,
-               gap_ns: int) -> Frames:
+               gap_ns: int) -> frames.Frames:
     """Return the images of one camera of a bag; its name is '' if it is the only one."""
     topics = bag_frames.BagTopics(options.image, options.camera_info, options.rectified,
                                   options.depth or '', options.intrinsics,
@@ -297,7 +290,7 @@ def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
             options.odometry_frame)) for name, mount in _mounts(options).items()}
 
 
-def _depth_format(options: argparse.Namespace) -> DepthFormat:
+def _depth_format(options: argparse.Namespace) -> frames.DepthFormat:
     camera = None
     if options.depth_intrinsics is not None:
         baseline = np.array(options.depth_baseline or (0.0, 0.0, 0.0))
@@ -305,4 +298,4 @@ def _depth_format(options: argparse.Namespace) -> DepthFormat:
         camera = DepthCamera(fx, fy, cx, cy, make_transform(np.eye(3), baseline))
     elif options.depth_baseline is not None:
         raise OptionsError('--depth-baseline needs --depth-intrinsics')
-    return DepthFormat(options.depth_unit, camera)
+    return frames.DepthFormat(options.depth_unit, camera)

@@ -13,16 +13,10 @@ from importlib import import_module
 from itertools import chain, islice
 from typing import Any
 
+from rclpy import qos
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    LivelinessPolicy,
-    QoSProfile,
-    ReliabilityPolicy,
-)
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability
 from rosgraph_msgs.msg import Clock
 
@@ -287,26 +281,26 @@ def message_class(topic: BagTopic) -> Any:
             f'leave the topic out: `exclude` {topic.name}') from None
 
 
-def qos_profile(offered: Collection[Qos]) -> QoSProfile:
+def qos_profile(offered: Collection[Qos]) -> qos.QoSProfile:
     """Return the QoS profile that a topic's publishers offered.
 
     With several publishers, the strongest reliability and durability are used, which match all
     their subscribers. The default depth of the history is 10.
     """
     if not offered:
-        return QoSProfile(depth=DEFAULT_DEPTH)
+        return qos.QoSProfile(depth=DEFAULT_DEPTH)
     first = next(iter(offered))
-    best_effort = all(qos.reliability == QosReliability.BEST_EFFORT for qos in offered)
+    best_effort = all(one.reliability == QosReliability.BEST_EFFORT for one in offered)
     keep_all = first.history == QosHistory.KEEP_ALL
-    profile = QoSProfile(
-        history=HistoryPolicy.KEEP_ALL if keep_all else HistoryPolicy.KEEP_LAST,
+    profile = qos.QoSProfile(
+        history=qos.HistoryPolicy.KEEP_ALL if keep_all else qos.HistoryPolicy.KEEP_LAST,
         depth=first.depth or DEFAULT_DEPTH,
-        reliability=(ReliabilityPolicy.BEST_EFFORT if best_effort
-                     else ReliabilityPolicy.RELIABLE),
-        durability=(DurabilityPolicy.TRANSIENT_LOCAL if is_latched(offered)
-                    else DurabilityPolicy.VOLATILE))
+        reliability=(qos.ReliabilityPolicy.BEST_EFFORT if best_effort
+                     else qos.ReliabilityPolicy.RELIABLE),
+        durability=(qos.DurabilityPolicy.TRANSIENT_LOCAL if is_latched(offered)
+                    else qos.DurabilityPolicy.VOLATILE))
     if first.liveliness == QosLiveliness.MANUAL_BY_TOPIC:
-        profile.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
+        profile.liveliness = qos.LivelinessPolicy.MANUAL_BY_TOPIC
     for name in ('deadline', 'lifespan', 'liveliness_lease_duration'):
         recorded = getattr(first, name)
         if recorded.sec < _INFINITE_S and (recorded.sec or recorded.nsec):
@@ -316,4 +310,4 @@ def qos_profile(offered: Collection[Qos]) -> QoSProfile:
 
 def is_latched(offered: Collection[Qos]) -> bool:
     """Return whether a recorded publisher kept messages for late subscribers."""
-    return any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in offered)
+    return any(one.durability == QosDurability.TRANSIENT_LOCAL for one in offered)

@@ -14,12 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.covariance import normalized_square
 from cliploc_ros.core.fit.verification import MAX_FRAMES
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    make_transform,
-    pose_error,
-    transform_from_pose,
-)
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.joined_map import place_of
@@ -180,7 +175,7 @@ def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -
     for query, stamp_ns in zip(queries, stamps_ns, strict=True):
         gaps_ns = np.abs(poses.stamps_ns - stamp_ns)
         row = int(gaps_ns.argmin())
-        pose = (transform_from_pose(poses.positions_xyz[row], poses.quats_xyzw[row])
+        pose = (transforms.transform_from_pose(poses.positions_xyz[row], poses.quats_xyzw[row])
                 if gaps_ns[row] <= tolerance_ns else None)
         results.append(Result(
             name, 0, query.number, stamp_ns / NS_PER_S, len(query.observation.detections),
@@ -192,7 +187,7 @@ def _error(pose: NDArray[np.float64] | None, query: PosedQuery) -> dict[str, Any
     """Return the pose and the errors of a result by their fields; None without a pose."""
     if pose is None:
         return dict.fromkeys(('map_from_camera', 'error_m', 'error_deg'))
-    error_m, error_deg = pose_error(pose, query.map_from_camera)
+    error_m, error_deg = transforms.pose_error(pose, query.map_from_camera)
     return {'map_from_camera': pose.tolist(), 'error_m': float(error_m),
             'error_deg': float(error_deg)}
 
@@ -295,10 +290,10 @@ def _odometry(frames: Sequence[PosedQuery], noise_m: float, noise_deg: float,
     """Return odom_from_camera (4, 4) of each frame, with a random error in each step."""
     poses = [np.eye(4)]
     for before, after in pairwise(frames):
-        step = invert_transform(before.map_from_camera) @ after.map_from_camera
+        step = transforms.invert_transform(before.map_from_camera) @ after.map_from_camera
         turn = Rotation.from_rotvec(np.radians(noise_deg) * rng.normal(size=3)).as_matrix()
         shift = noise_m * rng.normal(size=3)
-        poses.append(poses[-1] @ step @ make_transform(turn, shift))
+        poses.append(poses[-1] @ step @ transforms.make_transform(turn, shift))
     return poses
 
 

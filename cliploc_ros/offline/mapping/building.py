@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.mapping import joint
+from cliploc_ros.offline.mapping import joint, triangulation
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.doubles import close_pairs, merge_doubles, resolve_doubles
 from cliploc_ros.offline.mapping.evidence import (
@@ -34,12 +34,6 @@ from cliploc_ros.offline.mapping.odometry import link_frames
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection, refine_mount
-from cliploc_ros.offline.mapping.triangulation import (
-    MAX_SIGMA_WITH_DEPTH_M,
-    SUPPORT_IOU,
-    scaled_depths,
-    triangulate,
-)
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views, thin_out
 
 # Landmarks are found in overlapping windows of time [s]; no pair of boxes is farther apart than
@@ -178,12 +172,13 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     draft = builder.draft(given)
     if detections.depths is not None:
         # the draft from boxes alone gives the scale of depth
-        given, depth_notes = scaled_depths(given, detections, draft.landmarks, draft.shown)
+        given, depth_notes = triangulation.scaled_depths(given, detections, draft.landmarks,
+                                                         draft.shown)
         notes += depth_notes
         # depth limits the deviation, not the parallax
         builder = builder._replace(options=replace(
             options, min_baseline_deg=0.0, max_position_sigma_m=max(
-                options.max_position_sigma_m, MAX_SIGMA_WITH_DEPTH_M)))
+                options.max_position_sigma_m, triangulation.MAX_SIGMA_WITH_DEPTH_M)))
         draft = builder.draft(given)
     mount, odometry = None, detections.odom_from_camera
     if options.refine_mount:
@@ -277,10 +272,10 @@ class _Builder(NamedTuple):
             self.tell('finding landmarks', first / len(views.stamps_s))
             window = views.between(first, last)
             left = free[views.offsets[first]:views.offsets[last]].copy()
-            left &= associate(window, found[-1], SUPPORT_IOU) < 0
+            left &= associate(window, found[-1], triangulation.SUPPORT_IOU) < 0
             found.append(Landmarks.joined(*(
-                triangulate(window, np.nonzero(left & (window.classes == number))[0],
-                            self.options.min_viewpoints, self.rng)
+                triangulation.triangulate(window, np.nonzero(left & (window.classes == number))[0],
+                                          self.options.min_viewpoints, self.rng)
                 for number in np.unique(window.classes[left]))))
         all_found = Landmarks.joined(*found)
         # searched before they are dropped, so that moving_classes does not change the random

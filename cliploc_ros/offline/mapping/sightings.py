@@ -8,12 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry import ellipsoid
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-)
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
@@ -40,7 +36,7 @@ class Sighting(NamedTuple):
 def outlines_in_view(detections: PosedDetections, view: int, centers: NDArray[np.float64],
                      shapes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the outlines (n, 5) of ellipsoids in a view [px]; NaN behind the camera."""
-    return ellipses_in_pixels(project_ellipsoids(
+    return ellipsoid.ellipses_in_pixels(ellipsoid.project_ellipsoids(
         invert_transform(detections.map_from_camera[view]), centers, shapes),
         detections.camera_of(view))
 
@@ -103,7 +99,7 @@ def find_sightings(detections: PosedDetections, rows: NDArray[np.int64],
 def _projection(detections: PosedDetections, view: int, center: NDArray[np.float64],
                 shape: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the box (4,) around an ellipsoid in a view [px]; NaN behind the camera."""
-    box: NDArray[np.float64] = ellipse_bboxes(
+    box: NDArray[np.float64] = ellipsoid.ellipse_bboxes(
         outlines_in_view(detections, view, center[None], shape[None]))[0]
     return box
 

@@ -21,12 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.map.landmark_details import (
-    OPTIONAL_FIELDS,
-    LandmarkDetails,
-    join_details,
-    read_details,
-)
+from cliploc_ros.core.map import landmark_details
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
@@ -34,7 +29,8 @@ from cliploc_ros.offline.mapping.labelling import choose_medoids
 from cliploc_ros.offline.mapping.landmarks import Landmarks as Ellipsoids
 from cliploc_ros.offline.mapping.landmarks import unused_ids
 
-KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation', *OPTIONAL_FIELDS)
+KNOWN_FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation',
+                *landmark_details.OPTIONAL_FIELDS)
 # Edited numbers are rounded to these decimals, so that the file has the numbers that are shown.
 _DECIMALS = 6
 # The least semi-axis that an edit may set [m]; the file format allows less.
@@ -67,9 +63,9 @@ class Landmark:
     decision: str = field(default='', compare=False)
 
     @cached_property
-    def details(self) -> LandmarkDetails:
+    def details(self) -> landmark_details.LandmarkDetails:
         """The optional fields."""
-        return read_details(self.fields, 'landmark')
+        return landmark_details.read_details(self.fields, 'landmark')
 
     @property
     def label(self) -> str:
@@ -279,8 +275,8 @@ def merge(landmarks: Landmarks, landmark_ids: Sequence[str],
         halves = np.concatenate([bases, offsets], axis=2)
         squares, directions = np.linalg.eigh(np.einsum('n,nij,nkj->ik', weights, halves, halves))
         fit = center, directions * np.sqrt(squares)
-    classes = join_details([(part.label, part.class_id, part.details)
-                            for part in parts]).class_weights
+    classes = landmark_details.join_details([(part.label, part.class_id, part.details)
+                                             for part in parts]).class_weights
     merged = replace(
         parts[0].changed(**shape_fields(*fit), **_NO_EVIDENCE,
                          class_weights=None if classes is None else dict(classes)),

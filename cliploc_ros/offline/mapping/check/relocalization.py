@@ -24,6 +24,7 @@ from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
+from cliploc_ros.offline import simulation
 from cliploc_ros.offline.mapping.check.findings import Witness
 from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, REACH, best_ious, is_expected
 from cliploc_ros.offline.mapping.fitting import fit_landmarks, linearize_boxes
@@ -32,12 +33,6 @@ from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.views import Views
 from cliploc_ros.offline.posed_query import PosedQuery, ask
-from cliploc_ros.offline.simulation import (
-    GUESSED_MIN_SIDE_PX,
-    DetectorModel,
-    LabelModel,
-    Sightings,
-)
 from cliploc_ros.units import NS_PER_S
 
 _MAX_SAMPLED_FRAMES = 600
@@ -116,7 +111,7 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
 
 
 def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
-                     witness: Witness) -> DetectorModel:
+                     witness: Witness) -> simulation.DetectorModel:
     """Return a model of the detector of a recording, for the images of its first camera.
 
     The model never detects a landmark that was never detected in the recording.
@@ -133,12 +128,12 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
         distances = np.linalg.norm(offsets, axis=1)
         expected = frames[(is_expected(views, cameras, center, basis, reach[row])
                            & (distances > 0.0))[frames]]
-        sightings.append(Sightings(offsets[expected] / distances[expected, None],
+        sightings.append(simulation.Sightings(offsets[expected] / distances[expected, None],
                                     np.isin(expected, views.frames[rows])))
     own = detections.frame_cameras == 0
     sides = np.diff(detections.bboxes_xyxy[own[views.frames]].reshape(-1, 2, 2), axis=1
                     ).min(axis=(1, 2))
-    min_side = float(np.quantile(sides, 0.01)) if len(sides) else GUESSED_MIN_SIDE_PX
+    min_side = float(np.quantile(sides, 0.01)) if len(sides) else simulation.GUESSED_MIN_SIDE_PX
     # the boxes that no landmark explains, by frame
     is_clutter = best_ious(views, landmarks) < _CLUTTER_IOU
     clutter = []
@@ -150,7 +145,7 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
     linear = linearize_boxes(views, witness.shown, landmarks)
     residuals = np.abs(linear.residuals[linear.weights > 0.0])
     scale = float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
-    return DetectorModel(
+    return simulation.DetectorModel(
         landmark_map, detections.cameras[0], tuple(sightings), witness.evidence.seen_ratio,
         reach, scale, min_side, tuple(clutter))
 
@@ -179,7 +174,7 @@ class Trial:
 
 
 def simulated(detections: PosedDetections, frame: int, shown: NDArray[np.int64],
-              labels: LabelModel, seed: int) -> PosedQuery:
+              labels: simulation.LabelModel, seed: int) -> PosedQuery:
     """Return a recorded frame as a query, with simulated, reproducible similarities.
 
     shown (n,) is the landmark of each box of the recording, -1 for none.
@@ -202,7 +197,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     the landmark of each box, -1 for none. tell is called with the progress, 0 to 1. A fold has one
     localizer, and a second localizer with keyframes; each gathers its own evidence.
     """
-    labels = LabelModel.of(landmark_map)
+    labels = simulation.LabelModel.of(landmark_map)
     chosen = set(sample_frames(detections, options.frames).tolist())
     taken_at = None if keyframes is None else _frames_of(keyframes.layer, detections)
     trials: list[Trial] = []
@@ -249,15 +244,15 @@ def sample_frames(detections: PosedDetections, limit: int) -> NDArray[np.int64]:
     return detections.every(step, min(step // 2, count - 1))
 
 
-def try_poses(model: DetectorModel, landmark_map: LandmarkMap, poses: NDArray[np.float64],
-              options: CheckOptions, tell: Tell) -> list[Trial]:
+def try_poses(model: simulation.DetectorModel, landmark_map: LandmarkMap,
+              poses: NDArray[np.float64], options: CheckOptions, tell: Tell) -> list[Trial]:
     """Relocalize a simulated frame for each pose; return the trials.
 
     The model generates the detections, and the relocalizer knows the map; poses (k, 4, 4) are
     the true map_from_camera. tell is called with the progress, 0 to 1.
     """
-    trials = []
-    labels, relocalizer = LabelModel.of(landmark_map), make_relocalizer(landmark_map, options)
+    trials, relocalizer = [], make_relocalizer(landmark_map, options)
+    labels = simulation.LabelModel.of(landmark_map)
     for number, pose in enumerate(poses):
         rng = np.random.default_rng([options.random_seed, number])
         detections, shown = model.detect(pose, rng)

@@ -11,12 +11,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
+from cliploc_ros.offline.mapping.check import relocalization
 from cliploc_ros.offline.mapping.check.findings import Grid, LandmarkCheck, LookAlike, Overlap
-from cliploc_ros.offline.mapping.check.relocalization import (
-    LANDMARKS_FOR_A_POSE,
-    Trial,
-    count_verdicts,
-)
 from cliploc_ros.offline.mapping.evidence import BoxQuality
 from cliploc_ros.offline.mapping.options import Thresholds
 from cliploc_ros.offline.mapping.systematic import Correction
@@ -32,7 +28,7 @@ class Advice(NamedTuple):
 
     text: str
     landmarks: tuple[str, ...] = ()  #: Ids of the landmarks that it concerns
-    view: Trial | None = None  #: The view that it concerns
+    view: relocalization.Trial | None = None  #: The view that it concerns
 
 
 class Measure(NamedTuple):
@@ -68,11 +64,12 @@ class RecordingCheck:
     #: With the map as it is. A map built from this recording was fitted to these boxes.
     as_given: BoxQuality
     held_out: BoxQuality  #: Cross-validated over time
-    trials: tuple[Trial, ...]  #: Recorded frames in cross-validated maps, in the order of time
+    #: Recorded frames in cross-validated maps, in the order of time
+    trials: tuple[relocalization.Trial, ...]
     corrections: tuple[Correction, ...]
 
     @property
-    def judged(self) -> tuple[Trial, ...]:
+    def judged(self) -> tuple[relocalization.Trial, ...]:
         """Return the recorded frames by which the map can be judged."""
         return tuple(trial for trial in self.trials if trial.is_judged)
 
@@ -96,7 +93,7 @@ class GridCheck(Grid):
     misled: NDArray[np.int64]
     #: (P, H): average number of landmarks that the detector finds, by heading
     visible: NDArray[np.float64]
-    trials: tuple[Trial, ...]  #: Heading by heading of each position
+    trials: tuple[relocalization.Trial, ...]  #: Heading by heading of each position
 
     @property
     def headings(self) -> int:
@@ -106,7 +103,7 @@ class GridCheck(Grid):
     @property
     def useful(self) -> NDArray[np.int64]:
         """Return the number of headings (P,) that show enough landmarks for a pose."""
-        return np.asarray((self.visible >= LANDMARKS_FOR_A_POSE).sum(axis=1))
+        return np.asarray((self.visible >= relocalization.LANDMARKS_FOR_A_POSE).sum(axis=1))
 
     @property
     def accepted_positions(self) -> float:
@@ -183,7 +180,7 @@ class CheckReport:
         return not self.failures
 
     @property
-    def _by_images(self) -> list[Trial]:
+    def _by_images(self) -> list[relocalization.Trial]:
         """Return the recorded frames that were relocalized by keyframes, too."""
         return [] if self.recording is None else [
             trial for trial in self.recording.judged if trial.by_objects is not None]
@@ -264,15 +261,15 @@ def _percent(value: float, digits: int) -> str:
                                       trim='-') + ' %'
 
 
-def count_by_objects(trials: Sequence[Trial]) -> dict[str, int]:
+def count_by_objects(trials: Sequence[relocalization.Trial]) -> dict[str, int]:
     """Return how many trials are accepted, refused and misled without keyframes."""
-    return count_verdicts([replace(trial, verdict=trial.by_objects or trial.verdict)
-                           for trial in trials])
+    return relocalization.count_verdicts([replace(trial, verdict=trial.by_objects or trial.verdict)
+                                          for trial in trials])
 
 
-def share(trials: Sequence[Trial], verdict: str) -> float:
+def share(trials: Sequence[relocalization.Trial], verdict: str) -> float:
     """Return the share of the trials with a verdict; 0 without trials."""
-    return count_verdicts(trials)[verdict] / len(trials) if trials else 0.0
+    return relocalization.count_verdicts(trials)[verdict] / len(trials) if trials else 0.0
 
 
 def check_keyframes(layer: KeyframeLayer, grid: GridCheck,

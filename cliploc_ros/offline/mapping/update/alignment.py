@@ -18,16 +18,10 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.ellipsoid import normalized_lengths
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.mapping import joint
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.building import REFINEMENTS
 from cliploc_ros.offline.mapping.fitting import centre_covariance, fit_ellipsoid
-from cliploc_ros.offline.mapping.joint import (
-    Anchors,
-    pose_changes,
-    pose_errors,
-    refine_jointly,
-    significant_pose_errors,
-)
 from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.views import Views
@@ -152,10 +146,10 @@ def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
     if errors is None and options.estimate_pose_errors:
         shown = associate(views, known.landmarks)
         found = refit(views, known.landmarks, shown, options.min_viewpoints)
-        errors = estimated = significant_pose_errors(views, found.landmarks, shown)
+        errors = estimated = joint.significant_pose_errors(views, found.landmarks, shown)
     refined = views if errors is None else _refine(views, known, errors, options)
-    return Aligned(refined, offset_m, offset_deg, *pose_changes(views, refined),
-                   pose_errors(views, refined), estimated)
+    return Aligned(refined, offset_m, offset_deg, *joint.pose_changes(views, refined),
+                   joint.pose_errors(views, refined), estimated)
 
 
 def _offset(known: OldMap, refits: Refits) -> NDArray[np.float64]:
@@ -187,7 +181,7 @@ def _offset(known: OldMap, refits: Refits) -> NDArray[np.float64]:
 def _refine(aligned: Views, known: OldMap, errors: PoseErrors, options: MappingOptions) -> Views:
     """Return the views with poses refined against the old landmarks that are in their place."""
     views = aligned
-    anchors = Anchors(known.landmarks.centers, known.sigmas)
+    anchors = joint.Anchors(known.landmarks.centers, known.sigmas)
     for _ in range(REFINEMENTS):
         shown = associate(views, known.landmarks)
         found = refit(views, known.landmarks, shown, options.min_viewpoints)
@@ -195,7 +189,8 @@ def _refine(aligned: Views, known: OldMap, errors: PoseErrors, options: MappingO
         shown[np.isin(shown, np.nonzero(away)[0])] = -1
         if not (shown >= 0).any():
             return views
-        views, _ = refine_jointly(aligned, views, known.landmarks, shown, errors, anchors=anchors)
+        views, _ = joint.refine_jointly(aligned, views, known.landmarks, shown, errors,
+                                        anchors=anchors)
     return views
 
 

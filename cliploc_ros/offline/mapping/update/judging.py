@@ -23,14 +23,7 @@ from cliploc_ros.offline.mapping.joint import left_by_poses
 from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.update.alignment import (
-    LEAST_MOVE_SHAPES,
-    Aligned,
-    OldMap,
-    Refits,
-    has_moved,
-    refit,
-)
+from cliploc_ros.offline.mapping.update import alignment
 from cliploc_ros.offline.mapping.views import Views
 
 # Range of the factor by which a recording changes all ratios, if its objects are detected more or
@@ -105,8 +98,8 @@ class Judgement(NamedTuple):
     is_doubtful: NDArray[np.bool_]
 
 
-def judge(detections: PosedDetections, views: Views, known: OldMap, options: MappingOptions
-          ) -> Judgement:
+def judge(detections: PosedDetections, views: Views, known: alignment.OldMap,
+          options: MappingOptions) -> Judgement:
     """Judge each place of the map by the recording, and find the other objects that it shows.
 
     The views have poses in the coordinate frame of the map.
@@ -120,9 +113,9 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
                            for new, weak in enumerate(finds.weak)], sight)
     # old landmarks and finds compete for the boxes: an old one may have boxes of a neighbour
     shown, _ = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
-    refits = refit(views, known.landmarks, np.where(shown < count, shown, -1),
-                   options.min_viewpoints)
-    displaced = has_moved(known.landmarks, known.sigmas, refits)
+    refits = alignment.refit(views, known.landmarks, np.where(shown < count, shown, -1),
+                             options.min_viewpoints)
+    displaced = alignment.has_moved(known.landmarks, known.sigmas, refits)
     finds = _with_displaced(finds, refits, displaced, known.map.class_ids)
     shown, sight = _look(views, known, finds, displaced)
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
@@ -154,7 +147,7 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     is_gone |= _is_absent(known, own, limits)
     shown[np.isin(shown, np.nonzero(is_gone)[0])] = -1
     of_landmarks = np.where(shown < count, shown, -1)
-    refits = refit(views, known.landmarks, of_landmarks, options.min_viewpoints)
+    refits = alignment.refit(views, known.landmarks, of_landmarks, options.min_viewpoints)
     fits = gather_evidence(views, refits.landmarks, of_landmarks).median_iou
     is_rare = ((own.seen_ratio < _MIN_SHARE_IN_PLACE * usual) & (own.expected >= LEAST_VIEWS))
     is_there = (~is_gone & ~is_rare & (fits >= MIN_MEDIAN_IOU)
@@ -166,7 +159,7 @@ def judge(detections: PosedDetections, views: Views, known: OldMap, options: Map
     return Judgement(shown, finds, sight, is_gone, is_there, is_doubtful)
 
 
-def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
+def _is_absent(known: alignment.OldMap, sight: Sight, limits: NDArray[np.float64] | float
                ) -> NDArray[np.bool_]:
     """Return a mask of the objects (L,) whose probability of being in place is below the limits.
 
@@ -179,7 +172,7 @@ def _is_absent(known: OldMap, sight: Sight, limits: NDArray[np.float64] | float
     return np.asarray(is_told & (is_never_seen | (_probability_there(known, sight) < limits)))
 
 
-def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
+def _probability_there(known: alignment.OldMap, sight: Sight) -> NDArray[np.float64]:
     """Return for each place (L,) the probability that its object is there.
 
     If it is, the recording shows it in a usual share of the views. It is the share of the old
@@ -212,7 +205,7 @@ def _probability_there(known: OldMap, sight: Sight) -> NDArray[np.float64]:
     return np.asarray(expit(log_odds_there(_STAYS, there, away)))
 
 
-def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_]
+def _look(views: Views, known: alignment.OldMap, finds: Finds, is_gone: NDArray[np.bool_]
           ) -> tuple[NDArray[np.int64], Sight]:
     """Return the old landmark or new find that each box shows, and the sight of all places."""
     places = Landmarks.joined(known.landmarks, finds.landmarks)
@@ -221,7 +214,7 @@ def _look(views: Views, known: OldMap, finds: Finds, is_gone: NDArray[np.bool_]
     return shown, look_for(views, places, shown, is_solid)
 
 
-def _free(views: Views, known: OldMap) -> NDArray[np.bool_]:
+def _free(views: Views, known: alignment.OldMap) -> NDArray[np.bool_]:
     """Return a mask of the boxes (n,) that may show new objects: no old landmark fits them well.
 
     Boxes of other classes on a landmark are excluded if it has at least as many boxes of its
@@ -260,7 +253,7 @@ def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.boo
                        f'{options.min_baseline_deg:g}' for detail in built.landmark_map.details))
 
 
-def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
+def _with_displaced(finds: Finds, refits: alignment.Refits, displaced: NDArray[np.bool_],
                     class_ids: Sequence[str]) -> Finds:
     """Add old landmarks that are slightly displaced to the finds, unless they are among them."""
     rows = np.nonzero(displaced)[0]
@@ -274,7 +267,7 @@ def _with_displaced(finds: Finds, refits: Refits, displaced: NDArray[np.bool_],
         weak=finds.weak + ('',) * len(rows))
 
 
-def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
+def _without_copies(views: Views, finds: Finds, old: Landmarks, known: alignment.OldMap,
                     shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
     """Return the finds without those that are an old landmark in its place.
 
@@ -289,7 +282,7 @@ def _without_copies(views: Views, finds: Finds, old: Landmarks, known: OldMap,
     for new, row, distance in _pairs_between(finds.landmarks, old):
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
         if len(boxes[row]) >= max(1.0, majority * len(boxes[count + new])) and (
-                (is_one_class and distance < LEAST_MOVE_SHAPES)
+                (is_one_class and distance < alignment.LEAST_MOVE_SHAPES)
                 or relation(views, every, boxes, (row, count + new)) is not Relation.TWO):
             reasons[new] = f'it is {known.map.landmark_ids[row]} in its place'
     return finds.without(reasons, sight)
@@ -305,7 +298,7 @@ def _pairs_between(new: Landmarks, old: Landmarks) -> list[tuple[int, int, float
 class Shown(NamedTuple):
     """The m objects that the recording shows: old landmarks in their places, and finds."""
 
-    refits: Refits  #: Where they are
+    refits: alignment.Refits  #: Where they are
     owners: NDArray[np.int64]  #: (m,): the old landmark in whose place it was seen, -1 for none
     #: For each object, the old landmarks that it may be although it is slightly off their place
     near: tuple[frozenset[int], ...]
@@ -327,8 +320,8 @@ class Shown(NamedTuple):
                      for row, weak in enumerate(self.weak) if weak and row not in chosen)
 
 
-def gather_objects(aligned: Aligned, known: OldMap, judged: Judgement, options: MappingOptions
-                   ) -> Shown:
+def gather_objects(aligned: alignment.Aligned, known: alignment.OldMap, judged: Judgement,
+                   options: MappingOptions) -> Shown:
     """Return the objects that the recording shows."""
     views, count, finds = aligned.views, len(known.sigmas), judged.finds
     in_place = np.nonzero(judged.is_there)[0]
@@ -337,7 +330,7 @@ def gather_objects(aligned: Aligned, known: OldMap, judged: Judgement, options: 
     numbers[places] = np.arange(len(places))
     shown = numbers[judged.shown]
     landmarks = Landmarks.joined(known.landmarks.select(in_place), finds.landmarks)
-    refits = refit(views, landmarks, shown, options.min_viewpoints)
+    refits = alignment.refit(views, landmarks, shown, options.min_viewpoints)
     left_m = left_by_poses(views, np.square(aligned.changes), shown, len(places))
     refits = refits._replace(
         covariances=refits.covariances + np.square(left_m)[:, None, None] * np.eye(3))

@@ -27,27 +27,7 @@ from cliploc_ros.offline.mapping.joint import estimated_note
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map, unused_ids
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.update.alignment import (
-    MIN_CONFIRMED,
-    Aligned,
-    OldMap,
-    align,
-    known_landmarks,
-)
-from cliploc_ros.offline.mapping.update.identity import (
-    Fates,
-    compare_looks,
-    decide_fates,
-    renew_embeddings,
-    why_not_comparable,
-)
-from cliploc_ros.offline.mapping.update.judging import (
-    LEAST_VIEWS,
-    Judgement,
-    Shown,
-    gather_objects,
-    judge,
-)
+from cliploc_ros.offline.mapping.update import alignment, identity, judging
 from cliploc_ros.offline.mapping.views import Views, check_input, make_views
 
 _ROWS_SHOWN = 40
@@ -167,20 +147,20 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
     if removed is not None:
         old = old.with_more(removed.select([row for row, name in enumerate(removed.landmark_ids)
                                             if name not in old.landmark_ids]))
-    known = known_landmarks(old, detections.class_names)
-    aligned = align(given, known, options)
-    judged = judge(detections, aligned.views, known, options)
+    known = alignment.known_landmarks(old, detections.class_names)
+    aligned = alignment.align(given, known, options)
+    judged = judging.judge(detections, aligned.views, known, options)
     loose, well = (int((associate(aligned.views, known.landmarks, min_iou) >= 0).sum())
                    for min_iou in (ASSOCIATION_IOU, MIN_MEDIAN_IOU))
     _check_belongs(judged, count, well / max(1, loose))
-    objects = gather_objects(aligned, known, judged, options)
-    unlike = why_not_comparable(embeddings, detections)
+    objects = judging.gather_objects(aligned, known, judged, options)
+    unlike = identity.why_not_comparable(embeddings, detections)
     looks = None
     if unlike:
         notes.append(f'image embeddings are not compared: {unlike}')
     elif embeddings is not None:
-        looks = compare_looks(embeddings, old.landmark_ids, detections, objects)
-    fates = decide_fates(known, judged, objects, looks)
+        looks = identity.compare_looks(embeddings, old.landmark_ids, detections, objects)
+    fates = identity.decide_fates(known, judged, objects, looks)
     away = fates.objects < 0
     away[:count] = False
     was_here = np.arange(len(old)) < count
@@ -209,17 +189,17 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
                               key=lambda landmark: -landmark.support)),
         notes=tuple(notes))
     return UpdatedMap(without_doubles, report, shown, first_new, aligned.views.poses,
-                      renew_embeddings(embeddings, without_doubles.landmark_ids, detections,
-                                       shown),
+                      identity.renew_embeddings(embeddings, without_doubles.landmark_ids,
+                                                detections, shown),
                       old.select(np.setdiff1d(np.arange(len(old)), kept).tolist()))
 
 
-def _check_belongs(judged: Judgement, count: int, well_share: float) -> None:
+def _check_belongs(judged: judging.Judgement, count: int, well_share: float) -> None:
     """Refuse a recording that confirms hardly any landmark, or whose boxes fit badly."""
     is_there = judged.is_there[:count]
     there = int(is_there.sum())
-    in_view = int((is_there | (judged.sight.expected[:count] >= LEAST_VIEWS)).sum())
-    if (there < min(MIN_CONFIRMED, count) or there < _MIN_CONFIRMED_SHARE * in_view
+    in_view = int((is_there | (judged.sight.expected[:count] >= judging.LEAST_VIEWS)).sum())
+    if (there < min(alignment.MIN_CONFIRMED, count) or there < _MIN_CONFIRMED_SHARE * in_view
             or well_share < _MIN_WELL_SHARE):
         raise MappingError(
             f'the recording does not belong to this map: of {in_view} landmarks in view, {there} '
@@ -228,7 +208,8 @@ def _check_belongs(judged: Judgement, count: int, well_share: float) -> None:
             'errors, or build a new map')
 
 
-def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list[str]:
+def _notes(known: alignment.OldMap, aligned: alignment.Aligned, detections: PosedDetections
+           ) -> list[str]:
     """Return notes for the user about the input."""
     notes = []
     if aligned.estimated is not None:
@@ -249,8 +230,9 @@ def _notes(known: OldMap, aligned: Aligned, detections: PosedDetections) -> list
     return notes
 
 
-def _renew(known: OldMap, views: Views, objects: Shown, fates: Fates, judged: Judgement,
-           class_names: tuple[str, ...], kept: NDArray[np.int64]) -> LandmarkMap:
+def _renew(known: alignment.OldMap, views: Views, objects: judging.Shown, fates: identity.Fates,
+           judged: judging.Judgement, class_names: tuple[str, ...], kept: NDArray[np.int64]
+           ) -> LandmarkMap:
     """Return the new map: the old landmarks that are kept, in their order, then new ones.
 
     The class names are those of the recording; the views have its poses in the map.
@@ -330,7 +312,8 @@ def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], f
     ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes
 
 
-def _refitted(known: OldMap, views: Views, objects: Shown, fates: Fates) -> dict[int, float]:
+def _refitted(known: alignment.OldMap, views: Views, objects: judging.Shown,
+              fates: identity.Fates) -> dict[int, float]:
     """Return the weight of the new centre for each confirmed landmark that is refitted."""
     rows = np.array([row for row in fates.confirmed
                      if known.map.details[row].position_sigma is not None
@@ -364,8 +347,9 @@ def _in_new_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, nu
                    last_seen=max(0.0, float(evidence.last_seen[number])))
 
 
-def _describe(old: LandmarkMap, updated: LandmarkMap, objects: Shown, fates: Fates,
-             judged: Judgement) -> dict[str, tuple[UpdatedLandmark, ...]]:
+def _describe(old: LandmarkMap, updated: LandmarkMap, objects: judging.Shown,
+              fates: identity.Fates, judged: judging.Judgement
+              ) -> dict[str, tuple[UpdatedLandmark, ...]]:
     """Return the lists of an UpdateReport."""
     places = dict(zip(updated.landmark_ids, updated.centers, strict=True))
     in_place, in_old_place = objects.sight.words, judged.sight.words
