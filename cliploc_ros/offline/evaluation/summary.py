@@ -90,15 +90,15 @@ class Summary:
             found = errors[np.isfinite(errors)]
             return float(found.mean()) if len(found) else np.nan
 
-        figures: dict[str, tuple[Callable[[Any], Any], NDArray[np.float64]]] = {
-            f'success_{limit:g}m': (np.mean, np.asarray(self.errors_m < limit, np.float64))
-            for limit in LIMITS_M} | {
-                'median_error_m': (np.median, self.errors_m),
-                'median_error_deg': (np.median, self.errors_deg),
-                'mean_error_m': (mean, self.errors_m)}
+        def spread(of: Callable[[Any], Any], values: NDArray[Any]) -> tuple[float, float]:
+            return float(of(values)), float(np.std([of(trial) for trial in values]))
+
         with np.errstate(invalid='ignore'):
-            return {name: (float(of(values)), float(np.std([of(trial) for trial in values])))
-                    for name, (of, values) in figures.items()}
+            return {f'success_{limit:g}m': spread(np.mean, self.errors_m < limit)
+                    for limit in LIMITS_M} | {
+                'median_error_m': spread(np.median, self.errors_m),
+                'median_error_deg': spread(np.median, self.errors_deg),
+                'mean_error_m': spread(mean, self.errors_m)}
 
     def false_accepts(self) -> int:
         """Return the number of accepted poses that are wrong."""
@@ -214,15 +214,19 @@ def table_rows(summaries: Sequence[Summary]) -> list[tuple[str, ...]]:
 def _row(summary: Summary, best: Summary) -> tuple[str, ...]:
     matching, algorithm = (summary.method.split('_', 1) if summary.method in PAPER_METHODS
                            else (summary.method, ''))
-    several, spreads = len(summary.errors_m) > 1, list(summary.spreads.values())
+    several, spreads = len(summary.errors_m) > 1, summary.spreads
     rates = ' / '.join(_rate(value) + (f'±{_rate(off)}' if several else '')
-                       for value, off in spreads[:-3])
+                       for name, (value, off) in spreads.items() if name.startswith('success'))
     if summary is not best and compare(summary, best).is_noise:
         rates += f' {_WITHIN_NOISE}'
-    median_m, median_deg, mean_m = (
-        f'{value:.{digits}f}' + (f'±{off:.{digits}f}' if several and np.isfinite(off) else '')
-        for (value, off), digits in zip(spreads[-3:], (3, 2, 2), strict=True))
-    errors = f'{median_m}, {median_deg}; {mean_m}'
+
+    def error(name: str, digits: int) -> str:
+        value, off = spreads[name]
+        spread = f'±{off:.{digits}f}' if several and np.isfinite(off) else ''
+        return f'{value:.{digits}f}{spread}'
+
+    errors = (f'{error("median_error_m", 3)}, {error("median_error_deg", 2)}; '
+              f'{error("mean_error_m", 2)}')
     if summary.is_given:
         return (matching, algorithm, rates, errors, '', '', '', '')
     cut = '' if summary.coverage.min() == 1.0 else f' ({summary.coverage.mean():.0%} tried)'
