@@ -49,7 +49,7 @@ class ReviewQueue:
     """The review: the user decides on each landmark of the map once, worst landmarks first.
 
     The order is that of the last check, so that the list does not change under the user's cursor.
-    Newer landmarks are at the end. Decisions are marks of the landmarks, so that undo reverts them.
+    Newer landmarks are at the end. Decisions are marks of the landmarks: undo reverts them.
     """
 
     ACTIONS = ('accept', 'fix', 'discard', 'step')
