@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.transforms import SAME_ANSWER
 from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.offline.mapping import building, triangulation
-from cliploc_ros.offline.mapping.update import judging, updating
+from cliploc_ros.offline.mapping.update import alignment, judging, updating
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -193,7 +193,7 @@ CONSTANTS = [
     ('mapping.md', r'a factor above ([.\d]+) is refused', [triangulation._UNIT_FACTOR]),
     ('mapping.md', r'in view from at least (\d+) viewpoints', [judging.LEAST_VIEWS]),
     ('mapping.md', r'fewer than (\d+) landmarks or less than ([.\d]+) .* less than ([.\d]+) of',
-     [updating.MIN_CONFIRMED, updating._MIN_CONFIRMED_SHARE, updating._MIN_WELL_SHARE]),
+     [alignment.MIN_CONFIRMED, updating._MIN_CONFIRMED_SHARE, updating._MIN_WELL_SHARE]),
     ('interface.md', r'The last images \(at most (\d+)\) .* confidence of ([.\d]+) on average',
      [CALIBRATION.looks.most, CALIBRATION.looks.mean_confidence]),
     ('interface.md', r'off by more than (\d+) %', [100 * (CALIBRATION.depth.most_ratio - 1)]),

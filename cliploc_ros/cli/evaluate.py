@@ -13,16 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cliploc_ros.cli.options import (
-    add_folders,
-    add_network_options,
-    add_reading_options,
-    add_use_option,
-    check_folder_options,
-    folder_of,
-    given_options,
-    read_layer,
-)
+from cliploc_ros.cli import options as shared
 from cliploc_ros.command import SEEDS, limit, not_negative, option, positive_int, run_main, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
@@ -70,7 +61,7 @@ def make_parser() -> argparse.ArgumentParser:
            'recordings have no effect on it and are refused')
     option(sources, '--bag', 'a rosbag2 recording with ground truth; or a request that was '
            'stored by ~/record (npz), to answer it again', Path)
-    add_folders(sources)
+    shared.add_folders(sources)
     option(parser, '--map YAML', 'several maps are searched as one; the true poses are in the '
            'first', nargs='+', required=True)
     option(parser, '--methods M', f'methods to compare ({ALL}); see below', default=[ALL],
@@ -88,8 +79,8 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--workers N',
            f'number of local processes ({_CORES} for searches, 1 for networks)', positive_int)
     option(parser, '--no-figures', dest='figures', action='store_false')
-    add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer does, on "
-                   'the images of --bag or a folder')
+    shared.add_use_option(parser, f"'{AUTO}' uses the keyframes of the map, as the relocalizer "
+                          'does, on the images of --bag or a folder')
     group = parser.add_argument_group("options of the paper's methods")
     option(group, '--iterations', '(%(default)s)', positive_int, 500)
     option(group, '--k', '(%(default)s)', positive_int, 3)
@@ -117,7 +108,7 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('options of --bag and folders')
     option(group, '--save-queries NPZ', 'write boxes and similarities to a file for --queries')
-    add_network_options(group)
+    shared.add_network_options(group)
     option(group, '--landmark-embeddings', "compare crops with the map's labels (text), with the "
            'images of its landmarks, or with both (%(default)s)', default='image',
            choices=COMPARED)
@@ -125,7 +116,7 @@ def _add_recording_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--sync-tolerance SECONDS', 'greatest distance in time of images of several '
            '--cameras that are localized together, from the first camera (%(default)s)',
            not_negative, 0.05)
-    add_reading_options(parser)
+    shared.add_reading_options(parser)
 
 
 def evaluate(options: argparse.Namespace) -> int:
@@ -140,8 +131,8 @@ def evaluate(options: argparse.Namespace) -> int:
 
     logging.basicConfig(level=logging.WARNING, format='%(message)s')
     parser = make_parser()
-    given = given_options(options, {name: parser.get_default(name) for name in vars(options)
-                                    if name != 'ros_args'})
+    given = shared.given_options(options, {name: parser.get_default(name) for name in vars(options)
+                                           if name != 'ros_args'})
     _check_options(options)
     of_case = options.bag is not None and options.bag.suffix == '.npz'
     if options.queries is None and not of_case:
@@ -190,14 +181,14 @@ def _check_options(options: argparse.Namespace) -> None:
         _add_recording_options(of_images)
         defaults = vars(of_images.parse_args([]))
         del defaults['scheduler']  # searches use it, too
-        if idle := given_options(options, defaults):
+        if idle := shared.given_options(options, defaults):
             raise OptionsError(
                 f'{", ".join(idle)}: no effect on --queries, whose boxes and similarities are '
                 'recorded; remove them, or give --bag or a folder')
     if options.cameras != [''] and (options.bag is None or options.fuse or options.save_queries):
         raise OptionsError('--cameras is for --bag, without --fuse and --save-queries')
-    check_folder_options(options)
-    if options.level and folder_of(options) is None:
+    shared.check_folder_options(options)
+    if options.level and shared.folder_of(options) is None:
         raise OptionsError('--level is for folders of images only')
     if options.poses and options.bag is not None and options.bag.suffix == '.npz':
         raise OptionsError('--poses: no effect on a stored request, which is answered again')
@@ -291,7 +282,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
         else 'several maps are searched by objects only' if len(options.map) > 1
         else '--queries has no images: give --bag or a folder' if options.queries else '')
     if not problem:
-        return read_layer(options.map[0], landmark_map, options.keyframes)
+        return shared.read_layer(options.map[0], landmark_map, options.keyframes)
     if options.keyframes:
         raise OptionsError(f'--keyframes: {problem}')
     return None
@@ -315,7 +306,9 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     wanted = options.keyframes
     if wanted is None and not case.report.get('parameters', {}).get('keyframes_file', True):
         wanted = False
-    layer = read_layer(options.map[0], landmark_map, wanted) if len(options.map) == 1 else None
+    layer = None
+    if len(options.map) == 1:
+        layer = shared.read_layer(options.map[0], landmark_map, wanted)
     again = repeat(case, Localizer(Relocalizer(landmark_map, case.options),
                                    None if layer is None else KeyframeLocalizer(layer)), observer)
     is_same = again.accepted == (case.report.get('found') == 'accepted')

@@ -13,16 +13,9 @@ from numpy.typing import NDArray
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.mapping import joint, triangulation
+from cliploc_ros.offline.mapping import evidence, joint, triangulation
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.doubles import close_pairs, merge_doubles, resolve_doubles
-from cliploc_ros.offline.mapping.evidence import (
-    Evidence,
-    explained_boxes,
-    gather_evidence,
-    is_expected,
-    reasons_against,
-)
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
 from cliploc_ros.offline.mapping.landmarks import (
     Landmarks,
@@ -212,7 +205,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
                    'past the objects instead of only turning it, or map images with depth')
         raise NothingFoundError(why, left_out)
     landmarks, shown = _one_of_each(views, draft.landmarks)
-    quality = explained_boxes(views, landmarks, shown)
+    quality = evidence.explained_boxes(views, landmarks, shown)
     report = MappingReport(
         len(detections), int(views.viewpoints.max()) + 1, quality.boxes, len(landmarks.centers),
         quality.explained, quality.median_iou,
@@ -246,11 +239,11 @@ class _Builder(NamedTuple):
             found = self._discover(views, shown < 0)
             self.tell('fitting landmarks', number / _DISCOVERY_ROUNDS)
             landmarks, shown = self._settle(views, Landmarks.joined(landmarks, found))
-        evidence = gather_evidence(views, landmarks, shown)
-        reasons = reasons_against(landmarks, evidence, self.options)
+        gathered = evidence.gather_evidence(views, landmarks, shown)
+        reasons = evidence.reasons_against(landmarks, gathered, self.options)
         left_out = tuple(LeftOut(
             self.detections.class_names[landmarks.classes[row]], rounded(landmarks.centers[row]),
-            int(evidence.support[row]), int(evidence.viewpoints[row]), reason)
+            int(gathered.support[row]), int(gathered.viewpoints[row]), reason)
             for row, reason in enumerate(reasons) if reason is not None)
         landmarks = landmarks.select(np.array([reason is None for reason in reasons],
                                               dtype=np.bool_))
@@ -338,9 +331,9 @@ class _Builder(NamedTuple):
                errors: PoseErrors | None) -> LandmarkMap:
         """Return the map of the landmarks, labelled with their class names."""
         count = len(landmarks.centers)
-        evidence = gather_evidence(views, landmarks, shown)
-        evidence = evidence._replace(position_sigma=np.hypot(
-            evidence.position_sigma,
+        gathered = evidence.gather_evidence(views, landmarks, shown)
+        gathered = gathered._replace(position_sigma=np.hypot(
+            gathered.position_sigma,
             joint.left_by_poses(views, np.square(joint.pose_errors(given, views)), shown, count)))
         shared = None if errors is None else joint.shared_by_neighbours(
             views, shown, count, errors)
@@ -351,7 +344,7 @@ class _Builder(NamedTuple):
                                  for number in np.argsort(-counts, kind='stable')
                                  if counts[number]))
         details = tuple(
-            evidence.details(row, LandmarkDetails(
+            gathered.details(row, LandmarkDetails(
                 class_weights=weight if len(weight) > 1 else None,
                 shared_sigma=None if shared is None else float(shared[row, 0]),
                 shared_sigma_deg=None if shared is None else float(shared[row, 1]),
@@ -452,14 +445,14 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     settled, part_of = resolve_doubles(views, settled, associate(views, settled), chosen)
     is_own = part_of == np.arange(len(chosen))
     shown = associate(views, settled, among=is_own)
-    evidence = gather_evidence(views, settled, shown)
+    gathered = evidence.gather_evidence(views, settled, shown)
     reasons = [reason if is_chosen else None for reason, is_chosen in zip(
-        _reasons(views, given, settled, part_of, evidence, landmark_map), chosen, strict=True)]
+        _reasons(views, given, settled, part_of, gathered, landmark_map), chosen, strict=True)]
     is_fitted = np.array([reason is None for reason in reasons]) & chosen
     share_known = float(known.mean())
-    before = explained_boxes(views, given)
+    before = evidence.explained_boxes(views, given)
     share_before = before.explained / share_known
-    share_settled = explained_boxes(views, settled.select(is_own)).explained / share_known
+    share_settled = evidence.explained_boxes(views, settled.select(is_own)).explained / share_known
     if share_before < _LEAST_AS_GIVEN * share_settled:
         raise MappingError(
             f'the map does not match the boxes: it explains {share_before:.0%} of them as given, '
@@ -475,11 +468,11 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
         bases=np.where(is_fitted[:, None, None], settled.bases, given.bases))
     shown = associate(views, landmarks, among=is_fitted | ~chosen)
     landmarks = fit_landmarks(views, landmarks, shown, among=is_fitted)
-    evidence = gather_evidence(views, landmarks, shown)
-    after = explained_boxes(views, landmarks.select(is_fitted | ~chosen))
+    gathered = evidence.gather_evidence(views, landmarks, shown)
+    after = evidence.explained_boxes(views, landmarks.select(is_fitted | ~chosen))
     details = list(landmark_map.joined(part_of).details)
     for row in np.nonzero(is_fitted)[0]:
-        details[row] = evidence.details(int(row), replace(
+        details[row] = gathered.details(int(row), replace(
             details[row], shared_sigma=None, shared_sigma_deg=None))
     semi_axes, quats_xyzw = landmarks.axes_and_quats()
     fitted = is_fitted[:, None]
@@ -493,9 +486,9 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
 
 
 def _reasons(views: Views, given: Landmarks, landmarks: Landmarks, part_of: NDArray[np.int64],
-             evidence: Evidence, landmark_map: LandmarkMap) -> list[str | None]:
+             gathered: evidence.Evidence, landmark_map: LandmarkMap) -> list[str | None]:
     """Return why each landmark could not be fitted; None if it was."""
-    reasons = reasons_against(landmarks, evidence, MappingOptions())
+    reasons = evidence.reasons_against(landmarks, gathered, MappingOptions())
     moved_m = np.linalg.norm(landmarks.centers - given.centers, axis=1)
     sizes_m = np.linalg.norm(given.bases, axis=1).max(axis=1)
     cameras = views.centers
@@ -505,9 +498,9 @@ def _reasons(views: Views, given: Landmarks, landmarks: Landmarks, part_of: NDAr
         elif landmarks.classes[row] < 0:
             name = landmark_map.class_ids[row]
             reasons[row] = f"the recording has no boxes of its class, '{name}'"
-        elif evidence.support[row] == 0:
-            images = is_expected(views, cameras, landmarks.centers[row], landmarks.bases[row],
-                                 np.inf).sum()
+        elif gathered.support[row] == 0:
+            images = evidence.is_expected(views, cameras, landmarks.centers[row],
+                                          landmarks.bases[row], np.inf).sum()
             reasons[row] = (f'its place is in {images} images, and no box shows it: hidden, '
                             'missed or gone' if images else 'its place is in no image')
         elif reasons[row] is None and moved_m[row] > max(_MAX_MOVE_M, 2.0 * sizes_m[row]):

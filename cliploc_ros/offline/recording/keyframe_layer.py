@@ -14,14 +14,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import DepthImage, points_in_color
 from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.keyframes import layer
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
-from cliploc_ros.core.keyframes.layer import (
-    FROM_DEPTH,
-    PIXEL_SCALE,
-    TRIANGULATED,
-    KeyframeLayer,
-    nearest_words,
-)
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
@@ -93,7 +87,7 @@ class _Keyframe(NamedTuple):
 
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
-                ) -> KeyframeLayer:
+                ) -> layer.KeyframeLayer:
     """Build the keyframes of all cameras of a recording, in the coordinate frame of its poses.
 
     Parameters
@@ -135,22 +129,22 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         + (keyframe.camera.cx, keyframe.camera.cy) for keyframe, _, rows in chosen])
     different = tuple(dict.fromkeys(cameras))
     vocabulary = learn_words(descriptors, kind)
-    layer = KeyframeLayer(
+    built = layer.KeyframeLayer(
         landmark_map.frame_id, landmark_map.landmark_ids,
         landmark_map.centers.astype(np.float32), different,
         np.array([keyframe.posed.map_from_camera for keyframe, _, _ in chosen]),
         np.cumsum([0, *(len(rows) for _, _, rows in chosen)]),
-        np.clip(np.round(pixels * PIXEL_SCALE), 0, 65535).astype(np.uint16),
+        np.clip(np.round(pixels * layer.PIXEL_SCALE), 0, 65535).astype(np.uint16),
         np.concatenate([points for _, points, _ in chosen]).astype(np.float32),
-        descriptors, nearest_words(kind.units(descriptors), kind.units(vocabulary)
-                                   ).astype(np.uint16), vocabulary,
-        FROM_DEPTH if has_depth else TRIANGULATED,
+        descriptors, layer.nearest_words(kind.units(descriptors), kind.units(vocabulary)
+                                         ).astype(np.uint16), vocabulary,
+        layer.FROM_DEPTH if has_depth else layer.TRIANGULATED,
         camera_rows=None if len(different) == 1 else np.array(
             [different.index(own) for own in cameras]), kind=kind)
     if not options.images:
-        return layer
+        return built
     jpegs = [keyframe.jpeg for keyframe, _, _ in chosen]
-    return replace(layer, images=np.frombuffer(b''.join(jpegs), dtype=np.uint8),
+    return replace(built, images=np.frombuffer(b''.join(jpegs), dtype=np.uint8),
                    image_offsets=np.cumsum([0, *map(len, jpegs)]))
 
 
@@ -319,7 +313,7 @@ def learn_words(descriptors: NDArray[np.uint8], kind: FeatureKind = SIFT) -> NDA
     count = min(_WORDS, len(learned))
     means = learned[np.linspace(0, len(learned) - 1, count).astype(np.int64)]
     for _ in range(_STEPS):
-        words = nearest_words(learned, means)
+        words = layer.nearest_words(learned, means)
         order = np.argsort(words, kind='stable')
         found, starts = np.unique(words[order], return_index=True)
         sums = np.add.reduceat(learned[order], starts, axis=0)
