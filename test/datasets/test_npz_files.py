@@ -97,7 +97,6 @@ def become(name, value):
     (put('boxes_xyxy', (1, 2), 1e308), r'beyond 1e\+10.* row 1'),
     (become('depths', [1.0, np.inf, np.nan]), 'depths is not positive and finite in row 1'),
     (become('stamps_ns', [0, 1, 2]), 'stamps_ns contradicts timestamps in row 0'),
-    (become('clip_ms', [1.0, -2.0, 3.0]), 'clip_ms is negative'),
     (become('scores', np.array([1, 'a', None], dtype=object)), 'scores cannot be')])
 def test_malformed_arrays_are_named(tmp_path, kind, change, message):
     path, arrays = tmp_path / 'q.npz', kind[0]()

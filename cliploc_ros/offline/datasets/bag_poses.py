@@ -274,8 +274,9 @@ def _ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
 def _read_links(reader: BagReader, topics: Collection[str], children: Collection[str],
                 parents: Mapping[str, str], max_gap_ns: int) -> dict[str, TimedPoses]:
     """Read the poses of frames in their parents, by frame; a static frame has its last pose."""
-    samples: dict[str, dict[str, tuple[list[int], list[tuple[float, ...]]]]] = {
-        topic: {child: ([], []) for child in children} for topic in topics}
+    # stamps and poses, by frame and by whether the topic is static
+    samples: dict[tuple[str, bool], tuple[list[int], list[tuple[float, ...]]]] = {
+        (child, is_static): ([], []) for child in children for is_static in (False, True)}
     for topic, recorded in reader.readable(topics):
         for message in recorded.transforms:
             child = plain_name(message.child_frame_id)
@@ -288,20 +289,18 @@ def _read_links(reader: BagReader, topics: Collection[str], children: Collection
             field = message.transform
             numbers = _sound(reader, topic, message, field.translation, field.rotation)
             if numbers is not None:
-                stamps, rows = samples[topic][child]
+                stamps, rows = samples[child, topic.endswith('_static')]
                 stamps.append(bag_messages.stamp_ns(message))
                 rows.append(numbers)
     links: dict[str, TimedPoses] = {}
     for child in children:
         where = f"{reader.path}: tf of '{child}'"
-        fixed = [samples[name][child] for name in topics if name.endswith('_static')]
-        moving = [samples[name][child] for name in topics if not name.endswith('_static')]
-        stamps, rows = next((recorded for recorded in fixed if recorded[0]), ([], []))
+        stamps, rows = samples[child, True]
         if stamps:
             links[child] = replace(TimedPoses.from_samples(stamps[-1:], rows[-1:], where),
                                    tolerance_ns=_ALWAYS_NS)
         else:
-            stamps, rows = moving[0] if moving else ([], [])
+            stamps, rows = samples[child, False]
             check_forward(stamps, where)
             links[child] = replace(TimedPoses.from_samples(stamps, rows, where),
                                    max_gap_ns=max_gap_ns)

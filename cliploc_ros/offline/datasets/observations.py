@@ -24,7 +24,6 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
 
-_STAGES = ('detector_ms', 'clip_ms')
 _NOT_NEGATIVE = npz.Check('is negative or infinite',
                           lambda values: (values < 0) | np.isinf(values))
 
@@ -51,8 +50,6 @@ FRAME_FIELDS = {
         is_optional=True),
     # exact, unlike a float64 of seconds [ns]
     'stamps_ns': npz.Field('integers', ('F',), (_check_stamps,), is_optional=True),
-    # run time of the networks [ms], NaN where unknown
-    **dict.fromkeys(_STAGES, npz.Field('numbers', ('F',), (_NOT_NEGATIVE,), is_optional=True)),
 }
 
 
@@ -238,7 +235,7 @@ _OBSERVATIONS = npz.Schema('observation file', {
 
 # Optional fields of PosedDetections
 _OPTIONAL = ('depths', 'depth_spreads', 'embeddings', 'odom_from_camera', 'open_edges',
-             'stamps_ns', *_STAGES)
+             'stamps_ns')
 
 
 def camera_from_numbers(size: NDArray[Any], intrinsics: NDArray[Any]) -> Camera:
@@ -264,10 +261,7 @@ def load_observations(path: str | Path) -> PosedDetections:
     except CameraError as error:
         raise _OBSERVATIONS.invalid(Path(path), error) from error
     names, classes = np.unique(arrays['class_ids'], return_inverse=True)
-    frames = len(arrays['timestamps'])
-    detector_ms, clip_ms = (arrays.get(name, np.full(frames, np.nan)).astype(np.float64)
-                            for name in _STAGES)
-    images, without_pose = arrays.get('image_counts', (frames, 0))
+    images, without_pose = arrays.get('image_counts', (len(arrays['timestamps']), 0))
     detections = PosedDetections(
         cameras=cameras, map_from_camera=arrays['map_from_camera'].astype(np.float64),
         stamps_s=arrays['timestamps'].astype(np.float64),
@@ -280,8 +274,7 @@ def load_observations(path: str | Path) -> PosedDetections:
                           if 'odom_from_camera' in arrays else None),
         camera_rows=arrays['camera_rows'].astype(np.int64) if 'camera_rows' in arrays else None,
         camera_names=tuple(map(str, arrays.get('camera_names', ('',)))),
-        stamps_ns=_stamps_ns(arrays), detector_ms=detector_ms, clip_ms=clip_ms,
-        images=int(images), without_pose=int(without_pose),
+        stamps_ns=_stamps_ns(arrays), images=int(images), without_pose=int(without_pose),
         described=str(arrays.get('described', '')), **{name: arrays.get(name) for name in (
             'depths', 'depth_spreads', 'embeddings', 'open_edges')})
     order = np.argsort(detections.stamps_s, kind='stable')

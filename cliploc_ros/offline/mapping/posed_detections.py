@@ -18,8 +18,7 @@ from cliploc_ros.core.observation import Detections
 _SAME_CAMERA = 0.02
 _PER_BOX = ('bboxes_xyxy', 'classes', 'scores', 'depths', 'depth_spreads', 'embeddings',
             'open_edges')
-_PER_FRAME = ('map_from_camera', 'stamps_s', 'odom_from_camera', 'camera_rows', 'stamps_ns',
-              'detector_ms', 'clip_ms')
+_PER_FRAME = ('map_from_camera', 'stamps_s', 'odom_from_camera', 'camera_rows', 'stamps_ns')
 
 
 @dataclass(frozen=True)
@@ -54,9 +53,6 @@ class PosedDetections:
     camera_rows: NDArray[np.int64] | None = None
     camera_names: tuple[str, ...] = ('',)  #: Of the cameras; '' for a single unnamed one
     stamps_ns: NDArray[np.int64] | None = None  #: (F,): exact times of recorded images [ns]
-    #: (F,): run time of the networks [ms]; NaN where unknown
-    detector_ms: NDArray[np.float64] | None = None
-    clip_ms: NDArray[np.float64] | None = None
     #: Number of images in the recording, and of images without a pose
     images: int = 0
     without_pose: int = 0

@@ -4,7 +4,6 @@
 
 import io
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -50,9 +49,6 @@ class SeenFrame:
     #: (n,): [m]; NaN where unknown
     depths: NDArray[np.float32]
     depth_spreads: NDArray[np.float32]
-    #: Run time [ms]
-    detector_ms: float
-    clip_ms: float
 
     @property
     def pinhole(self) -> Camera:
@@ -113,10 +109,8 @@ class RunNetworks:
             return str(error)
         camera = frame.camera
         assert frame.map_from_camera is not None
-        start = time.perf_counter()
         detections = self.detect(frame.image_rgb).usable(camera.width, camera.height,
                                                          MAX_DETECTIONS)
-        detected = time.perf_counter()
         bboxes, size = detections.bboxes_xyxy, [camera.width, camera.height]
         open_edges = at_border(bboxes, np.array(size * 2))
         if not camera.is_pinhole:
@@ -125,7 +119,6 @@ class RunNetworks:
         sound = detections.select(rows)
         embeddings = (np.empty((len(rows), 0)) if self.encoder is None
                       else self.encoder.encode_crops(frame.image_rgb, sound.bboxes_xyxy))
-        embedded = time.perf_counter()
         depths = spreads = np.full(len(rows), np.nan, dtype=np.float32)
         if frame.depth is not None:
             depths, spreads = depths_of_boxes(frame.depth, camera, sound.bboxes_xyxy)
@@ -134,5 +127,4 @@ class RunNetworks:
             np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), sound.bboxes_xyxy,
             bboxes[rows], open_edges[rows], not camera.is_pinhole,
             np.array(sound.class_ids, dtype=np.str_), sound.scores,
-            embeddings.astype(np.float16), depths, spreads,
-            (detected - start) * 1e3, (embedded - detected) * 1e3)
+            embeddings.astype(np.float16), depths, spreads)

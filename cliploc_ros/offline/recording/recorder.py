@@ -359,8 +359,6 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
         camera_rows=None if camera_names == ('',) else rows,
         camera_names=camera_names,
         stamps_ns=np.array([frame.stamp_ns for frame in seen], dtype=np.int64),
-        detector_ms=np.array([frame.detector_ms for frame in seen]),
-        clip_ms=np.array([frame.clip_ms for frame in seen]),
         images=sum(keyframes.asked for keyframes in filters.values()),
         without_pose=sum(keyframes.without_pose for keyframes in filters.values()),
         described=described)

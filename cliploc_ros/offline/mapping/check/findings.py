@@ -271,7 +271,14 @@ def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
         pitch_deg = float(np.degrees(np.arcsin(np.clip(np.median(recorded[:, 2, 2]), -1, 1))))
     if options.camera_height_m is not None:
         height = options.camera_height_m
-    positions, spacing = _positions(low[:2] - margin, high[:2] + margin, height, options)
+    low, high, spacing = low[:2] - margin, high[:2] + margin, options.spacing_m
+    while (counts := np.maximum(1, np.ceil((high - low) / spacing)).astype(int)
+           ).prod() > options.max_positions:
+        spacing *= 1.1
+    first = (low + high) / 2 - spacing * (counts - 1) / 2
+    x, y = (first[axis] + spacing * np.arange(counts[axis]) for axis in (0, 1))
+    positions = np.stack([column.ravel() for column in np.meshgrid(x, y, height, indexing='ij')],
+                         axis=1)
     # positions inside a landmark are left out
     inside = np.zeros(len(positions), dtype=np.bool_)
     for center, basis in zip(landmark_map.centers, landmarks_of_map(landmark_map, ()).bases,
@@ -291,19 +298,6 @@ def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
     poses[:, :, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=2)
     poses[:, :, :3, 3] = positions[:, None]
     return Grid(positions, near, poses.reshape(-1, 4, 4), spacing)
-
-
-def _positions(low: NDArray[np.float64], high: NDArray[np.float64], height: float,
-               options: CheckOptions) -> tuple[NDArray[np.float64], float]:
-    """Return positions between two corners, and their spacing, which is increased if needed."""
-    spacing = options.spacing_m
-    while (counts := np.maximum(1, np.ceil((high - low) / spacing)).astype(int)
-           ).prod() > options.max_positions:
-        spacing *= 1.1
-    first = (low + high) / 2 - spacing * (counts - 1) / 2
-    x, y = (first[axis] + spacing * np.arange(counts[axis]) for axis in (0, 1))
-    columns = np.meshgrid(x, y, height, indexing='ij')
-    return np.stack([column.ravel() for column in columns], axis=1), spacing
 
 
 @dataclass(frozen=True)
