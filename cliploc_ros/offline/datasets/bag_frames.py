@@ -227,9 +227,8 @@ def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat
             problem = 'tf between them does not cover the first depth image'
         except DatasetError as error:
             problem = str(error).removeprefix(f'{reader.path}: ')
-    raise DatasetError(f"{reader.path}: depth is in the coordinate frame '{depth}', the image in "
-                       f"'{image}', and {problem}: record depth registered to the image, or give "
-                       'its `depth_intrinsics` and `depth_baseline`')
+    raise DatasetError(f"{reader.path}: depth is in frame '{depth}', the image in '{image}', and "
+                       f'{problem}: register depth, or give `depth_intrinsics`, `depth_baseline`')
 
 
 def _sampled(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Cameras

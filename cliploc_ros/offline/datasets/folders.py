@@ -154,9 +154,8 @@ def _placed(folder: Path, layout: Layout, capture: frames.Capture, options: fram
         scale = _find_scale(files, *options.known_distance, folder)
         notes.append(f'a unit is {scale:.5g} m by the known distance')
     if scale is None and not capture.is_metric and not options.any_unit:
-        raise DatasetError(f'{folder}: the unit of {layout.name} is unknown: give `scale`, the '
-                           'metres of a unit (1 for metres), a `known_distance` or an '
-                           '`object_size`')
+        raise DatasetError(f'{folder}: the unit of {layout.name} is unknown: give `scale` (1 for '
+                           'metres), a `known_distance` or an `object_size`')
     files = _place_images(capture.files, axes, scale or 1.0, turn)
     poses = np.array([file.pose for file in files if file.pose is not None]).reshape(-1, 4, 4)
     if options.level:

@@ -292,9 +292,8 @@ def find_camera(choice: str | None, folder: Path) -> tuple[Camera, str]:
         return read_camera(folder / 'camera.json'), str(folder / 'camera.json')
     match = _SEQUENCE_NAME.search(folder.resolve().name)
     if match is None:
-        raise DatasetError(f'{folder}: has no camera.json, and its name contains no TUM '
-                           'camera; put a camera.json there, or give `intrinsics`: a '
-                           'camera.json, or fr1, fr2, fr3')
+        raise DatasetError(f'{folder}: has no camera.json, and its name contains no TUM camera; '
+                           'give `intrinsics`: a camera.json, or fr1, fr2, fr3')
     return PRESETS[f'fr{match[1]}'], f"preset fr{match[1]}, from the folder's name"
 
 

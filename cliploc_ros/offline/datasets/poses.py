@@ -141,8 +141,7 @@ def check_forward(stamps_ns: Sequence[int], where: str) -> None:
     if len(again):
         raise DatasetError(
             f'{where}: the stamps jump back: {stamps[again[0]] / NS_PER_S:.3f} s comes after '
-            f'{latest[again[0]] / NS_PER_S:.3f} s; poses of two runs would be mixed: record each '
-            'run separately, or split them with `ros2 bag convert`')
+            f'{latest[again[0]] / NS_PER_S:.3f} s; split two runs with `ros2 bag convert`')
 
 
 def check_clock(poses: Poses, first_ns: int, last_ns: int, where: str) -> None:

@@ -201,8 +201,7 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
             kinds = Counter(landmark.reason.partition(':')[0] for landmark in draft.left_out)
             counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
             why = (f'no landmark is good enough for a map; {len(left_out)} were left out '
-                   f'({counts}); for the first one: {draft.left_out[0].reason}. Move the camera '
-                   'past the objects instead of only turning it, or map images with depth')
+                   f'({counts}); move the camera past the objects, or map images with depth')
         raise NothingFoundError(why, left_out)
     landmarks, shown = _one_of_each(views, draft.landmarks)
     quality = evidence.explained_boxes(views, landmarks, shown)
@@ -456,8 +455,7 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     if share_before < _LEAST_AS_GIVEN * share_settled:
         raise MappingError(
             f'the map does not match the boxes: it explains {share_before:.0%} of them as given, '
-            f"and {share_settled:.0%} after fitting; transform it to the recording's coordinate "
-            'frame, and to metres, first')
+            f'{share_settled:.0%} after fitting; transform it to their coordinate frame first')
     if not (is_fitted | ~chosen).any():
         raise MappingError(
             f'no landmark can be fitted; for the first one, {reasons[0]}; as given, the map '

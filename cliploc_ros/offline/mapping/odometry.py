@@ -173,10 +173,8 @@ class _Known:
                 f'{scale:.2f} times as far; check its wheel radius or unit')
         by_odometry, by_poses = np.median(windows.motions_m[:, is_far], axis=1)
         return (f'odometry is left out: it contradicts the poses in '
-                f'{is_far.sum() / tells.sum():.0%} of the windows of {_WINDOW_S:.0f} s; the '
-                f'camera moves {by_odometry:.2f} m by odometry and {by_poses:.2f} m by the poses '
-                'there (medians); check unit, clock and mount of the odometry, and the noise of '
-                'the poses')
+                f'{is_far.sum() / tells.sum():.0%} of the windows of {_WINDOW_S:.0f} s, with '
+                f'{by_odometry:.2f} m against {by_poses:.2f} m; check its unit, clock and mount')
 
     def compare(self, firsts: NDArray[np.int64], seconds: NDArray[np.int64]) -> _Compared:
         """Compare the motions between pairs of these frames."""

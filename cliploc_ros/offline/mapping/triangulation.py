@@ -125,8 +125,7 @@ def scaled_depths(views: Views, detections: PosedDetections, landmarks: Landmark
         if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
             raise MappingError(
                 f'measured depth{of} is {1.0 / scale:.3g} times the depth by boxes and poses: '
-                f'wrong unit? multiply `depth_unit` by {scale:.3g}, check that the poses are in '
-                'metres, or leave depth out')
+                f'wrong unit? multiply `depth_unit` by {scale:.3g}, or give poses in metres')
         kept[number] = scale
         notes.append(f'measured depth{of} is {1.0 / scale:.3f} times the depth by boxes and '
                      'poses; it is corrected by this factor')

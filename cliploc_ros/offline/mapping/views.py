@@ -214,9 +214,8 @@ def check_input(detections: PosedDetections, views: Views,
                            'its classes and its confidence threshold')
     viewpoints = int(views.viewpoints.max()) + 1
     if viewpoints < min_viewpoints:
-        raise MappingError(f'the camera took {viewpoints} viewpoints, at least '
-                           f'{min_viewpoints} are needed; move it around the objects, and '
-                           'check that the poses are those of the images')
+        raise MappingError(f'the camera took {viewpoints} viewpoints, at least {min_viewpoints} '
+                           'are needed; move it around the objects, and check the poses')
     jumps = np.sort(np.concatenate([
         _jumps(detections.map_from_camera[own], detections.stamps_s[own])
         for own in (views.cameras == number for number in range(len(detections.cameras)))]))

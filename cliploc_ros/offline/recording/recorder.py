@@ -375,9 +375,8 @@ def _camera_of(seen: list[SeenFrame], where: str, images: int, varies: bool) -> 
     camera = seen[0].pinhole
     other = next((frame for frame in seen if frame.pinhole != camera), None)
     if other is not None and not varies:
-        raise DatasetError(f'{where} the camera changes at {other.stamp_ns / NS_PER_S:.6f} s, but '
-                           'all observations of a camera must have the same intrinsics; name '
-                           'several cameras with `cameras`')
+        raise DatasetError(f'{where} the camera changes at {other.stamp_ns / NS_PER_S:.6f} s; '
+                           'name several cameras with `cameras`')
     check_depth_unit(np.concatenate([frame.depths for frame in seen]), where.removesuffix(':'))
     return camera
 

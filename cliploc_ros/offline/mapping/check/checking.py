@@ -172,9 +172,8 @@ def _where_cameras_can_be(recorded: NDArray[np.float64] | None) -> str:
     if recorded is None:
         return f'{known}, and there is no recording with their heights: set `height_range_m`'
     low, high = recorded[:, 2, 3].min(), recorded[:, 2, 3].max()
-    return (f'{known}; those of the recording were {low:.2f} to {high:.2f} m high. For a camera '
-            f'at this height, set `height_range_m` to [{low - _HEIGHT_MARGIN_M:.1f}, '
-            f'{high + _HEIGHT_MARGIN_M:.1f}]')
+    return (f'{known}; recorded ones were {low:.2f} to {high:.2f} m high: set `height_range_m` to '
+            f'[{low - _HEIGHT_MARGIN_M:.1f}, {high + _HEIGHT_MARGIN_M:.1f}] for their camera')
 
 
 def _notes_on(recording: RecordingCheck) -> list[str]:
@@ -184,9 +183,8 @@ def _notes_on(recording: RecordingCheck) -> list[str]:
         notes.append('cross-validation cannot judge boxes: other parts of the recording show the '
                      f'objects of {recording.held_out.boxes} of {recording.as_given.boxes}')
     if not recording.can_judge_frames:
-        notes.append(f'cross-validation cannot judge frames: other parts of the recording show '
-                     f'the objects of {len(recording.judged)} of {len(recording.trials)}; the '
-                     'verdict uses the grid alone; pass each place twice for a better test')
+        notes.append(f'only {len(recording.judged)} of {len(recording.trials)} frames can be '
+                     'judged, so the verdict uses the grid alone; pass each place twice')
     return notes
 
 
@@ -213,9 +211,8 @@ def _scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
 def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:
     shared = set(landmark_map.class_ids) & set(detections.class_names)
     if not shared:
-        return ('the recording has none of the classes of the map '
-                f'({", ".join(sorted(set(landmark_map.class_ids))[:3])}): use the detector that '
-                'the map was made with')
+        return ('the recording has none of the classes of the map: use its detector, which finds '
+                f'{", ".join(sorted(set(landmark_map.class_ids))[:3])}')
     return ('no box of the recording overlaps a landmark of its class: check that poses and map '
             'have the same coordinate frame, and that the poses are of the camera (z forward)')
 
@@ -269,8 +266,7 @@ def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
         if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
             yield Advice(
                 f'record more views: of {report.recording.frames} frames, {frames:.0f} show a '
-                f'landmark (median), and {unexplained:.0%} of the boxes belong to none; pass '
-                f'all objects slowly, until {_FEW_FRAMES} frames or more show each of them')
+                f'landmark, {_FEW_FRAMES} should; {unexplained:.0%} of the boxes belong to none')
     yield from _some([
         Advice(f'{one.landmark_id} {one.faults[0]}', (one.landmark_id,))
         for one in report.landmarks
@@ -297,8 +293,8 @@ def _on_corrections(report: CheckReport) -> Iterator[Advice]:
 def _on_misled(report: CheckReport, misled: Sequence[relocalization.Trial]) -> list[Advice]:
     wrong = [trial for trial in misled if not _sees_double(trial.position, report.look_alikes)]
     return _some([Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be '
-                         f'misled by {trial.error_m:.1f} m: raise the parameter min_confidence, '
-                         'or map more distinct objects there', view=trial)
+                         f'misled by {trial.error_m:.1f} m: map more distinct objects there, or '
+                         'raise min_confidence', view=trial)
                   for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))],
                  'views that mislead a robot', most=_MOST_MISLED)
 
@@ -334,8 +330,7 @@ def _on_grid(report: CheckReport) -> Iterator[Advice]:
             yield Advice(
                 f'no heading is accepted by objects at {_area(grid, rows)}'
                 f'{", only keyframes reach them" if reached else ""}: a view from there shows '
-                f'{int(grid.visible[rows].max())} landmarks at most; map more objects that can '
-                'be seen from there',
+                f'{int(grid.visible[rows].max())} landmarks at most; map more objects there',
                 view=grid.trials[int(rows[0] * grid.headings + grid.visible[rows[0]].argmax())])
     if keyframes is not None:
         yield from _some([

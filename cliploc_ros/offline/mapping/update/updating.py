@@ -91,8 +91,7 @@ class UpdateReport:
         rows = [f'{len(self.confirmed)} confirmed, {len(self.moved)} moved, '
                 f'{len(self.missing)} missing, {len(self.new)} new, '
                 f'{len(self.not_observed)} not observed ({len(self.doubtful)} doubtful); '
-                f'{self.frames} frames of '
-                f'{self.viewpoints} viewpoints']
+                f'{self.frames} frames of {self.viewpoints} viewpoints']
         rows += [f'note: {note}' for note in self.notes]
         for name, found in (('moved', self.moved), ('missing', self.missing),
                             ('doubtful', self.doubtful), ('new', self.new)):
@@ -203,9 +202,8 @@ def _check_belongs(judged: judging.Judgement, count: int, well_share: float) -> 
             or well_share < _MIN_WELL_SHARE):
         raise MappingError(
             f'the recording does not belong to this map: of {in_view} landmarks in view, {there} '
-            f'are where the map says, and {well_share:.0%} of their boxes fit; check the map, the '
-            'coordinate frame of the poses and the detector, give `pose_noise` if the poses have '
-            'errors, or build a new map')
+            f'are where the map says, and {well_share:.0%} of their boxes fit; check map, '
+            'detector and frame of the poses, give `pose_noise`, or build a new map')
 
 
 def _notes(known: alignment.OldMap, aligned: alignment.Aligned, detections: PosedDetections
@@ -224,9 +222,8 @@ def _notes(known: alignment.OldMap, aligned: alignment.Aligned, detections: Pose
                      'landmarks of this class are kept: the detector may not know it')
     last_seen = max((detail.last_seen or 0.0 for detail in known.map.details), default=0.0)
     if last_seen > float(detections.stamps_s[-1]):
-        notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the '
-                     f'landmarks were last seen at {last_seen:.0f} s: an older recording, or '
-                     'another clock')
+        notes.append(f'the recording ends at {detections.stamps_s[-1]:.0f} s, before the map at '
+                     f'{last_seen:.0f} s: an older recording, or another clock')
     return notes
 
 
