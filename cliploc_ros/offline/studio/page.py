@@ -55,7 +55,7 @@ _MAX_ANSWERS = 100
 _MAX_LINES, _MAX_TEXT = 60, 600
 # Longest wait for a slow action when the studio stops.
 _GRACE_S = 2.0
-# Actions after which the user's camera flies to the new selection.
+# Actions after which the user's camera moves to the new selection.
 _BRING_ANOTHER = ('step', 'accept', 'discard', 'create', 'select')
 
 logger = logging.getLogger(__name__)
@@ -196,7 +196,7 @@ class Desk:
             None if source is None else source.map_from_camera)
 
     def look(self, client: viser.ClientHandle | None, name: str) -> None:
-        """Move the camera of a user in a thread, because it takes a fraction of a second."""
+        """Move the camera of a user in a thread, as it fails until the browser has reported it."""
         if client is not None:
             threading.Thread(target=self._look, args=(client, name), daemon=True).start()
 
@@ -282,7 +282,7 @@ class Page:
     # ---- actions in the scene -------------------------------------------------------------------
 
     def _click(self, event: Any, landmark_id: str) -> None:
-        """Select a landmark; the second click of a double click flies to it."""
+        """Select a landmark; the second click of a double click moves to it."""
         key, now = (event.client_id, landmark_id), time.monotonic()
         before, self._clicked = self._clicked, (key, now)
         if before[0] == key and now - before[1] < _DOUBLE_CLICK_S:

@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Viewpoints of the scene: the whole map, from above, one landmark, a view of the recording."""
 
-import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +20,11 @@ _NEAR_M = 0.01
 _SAME_UP_DEG = 20.0
 # Share of landmarks and cameras within the extent.
 _EXTENT_SHARE = 0.95
-# Number of steps of a flight, and seconds per step.
-_FLIGHT_STEPS, _STEP_S = 10, 0.03
 # Least radius [m] and margin of a landmark in view: it fills about a third of the page's height.
 _LEAST_RADIUS_M, _AROUND = 0.2, 2.5
 _LEAST_RISE = 0.35
 #: Aspect of the scene between the panels, until the page reports it.
 USUAL_ASPECT = 0.6
-# The latest flight of each browser: a flight ends when another one begins.
-_FLIGHTS: WeakKeyDictionary[Any, object] = WeakKeyDictionary()
 
 
 class Bounds(NamedTuple):
@@ -108,25 +102,16 @@ def fly(client: Any, position: NDArray[np.float64], look_at: NDArray[np.float64]
     From then on it orbits that point.
     """
     camera = client.camera
-    start, pivot = camera.position, camera.look_at
-    camera.up_direction = up
-    flight = _FLIGHTS[client] = object()
-    for share in np.linspace(0.0, 1.0, _FLIGHT_STEPS + 1)[1:]:
-        share = share * share * (3.0 - 2.0 * share)
-        if _FLIGHTS.get(client) is not flight:
-            return
-        with client.atomic():
-            camera.position = start + share * (position - start)
-            camera.look_at = pivot + share * (look_at - pivot)
-            camera.fov, camera.near = FOV_RAD, _NEAR_M
-            camera.far = max(1000.0, 3.0 * float(np.linalg.norm(position - look_at)))
-        time.sleep(_STEP_S)
+    with client.atomic():
+        camera.up_direction = up
+        camera.position, camera.look_at = position, look_at
+        camera.fov, camera.near = FOV_RAD, _NEAR_M
+        camera.far = max(1000.0, 3.0 * float(np.linalg.norm(position - look_at)))
 
 
 def look_through(client: Any, pose: NDArray[np.float64], intrinsics: Camera) -> None:
     """Move the camera of a browser to the pose of an image, with the whole image in view."""
     camera = client.camera
-    _FLIGHTS.pop(client, None)
     with client.atomic():
         camera.near = _NEAR_M
         camera.position = pose[:3, 3]
