@@ -145,8 +145,7 @@ def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections
     print(f'keyframes only: no landmark; {len(layer)} keyframes with {int(layer.offsets[-1])} '
           'points localize a robot near their views')
     if detections is not None:
-        poses = detections.map_from_camera
-        reached = in_reach(layer, poses[:, :3, 3], poses[:, :3, 2])
+        reached = in_reach(layer, detections.map_from_camera)
         print(f'recorded frames within reach of a keyframe: {reached.mean():.0%} of '
               f'{len(reached)}')
     print('what to do:\n  record objects from several sides: they also localize a robot away from '

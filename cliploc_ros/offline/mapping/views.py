@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arrays of posed detections for the kernels of mapping: boxes and poses on the plane z = 1."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import group_boxes
 from cliploc_ros.offline.mapping.options import MappingOptions
@@ -17,9 +19,6 @@ from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE
 NO_SIZE = (np.inf, 1.0)
 # An edge this near to the image border is open: the object may extend beyond it.
 _BORDER_PX = 3.0
-# Frames that are closer than both limits share a viewpoint.
-_VIEWPOINT_DISTANCE_M = 0.1
-_VIEWPOINT_ANGLE_DEG = 5.0
 # No robot or person with a camera is faster.
 _MAX_SPEED_M_PER_S = 10.0
 _MAX_TURN_DEG_PER_S = 720.0
@@ -181,25 +180,48 @@ def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
     return kept
 
 
+@dataclass(frozen=True)
+class KeyframeOptions:
+    """Spacing of keyframes; exceeding one limit is sufficient."""
+
+    #: [m] [deg]. 0: every frame with a pose.
+    distance_m: float = 0.1
+    angle_deg: float = 5.0
+
+
+class KeyframeFilter:
+    """Chooses keyframes among the frames of a camera, which are passed in order."""
+
+    def __init__(self, options: KeyframeOptions) -> None:
+        self._options = options
+        self._last: NDArray[np.float64] | None = None
+        self.asked = self.without_pose = 0
+
+    def __call__(self, place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
+        """Return whether the frame with this pose is a keyframe."""
+        self.asked += 1
+        if pose is None:
+            self.without_pose += 1
+            return False
+        if self._last is not None:
+            distance, angle = pose_error(pose, self._last)
+            if distance < self._options.distance_m and angle < self._options.angle_deg:
+                return False
+        self._last = pose
+        return True
+
+
 def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:
     """Return the number of the viewpoint (F,) of each frame, ascending from 0, camera by camera.
 
     A new viewpoint begins as soon as a frame differs from the first frame of the current one by
     more than 10 cm or 5 degrees.
     """
-    poses, cameras = detections.map_from_camera, detections.frame_cameras
+    poses, order = detections.map_from_camera, detections.by_camera
+    filters = [KeyframeFilter(KeyframeOptions()) for _ in detections.cameras]
+    is_new = [filters[detections.frame_cameras[frame]](0, 0, poses[frame]) for frame in order]
     viewpoints = np.zeros(len(poses), dtype=np.int64)
-    least_cosine = np.cos(np.radians(_VIEWPOINT_ANGLE_DEG))
-    order = detections.by_camera.tolist()
-    first, number = order[0] if order else 0, 0
-    for frame in order[1:]:
-        here, there = poses[frame], poses[first]
-        cosine = 0.5 * (np.sum(here[:3, :3] * there[:3, :3]) - 1.0)
-        distance = np.linalg.norm(here[:3, 3] - there[:3, 3])
-        if (cosine < least_cosine or distance > _VIEWPOINT_DISTANCE_M
-                or cameras[frame] != cameras[first]):
-            first, number = frame, number + 1
-        viewpoints[frame] = number
+    viewpoints[order] = np.cumsum(is_new) - 1
     return viewpoints
 
 

@@ -26,7 +26,6 @@ from tqdm import tqdm
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import PLAUSIBLE_DEPTH_M, depths_of_boxes
-from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
@@ -42,6 +41,7 @@ from cliploc_ros.offline.mapping.posed_detections import (
     group_cameras,
     names_of_group,
 )
+from cliploc_ros.offline.mapping.views import KeyframeFilter, KeyframeOptions
 from cliploc_ros.offline.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S
 
@@ -53,41 +53,8 @@ _FRAMES_FOR_UNIT = 10
 _UNKNOWN = np.full((4, 4), np.nan)
 
 
-@dataclass(frozen=True)
-class KeyframeOptions:
-    """Spacing of keyframes; exceeding one limit is sufficient."""
-
-    #: [m] [deg]. 0: every frame with a pose.
-    distance_m: float = 0.1
-    angle_deg: float = 5.0
-
-
 #: Every frame with a pose.
 EVERY_FRAME = KeyframeOptions(0.0, 0.0)
-
-
-class KeyframeFilter:
-    """Chooses keyframes among the frames of a camera, which are passed in order."""
-
-    def __init__(self, options: KeyframeOptions) -> None:
-        self._options = options
-        self._last: NDArray[np.float64] | None = None
-        self.asked = self.without_pose = 0
-
-    def __call__(self, place: int, stamp_ns: int, pose: NDArray[np.float64] | None) -> bool:
-        """Return whether the frame with this pose is a keyframe."""
-        self.asked += 1
-        if pose is None:
-            self.without_pose += 1
-            return False
-        if self._last is not None:
-            distance, angle = pose_error(pose, self._last)
-            if distance < self._options.distance_m and angle < self._options.angle_deg:
-                return False
-        self._last = pose
-        return True
-
-
 _DEFAULT_KEYFRAMES = KeyframeOptions()
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.keyframes.localization import NEAR_DEG, NEAR_M
+from cliploc_ros.core.keyframes.localization import keyframes_near
 from cliploc_ros.offline.mapping.check import relocalization
 from cliploc_ros.offline.mapping.check.findings import Grid, LandmarkCheck, LookAlike, Overlap
 from cliploc_ros.offline.mapping.evidence import BoxQuality
@@ -275,28 +275,16 @@ def share(trials: Sequence[relocalization.Trial], verdict: str) -> float:
 def check_keyframes(layer: KeyframeLayer, grid: GridCheck,
                     recorded: NDArray[np.float64] | None) -> KeyframeCheck:
     """Return the coverage by keyframes; recorded (F, 4, 4) has the poses of a recording."""
-    poses = np.empty((0, 4, 4)) if recorded is None else recorded
-    reached = in_reach(layer, np.array([trial.position for trial in grid.trials]),
-                       np.array([trial.forward for trial in grid.trials]))
-    headings = reached.reshape(grid.visible.shape).sum(axis=1)
+    headings = in_reach(layer, grid.poses).reshape(grid.visible.shape).sum(axis=1)
     without = np.nonzero(grid.is_near & (headings == 0))[0]
     near = int(grid.is_near.sum())
     return KeyframeCheck(
-        len(layer), int(layer.offsets[-1]), in_reach(layer, poses[:, :3, 3], poses[:, :3, 2]),
-        headings, without, 1.0 - len(without) / near if near else 0.0)
+        len(layer), int(layer.offsets[-1]),
+        in_reach(layer, np.empty((0, 4, 4)) if recorded is None else recorded), headings,
+        without, 1.0 - len(without) / near if near else 0.0)
 
 
-def in_reach(layer: KeyframeLayer, positions: NDArray[np.float64],
-             forward: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask of the views (n,) with a keyframe within reach.
-
-    Cameras are at positions (n, 3) [m] and look along unit vectors (n, 3).
-    """
-    places, axes = layer.map_from_camera[:, :3, 3], layer.map_from_camera[:, :3, 2]
-    found = np.zeros(len(positions), dtype=np.bool_)
-    # one view at a time: a table of all pairs takes gigabytes
-    for row, (position, axis) in enumerate(zip(positions, forward, strict=True)):
-        angles = np.degrees(np.arccos(np.clip(axes @ axis, -1.0, 1.0)))
-        costs = np.linalg.norm(places - position, axis=1) / NEAR_M + angles / NEAR_DEG
-        found[row] = bool((costs < 1.0).any())
-    return found
+def in_reach(layer: KeyframeLayer, poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return a mask of the views of poses (n, 4, 4) that overlap the view of a keyframe."""
+    return np.array([len(keyframes_near(layer.map_from_camera, pose)) > 0 for pose in poses],
+                    dtype=np.bool_)
