@@ -17,11 +17,7 @@ from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_images
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions, RawFrame, folder_frames, undistorted
 from cliploc_ros.offline.datasets.map_recording import MapRecording
-from cliploc_ros.offline.mapping.posed_detections import (
-    PosedDetections,
-    group_cameras,
-    names_of_group,
-)
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections, group_cameras
 from cliploc_ros.units import NS_PER_S
 
 # A view and its image have the same stamp, but files round it to about a microsecond.
@@ -117,8 +113,7 @@ def views_of_folder(path: Path) -> PosedDetections:
         cameras.append(capture.files[raw.place].camera.pinhole)
     if not posed:
         raise DatasetError(f'{path}: no image has a pose')
-    each, rows = group_cameras(cameras)
-    names = names_of_group(each)
+    each, rows, names = group_cameras(cameras)
     return PosedDetections(
         cameras=each, map_from_camera=np.array([pose for _, pose in posed]),
         stamps_s=np.array([stamp for stamp, _ in posed]) / NS_PER_S,

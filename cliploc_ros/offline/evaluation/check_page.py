@@ -10,7 +10,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +30,7 @@ from cliploc_ros.offline.evaluation import figures
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.check.findings import RADIUS_M, LandmarkCheck
 from cliploc_ros.offline.mapping.check.relocalization import ImageOf, Trial, count_verdicts
-from cliploc_ros.offline.mapping.check.report import (
-    SERIOUS,
-    Advice,
-    CheckReport,
-    Measure,
-    count_by_objects,
-    share,
-)
+from cliploc_ros.offline.mapping.check.report import SERIOUS, Advice, CheckReport, Measure, share
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.sightings import crop_around, find_sightings, outlines_in_view
@@ -98,7 +91,9 @@ def _data(report: CheckReport) -> dict[str, Any]:
         data['recording'] = {
             **vars(recording), 'judged_frames': len(recording.judged),
             'verdicts': count_verdicts(recording.trials),
-            'verdicts_by_objects': count_by_objects(recording.trials)}
+            'verdicts_by_objects': count_verdicts([
+                replace(trial, verdict=trial.by_objects or trial.verdict)
+                for trial in recording.trials])}
     if layer is not None:
         data['keyframes'] = {
             'keyframes': layer.keyframes, 'points': layer.points,

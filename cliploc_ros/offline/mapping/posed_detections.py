@@ -129,10 +129,13 @@ class PosedDetections:
         return self.with_poses(move_poses(self.map_from_camera, scale, rotation))
 
 
-def group_cameras(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], NDArray[np.int64]]:
-    """Merge the cameras of F images; return the merged cameras and the row (F,) of each image.
+def group_cameras(cameras: Sequence[Camera]
+                  ) -> tuple[tuple[Camera, ...], NDArray[np.int64], tuple[str, ...]]:
+    """Merge the cameras of F images of a folder.
 
-    Cameras of one image size whose intrinsics differ only by refocusing are merged.
+    Cameras of one image size whose intrinsics differ only by refocusing are merged. Return the
+    merged cameras, the row (F,) of each image, and the names of the cameras by their image size;
+    '' for a single camera.
     """
     found: list[Camera] = []
     rows = {}
@@ -147,12 +150,6 @@ def group_cameras(cameras: Sequence[Camera]) -> tuple[tuple[Camera, ...], NDArra
         else:
             rows[camera] = len(found)
             found.append(camera)
-    return tuple(found), np.array([rows[camera] for camera in cameras], dtype=np.int64)
-
-
-def names_of_group(cameras: Sequence[Camera]) -> tuple[str, ...]:
-    """Return a name for each camera of a folder, by its image size; '' for a single camera."""
-    if len(cameras) == 1:
-        return ('',)
-    return tuple(f'{number}: {camera.width}x{camera.height}'
-                 for number, camera in enumerate(cameras, 1))
+    names = tuple(f'{number}: {camera.width}x{camera.height}'
+                  for number, camera in enumerate(found, 1)) if len(found) > 1 else ('',)
+    return tuple(found), np.array([rows[camera] for camera in cameras], dtype=np.int64), names

@@ -36,11 +36,7 @@ from cliploc_ros.offline.datasets.bags import MOST_LEFT_OUT
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.datasets.poses import Poses
-from cliploc_ros.offline.mapping.posed_detections import (
-    PosedDetections,
-    group_cameras,
-    names_of_group,
-)
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections, group_cameras
 from cliploc_ros.offline.mapping.views import KeyframeFilter, KeyframeOptions
 from cliploc_ros.offline.recording.networks import LoadNetworks, SeenFrame
 from cliploc_ros.units import NS_PER_S
@@ -296,35 +292,32 @@ def _assemble(seen: list[SeenFrame], frames: Frames, filters: Mapping[str, Keyfr
     camera_names = tuple(filters)
     rows = np.array([camera_names.index(frame.camera) for frame in seen])
     if frames.varies:
-        cameras, rows = group_cameras([frame.pinhole for frame in seen])
-        camera_names = names_of_group(cameras)
+        cameras, rows, camera_names = group_cameras([frame.pinhole for frame in seen])
         # boxes as the merged pinhole camera at the same pose would see them
         seen = [frame if frame.pinhole == cameras[row] else replace(
             frame, is_distorted=True, bboxes_xyxy=cameras[row].bboxes_in_pixels(
                 frame.pinhole.normalize_bboxes(frame.bboxes_xyxy)))
             for frame, row in zip(seen, rows, strict=True)]
-    names = np.concatenate([frame.class_ids for frame in seen])
-    class_names, classes = np.unique(names, return_inverse=True)
-    depths = np.concatenate([frame.depths for frame in seen])
-    has_depth = bool(np.isfinite(depths).any())
-    needs_edges = len(names) > 0 and any(frame.is_distorted for frame in seen)
+
+    def joined(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(frame, name) for frame in seen])
+
+    class_names, classes = np.unique(joined('class_ids'), return_inverse=True)
+    has_depth = bool(np.isfinite(joined('depths')).any())
+    needs_edges = len(classes) > 0 and any(frame.is_distorted for frame in seen)
     return PosedDetections(
         cameras=cameras,
         map_from_camera=np.array([frame.map_from_camera for frame in seen]),
         stamps_s=np.array([frame.stamp_ns / NS_PER_S for frame in seen]),
         frame_offsets=np.cumsum([0, *(len(frame.scores) for frame in seen)]),
-        bboxes_xyxy=np.concatenate([frame.bboxes_xyxy for frame in seen]),
-        class_names=tuple(str(name) for name in class_names), classes=classes.reshape(-1),
-        scores=np.concatenate([frame.scores for frame in seen]),
-        depths=depths if has_depth else None,
-        depth_spreads=(np.concatenate([frame.depth_spreads for frame in seen]) if has_depth
-                       else None),
-        embeddings=(np.concatenate([frame.embeddings for frame in seen])
-                    if any(frame.embeddings.shape[1] for frame in seen) else None),
-        encoder_key=encoder_key,
-        open_edges=np.concatenate([frame.open_edges for frame in seen]) if needs_edges else None,
-        camera_rows=None if camera_names == ('',) else rows,
-        camera_names=camera_names,
+        bboxes_xyxy=joined('bboxes_xyxy'), class_names=tuple(map(str, class_names)),
+        classes=classes.reshape(-1), scores=joined('scores'),
+        depths=joined('depths') if has_depth else None,
+        depth_spreads=joined('depth_spreads') if has_depth else None,
+        embeddings=(joined('embeddings') if any(frame.embeddings.shape[1] for frame in seen)
+                    else None), encoder_key=encoder_key,
+        open_edges=joined('open_edges') if needs_edges else None,
+        camera_rows=None if camera_names == ('',) else rows, camera_names=camera_names,
         stamps_ns=np.array([frame.stamp_ns for frame in seen], dtype=np.int64),
         images=sum(keyframes.asked for keyframes in filters.values()),
         without_pose=sum(keyframes.without_pose for keyframes in filters.values()),

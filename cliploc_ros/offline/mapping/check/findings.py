@@ -13,15 +13,9 @@ from cliploc_ros.core.acceptance.look_alikes import find_alike
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import misspelt_classes
+from cliploc_ros.offline.mapping import evidence
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.doubles import close_pairs, find_doubles
-from cliploc_ros.offline.mapping.evidence import (
-    MAX_SIGMA_SHARE,
-    MIN_MEDIAN_IOU,
-    Evidence,
-    gather_evidence,
-    look_for,
-)
 from cliploc_ros.offline.mapping.fitting import fit_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of, landmarks_of_map
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
@@ -96,7 +90,7 @@ class Witness(NamedTuple):
     class_names: tuple[str, ...]  #: Of the recording
     landmarks: Landmarks  #: Of the map, with the recording's classes
     shown: NDArray[np.int64]  #: (n,): the landmark that each box shows, -1 for none
-    evidence: Evidence
+    gathered: evidence.Evidence
     #: (L,): frames that should show each landmark, including landmarks without a box
     expected: NDArray[np.int64]
     fitted: Landmarks  #: The landmarks fitted to the boxes that show them
@@ -107,13 +101,14 @@ def hear_witness(views: Views, landmark_map: LandmarkMap, class_names: tuple[str
     """Return the evidence that a recording gives on a map."""
     landmarks = landmarks_of_map(landmark_map, class_names)
     shown = associate(views, landmarks)
-    evidence = gather_evidence(views, landmarks, shown)
+    gathered = evidence.gather_evidence(views, landmarks, shown)
     # a landmark without a box may be hidden
-    sight = look_for(views, landmarks, shown, np.ones(len(landmarks.centers), dtype=np.bool_))
-    expected = np.where(evidence.support == 0, sight.expected_frames, evidence.expected)
+    sight = evidence.look_for(views, landmarks, shown,
+                              np.ones(len(landmarks.centers), dtype=np.bool_))
+    expected = np.where(gathered.support == 0, sight.expected_frames, gathered.expected)
     fitted = fit_landmarks(views, landmarks, shown)
-    return Witness(class_names, landmarks, shown, evidence, expected, fitted,
-                   gather_evidence(views, fitted, shown).position_sigma)
+    return Witness(class_names, landmarks, shown, gathered, expected, fitted,
+                   evidence.gather_evidence(views, fitted, shown).position_sigma)
 
 
 def find_map_overlaps(landmark_map: LandmarkMap, witness: Witness | None, views: Views | None
@@ -191,19 +186,19 @@ def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> di
     if witness is None:
         return {'support': given.support, 'seen_ratio': given.seen_ratio,
                 'baseline_deg': given.baseline_deg, 'position_sigma_m': given.position_sigma}
-    evidence, expected = witness.evidence, int(witness.expected[row])
-    if evidence.support[row] == 0:
+    gathered, expected = witness.gathered, int(witness.expected[row])
+    if gathered.support[row] == 0:
         return {'support': 0, 'expected': expected, 'seen_ratio': 0.0 if expected else None}
     offset = float(np.linalg.norm(witness.fitted.centers[row] - witness.landmarks.centers[row]))
     is_told = offset > _OFFSET_SIGMAS * witness.fitted_sigmas[row] or offset < _MIN_OFFSET_M
-    return {'support': int(evidence.support[row]), 'expected': expected,
-            'seen_ratio': float(evidence.seen_ratio[row]),
-            'baseline_deg': float(evidence.baseline_deg[row]),
+    return {'support': int(gathered.support[row]), 'expected': expected,
+            'seen_ratio': float(gathered.seen_ratio[row]),
+            'baseline_deg': float(gathered.baseline_deg[row]),
             # localization uses the map's own value
-            'position_sigma_m': float(evidence.position_sigma[row])
+            'position_sigma_m': float(gathered.position_sigma[row])
             if given.position_sigma is None else given.position_sigma,
             'offset_m': offset if is_told else None,
-            'median_iou': float(evidence.median_iou[row])}
+            'median_iou': float(gathered.median_iou[row])}
 
 
 def _support_faults(check: LandmarkCheck, size_m: float) -> list[tuple[float, str]]:
@@ -222,7 +217,7 @@ def _support_faults(check: LandmarkCheck, size_m: float) -> list[tuple[float, st
         faults.append((1.2, f'is detected in {ratio:.1%} of the frames that should show it: '
                             'delete it if it has moved, or is hard to detect'))
     iou, baseline, sigma = check.median_iou, check.baseline_deg, check.position_sigma_m
-    if iou is not None and iou < MIN_MEDIAN_IOU:
+    if iou is not None and iou < evidence.MIN_MEDIAN_IOU:
         faults.append((1.2, f'does not fit its boxes (median IoU {iou:.2f}), as if it had moved '
                             'or were two objects: delete it or map again'))
     if baseline is not None and baseline < MappingOptions.min_baseline_deg:
@@ -233,7 +228,7 @@ def _support_faults(check: LandmarkCheck, size_m: float) -> list[tuple[float, st
         faults.append((1.1, f'is {offset * 100:.0f} cm away from where its boxes put it: delete '
                             'it or map again'))
     if sigma is not None and sigma > max(MappingOptions.max_position_sigma_m,
-                                         MAX_SIGMA_SHARE * size_m):
+                                         evidence.MAX_SIGMA_SHARE * size_m):
         faults.append((0.7, f'may be {sigma * 100:.0f} cm off (standard deviation): record it '
                             'from more sides'))
     return faults

@@ -90,7 +90,7 @@ def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterato
     block_s = min(options.block_s, max(float(elapsed[-1]), 1e-9) / options.folds)
     of_frames = (elapsed / block_s).astype(np.int64) % options.folds
     gap_s = min(options.gap_s, 0.25 * float(elapsed[-1]) / options.folds)
-    fits = witness.evidence.median_iou >= MIN_MEDIAN_IOU
+    fits = witness.gathered.median_iou >= MIN_MEDIAN_IOU
     for number in range(options.folds):
         judged = np.nonzero(of_frames == number)[0]
         if len(judged) == 0:
@@ -146,7 +146,7 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
     residuals = np.abs(linear.residuals[linear.weights > 0.0])
     scale = float(np.clip(1.4826 * np.median(residuals), 0.3, 5.0)) if len(residuals) else 1.0
     return simulation.DetectorModel(
-        landmark_map, detections.cameras[0], tuple(sightings), witness.evidence.seen_ratio,
+        landmark_map, detections.cameras[0], tuple(sightings), witness.gathered.seen_ratio,
         reach, scale, min_side, tuple(clutter))
 
 

@@ -3,7 +3,7 @@
 """The result of a check: figures, verdict and advice."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -259,12 +259,6 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
 def _percent(value: float, digits: int) -> str:
     return np.format_float_positional(100.0 * value, digits, unique=False, fractional=False,
                                       trim='-') + ' %'
-
-
-def count_by_objects(trials: Sequence[relocalization.Trial]) -> dict[str, int]:
-    """Return how many trials are accepted, refused and misled without keyframes."""
-    return relocalization.count_verdicts([replace(trial, verdict=trial.by_objects or trial.verdict)
-                                          for trial in trials])
 
 
 def share(trials: Sequence[relocalization.Trial], verdict: str) -> float:
