@@ -106,11 +106,11 @@ def build(options: argparse.Namespace) -> int:
         raise OptionsError(f'--update {update}: is a map of keyframes alone, which cannot be '
                            'updated; build a new one')
     mapping = _mapping_options(options, f'build_map {name}')
-    source = sources.read_source(options)
-    _tell_misspelt(mapping.moving_classes, source.recorded.class_names)
-    detections, scale, rotation = _placed(source.recorded, options, mapping)
-    if without := source.recorded.without_pose:
-        print(f'no pose: {without} of {source.recorded.images} images', flush=True)
+    recorded, file, images = sources.read_source(options)
+    _tell_misspelt(mapping.moving_classes, recorded.class_names)
+    detections, scale, rotation = _placed(recorded, options, mapping)
+    if without := recorded.without_pose:
+        print(f'no pose: {without} of {recorded.images} images', flush=True)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
     labeller = make_map.find_labeller(
@@ -122,7 +122,7 @@ def build(options: argparse.Namespace) -> int:
             note = ('the new map has no keyframes, which need all images: it localizes by objects '
                     'alone; build a new map to have both') if layer_path(update).exists() else ''
         else:
-            frames = source.images and move_frames(source.images, scale, rotation)
+            frames = images and move_frames(images, scale, rotation)
             with command.StageBar() as bar:
                 made = make_map.make_map(detections, labeller, mapping, frames, layer, bar.show)
             note = note or made.note
@@ -134,7 +134,7 @@ def build(options: argparse.Namespace) -> int:
                                        'left_out': [asdict(landmark) for landmark in left_out]})
         raise
     _write_report(options.report, asdict(made.report))
-    recording = sources.recording_of(options, source.file, scale, rotation)
+    recording = sources.recording_of(options, file, scale, rotation)
     path, is_poor = _write(options, made, name, recording, [labeller.note, note])
     print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
     try:

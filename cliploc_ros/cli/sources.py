@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,16 +90,9 @@ def images_at(options: argparse.Namespace, path: Path, cameras: Sequence[str]) -
         options.image, options.camera_info, options.rectified), cameras)
 
 
-class Source(NamedTuple):
-    """The content of a source: observations, their file, and images if there are any."""
-
-    recorded: PosedDetections
-    file: Path
-    images: frames.Frames | None
-
-
-def read_source(options: argparse.Namespace) -> Source:
-    """Return the observations of the source that the command line names.
+def read_source(options: argparse.Namespace
+                ) -> tuple[PosedDetections, Path, frames.Frames | None]:
+    """Return the observations of a source, their file, and its images if there are any.
 
     CliplocError: the source, the networks or the options cannot be used.
     """
@@ -109,13 +102,13 @@ def read_source(options: argparse.Namespace) -> Source:
     check_folder_options(options)
     find_topics(options, options.bag)
     if options.observations is not None:
-        return Source(load_observations(options.observations), options.observations, None)
+        return load_observations(options.observations), options.observations, None
     of_cameras = read_cameras(options)
     images = of_cameras[''] if '' in of_cameras else frames.join_frames(of_cameras)
     print(''.join(f'{note}\n' for note in images.notes), end='', flush=True)
     recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))
     file = options.record_to or recorder.observation_file(images, recording)
-    return Source(recorder.record_once(images, recording, file, _odometry(options)), file, images)
+    return recorder.record_once(images, recording, file, _odometry(options)), file, images
 
 
 def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeOptions,

@@ -71,21 +71,21 @@ def convert(options: argparse.Namespace) -> int:
         detections = tum.read_recorded_detections(
             options.detections, (camera.width, camera.height))
     print(f'{len(sequence)} images, intrinsics: {origin}', flush=True)
-    result = tum.convert_tum(
+    written = tum.convert_tum(
         sequence, camera, options.output,
         tum.ConversionOptions(
             options.storage, options.image_format, prefix=options.prefix,
             camera_frame=options.camera_frame, world_frame=options.world_frame),
         detections,
         progress=lambda images: tqdm(images, unit='image', disable=None))  # on a terminal only
-    print(f'wrote {options.output}: {result.images} images, {result.poses} ground-truth poses, '
-          f'{result.detections} detection messages, {result.accelerations} accelerations in '
-          f'{time.monotonic() - begin:.1f} s')
+    print(f'wrote {options.output}: {len(sequence)} images, {written["poses"]} ground-truth '
+          f'poses, {written["detections"]} detection messages, {written["accelerations"]} '
+          f'accelerations in {time.monotonic() - begin:.1f} s')
     if len(sequence.trajectory) == 0:
         print('the folder has no ground truth')
-    elif missing := result.images - result.poses:
+    elif missing := len(sequence) - written['poses']:
         print(f'{missing} images have no ground truth within 20 ms and so no pose')
-    if options.detections is not None and (missing := result.images - result.detections):
+    if options.detections is not None and (missing := len(sequence) - written['detections']):
         print(f'{missing} images have no recorded detections and so no detection message')
     return 0
 

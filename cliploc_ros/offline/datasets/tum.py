@@ -6,6 +6,7 @@ The recordings have the topics of the nodes, with recorded detections if there a
 """
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -215,20 +216,13 @@ class ConversionOptions:
         return '/'.join(['', *filter(None, self.prefix.split('/')), name])
 
 
-@dataclass(frozen=True)
-class ConversionResult:
-    """Numbers of written messages."""
-
-    images: int  #: Images, each with a camera_info
-    poses: int  #: Images with ground truth
-    detections: int  #: Images with an entry of recorded detections, which may be empty
-    accelerations: int = 0  #: Samples of the accelerometer
-
-
 def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
                 options: ConversionOptions, detections: Mapping[int, Detections] | None = None,
-                progress: Progress = iter) -> ConversionResult:
+                progress: Progress = iter) -> Counter[str]:
     """Write a sequence as a rosbag2 recording.
+
+    Return the numbers of ``poses`` (images with ground truth), ``detections`` (images with an
+    entry of recorded detections, which may be empty) and ``accelerations``.
 
     Topics: ``image`` or ``image/compressed``, ``camera_info``, ``ground_truth``, ``detections`` if
     given, and ``imu`` if the folder has an accelerometer.txt. All headers of a frame have the
@@ -259,7 +253,7 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
     image_topic = options.topic('image/compressed' if is_compressed else 'image')
     info_topic, pose_topic = options.topic('camera_info'), options.topic('ground_truth')
     boxes_topic = options.topic('detections')
-    frame, poses, boxes = options.camera_frame, 0, 0
+    frame, written = options.camera_frame, Counter[str]()
     accelerometer = sequence.folder / 'accelerometer.txt'
     stamps_ns, accelerations = (read_tum_accelerometer(accelerometer) if accelerometer.exists()
                                 else ([], np.empty((0, 3))))
@@ -290,18 +284,19 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
             if stamp_ns in recorded:
                 bag.write(boxes_topic, stamp_ns, bag_messages.detections_message(
                     stamp_ns, frame, recorded[stamp_ns]))
-                boxes += 1
+                written['detections'] += 1
             if (map_from_camera := sequence.pose_at(stamp_ns)) is not None:
                 bag.write(pose_topic, stamp_ns, bag_messages.pose_message(
                     stamp_ns, options.world_frame, map_from_camera))
-                poses += 1
+                written['poses'] += 1
         if stamps_ns:
             imu_topic = options.topic('imu')
             bag.add_topic(imu_topic, bag_messages.IMU)
             for stamp_ns, acceleration in zip(stamps_ns, accelerations, strict=True):
                 bag.write(imu_topic, stamp_ns, bag_messages.imu_message(
                     stamp_ns, _IMU_FRAME, acceleration))
-    return ConversionResult(len(sequence), poses, boxes, len(stamps_ns))
+                written['accelerations'] += 1
+    return written
 
 
 def read_recorded_detections(path: Path, image_size: tuple[int, int] | None = None
