@@ -113,14 +113,14 @@ def _play(player: 'Player', options: argparse.Namespace, stop: command.Interrupt
     begin = time.monotonic()
     with tqdm(total=length_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
               disable=None) as bar:  # draws on a terminal only
-        report = player.play(lambda message: bar.update(
+        counts, passes, unread, late_s = player.play(lambda message: bar.update(
             (message.stamp_ns - player.start_ns) / NS_PER_S - bar.n))
-    passes = f', {report.passes} passes' if report.passes > 1 else ''
-    print(f'{"stopped: " if stop.is_set() else ""}published {report.counts.total()} messages on '
-          f'{len(report.counts)} topics in {time.monotonic() - begin:.1f} s{passes}; '
-          f'at most {report.worst_lateness_s * 1000:.1f} ms late', flush=True)
-    if report.unread:
-        print(f'warning: {report.unread} messages that the recording lists were not found in it; '
+    print(f'{"stopped: " if stop.is_set() else ""}published {counts.total()} messages on '
+          f'{len(counts)} topics in {time.monotonic() - begin:.1f} s'
+          f'{f", {passes} passes" if passes > 1 else ""}; '
+          f'at most {late_s * 1000:.1f} ms late', flush=True)
+    if unread:
+        print(f'warning: {unread} messages that the recording lists were not found in it; '
               'it may be damaged', file=sys.stderr)
     if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
         print(f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all messages '

@@ -56,20 +56,6 @@ class PlayOptions:
     loop: bool = False
 
 
-@dataclass(frozen=True)
-class PlayReport:
-    """Numbers of published messages."""
-
-    #: Number of messages, by recorded topic name.
-    counts: Counter[str]
-    #: Number of times that the recording was played to its end.
-    passes: int = 0
-    #: Number of messages that the recording lists but does not contain.
-    unread: int = 0
-    #: Greatest delay of a message after its time.
-    worst_lateness_s: float = 0.0
-
-
 class Player:
     """Publishes an open recording; `stop` ends every wait and the playback within milliseconds.
 
@@ -112,10 +98,13 @@ class Player:
                 return
         self._stop.wait(_DISCOVERY_S)
 
-    def play(self, on_message: Callable[[BagMessage], None] = lambda message: None) -> PlayReport:
+    def play(self, on_message: Callable[[BagMessage], None] = lambda message: None
+             ) -> tuple[Counter[str], int, int, float]:
         """Publish the messages, each at its time; `on_message` is called after each.
 
-        DatasetError: the recording is damaged.
+        Return the number of messages by recorded topic, of passes to the end of the recording, and
+        of messages that the recording lists but does not contain, and the greatest delay of a
+        message after its time [s]. DatasetError: the recording is damaged.
         """
         counts = self._publish_latched()
         messages = self._read_ahead()
@@ -138,7 +127,7 @@ class Player:
             gap_ns = length_ns // max(played.total() - 1, 1) or NS_PER_S
             origin_ns += round((length_ns + gap_ns) / self._options.rate)
             messages = self._read_ahead()
-        return PlayReport(counts, passes, unread, worst_s)
+        return counts, passes, unread, worst_s
 
     def wait_for_acknowledgement(self, timeout_s: float) -> tuple[str, ...]:
         """Wait until all reliable subscribers have acknowledged all messages, or until stopped.

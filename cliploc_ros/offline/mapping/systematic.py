@@ -160,20 +160,12 @@ def _twists(views: Views, is_own: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.where(smooth, twists / np.where(smooth, seconds, 1.0), 0.0)
 
 
-class _Descent(NamedTuple):
-    """The best-fitting numbers (G,) of a cause, their deviations, and the corrected views."""
-
-    values: NDArray[np.float64]
-    deviations: NDArray[np.float64]
-    views: Views
-    linear: Linear
-
-
 def _descend(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64],
              start: NDArray[np.float64], prior: NDArray[np.float64], steps: int, precision: float
-             ) -> _Descent:
-    """Return the best-fitting values of a cause, from a start.
+             ) -> tuple[NDArray[np.float64], NDArray[np.float64], Views, Linear]:
+    """Return the best-fitting values (G,) of a cause, from a start, and their deviations (G,).
 
+    Also return the corrected views and their residuals.
     The prior (G,) holds inverse variances about zero. The descent ends after a step below the
     precision times the deviations.
     """
@@ -194,20 +186,21 @@ def _descend(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[n
         values, views, landmarks, linear = values + step, moved, refitted, trial
         if (np.abs(step) < precision * deviations).all():
             break
-    return _Descent(values, deviations, views, linear)
+    return values, deviations, views, linear
 
 
 def _fit(cause: _Cause, given: Views, landmarks: Landmarks, shown: NDArray[np.int64]
          ) -> list[Correction]:
     """Return the best-fitting values of a cause as corrections."""
     zeros = np.zeros(len(cause.names))
-    found = _descend(cause, given, landmarks, shown, zeros, zeros, _STEPS, 0.2)
-    own = cause.boxes[found.linear.rows]
+    values, deviations, _, linear = _descend(cause, given, landmarks, shown, zeros, zeros, _STEPS,
+                                             0.2)
+    own = cause.boxes[linear.rows]
     before = _cost_of(linearize_boxes(given, shown, landmarks), own)
-    explained = max(0.0, 1.0 - _cost_of(found.linear, own) / max(before, 1e-12))
+    explained = max(0.0, 1.0 - _cost_of(linear, own) / max(before, 1e-12))
     corrections = []
     for value, deviation, name, unit, factor, effect in zip(
-            found.values, found.deviations, cause.names, cause.units, cause.factors,
+            values, deviations, cause.names, cause.units, cause.factors,
             cause.effects_px, strict=True):
         effect_px = abs(float(value) * factor) * effect
         corrections.append(Correction(
@@ -301,10 +294,10 @@ def refine_mount(detections: PosedDetections, given: Views, landmarks: Landmarks
     values = np.concatenate([start.translations[0] - turn @ given.translations[0],
                              Rotation.from_matrix(turn).as_rotvec()])
     _, mount, _ = _causes(detections.cameras[0], given, 0)
-    found = _descend(mount, given, landmarks, _sample(shown), values, _MOUNT_PRIOR ** -2,
-                     _MOUNT_STEPS, 0.0)
-    motion = make_transform(Rotation.from_rotvec(found.values[3:]).as_matrix(), found.values[:3])
-    return MountCorrection(found.views, invert_transform(motion), found.deviations)
+    values, deviations, views, _ = _descend(mount, given, landmarks, _sample(shown), values,
+                                            _MOUNT_PRIOR ** -2, _MOUNT_STEPS, 0.0)
+    motion = make_transform(Rotation.from_rotvec(values[3:]).as_matrix(), values[:3])
+    return MountCorrection(views, invert_transform(motion), deviations)
 
 
 def _sample(shown: NDArray[np.int64]) -> NDArray[np.int64]:
