@@ -118,7 +118,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         if len(rows) >= _LEAST_POINTS:
             chosen.append((keyframe, points[rows], rows))
     if not chosen:
-        raise MappingError(f'{frames.source}: no keyframe: none of {len(seen)} images has '
+        raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
                            f'{_LEAST_POINTS} points; record depth, or images 5 cm apart')
     cameras, kind = [keyframe.camera for keyframe, _, _ in chosen], options.kind
     descriptors = np.concatenate([keyframe.posed.descriptors[rows]
