@@ -161,7 +161,7 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
            '--keyframes, with 3D points from depth or triangulation (default: if the source has '
            'images that suffice for a layer)', action=argparse.BooleanOptionalAction)
     option(group, '--keyframe-points N', 'greatest number of points of a keyframe, 146 bytes '
-           'each, or 82 with xfeat (%(default)s)', positive_int, 600)
+           'each, or 82 with xfeat (%(default)s)', within(20, 2000), 600)
     option(group, '--keyframe-features', 'kind of features of the keyframes, and later of the '
            'images to localize; xfeat is a network of 2.7 MB, which is downloaded once '
            '(%(default)s)', default=SIFT, choices=FEATURES)

@@ -154,21 +154,31 @@ class Player:
     def _play_once(self, messages: Iterator[BagMessage], origin_ns: int,
                    on_message: Callable[[BagMessage], None]) -> tuple[Counter[str], float]:
         """Publish messages; return their number by topic, and the greatest delay [s]."""
-        timeline = _Timeline(origin_ns, self.start_ns, self._options.rate, self._stop)
+        rate = self._options.rate
+
+        def late_s(stamp_ns: int) -> float:
+            """Return the time since a stamp's time, without drift; negative in the future."""
+            due_ns = origin_ns + (stamp_ns - self.start_ns) / rate
+            return (time.monotonic_ns() - due_ns) / NS_PER_S
+
+        def wait_for(stamp_ns: int) -> bool:
+            """Sleep until a stamp's time; return False if stopped before."""
+            left_s = -late_s(stamp_ns)
+            return not self._stop.wait(left_s) if left_s > 0 else not self._stop.is_set()
+
         # /clock ticks on a regular grid of real time; without a clock, nothing ticks
-        step_ns = max(round(self._options.rate * NS_PER_S / (self._options.clock_hz or 1.0)), 1)
+        step_ns = max(round(rate * NS_PER_S / (self._options.clock_hz or 1.0)), 1)
         tick_ns, counts, worst_lateness_s = self.start_ns, Counter[str](), 0.0
         for message in messages:
-            while self._clock is not None and tick_ns <= message.stamp_ns \
-                    and timeline.wait_for(tick_ns):
+            while self._clock is not None and tick_ns <= message.stamp_ns and wait_for(tick_ns):
                 tick = Clock()
                 tick.clock.sec, tick.clock.nanosec = divmod(tick_ns, NS_PER_S)
                 self._clock.publish(tick)
-                missed = max(timeline.now_ns() - tick_ns, 0) // step_ns  # skipped
+                missed = round(late_s(tick_ns) * rate * NS_PER_S) // step_ns  # skipped
                 tick_ns += step_ns * max(missed, 1)
-            if not timeline.wait_for(message.stamp_ns):
+            if not wait_for(message.stamp_ns):
                 break
-            worst_lateness_s = max(worst_lateness_s, timeline.lateness_s(message.stamp_ns))
+            worst_lateness_s = max(worst_lateness_s, late_s(message.stamp_ns))
             self._publishers[message.topic].publish(message.data)
             counts[message.topic] += 1
             on_message(message)
@@ -184,28 +194,6 @@ class Player:
             self._publishers[message.topic].publish(message.data)
             counts[message.topic] += 1
         return counts
-
-
-class _Timeline:
-    """Maps recorded stamps to the monotonic clock from a fixed origin, without drift."""
-
-    def __init__(self, origin_ns: int, start_ns: int, rate: float, stop: Interruption) -> None:
-        self.start_ns, self.rate = start_ns, rate
-        self._origin_ns, self._stop = origin_ns, stop
-
-    def wait_for(self, stamp_ns: int) -> bool:
-        """Sleep until a stamp's time; return False if stopped before."""
-        left_s = -self.lateness_s(stamp_ns)
-        return not self._stop.wait(left_s) if left_s > 0 else not self._stop.is_set()
-
-    def lateness_s(self, stamp_ns: int) -> float:
-        """Return the time since a stamp's time [s]; negative in the future."""
-        due_ns = self._origin_ns + (stamp_ns - self.start_ns) / self.rate
-        return (time.monotonic_ns() - due_ns) / NS_PER_S
-
-    def now_ns(self) -> int:
-        """Return the current time of the recording [ns]."""
-        return self.start_ns + round((time.monotonic_ns() - self._origin_ns) * self.rate)
 
 
 def _select_topics(reader: BagReader, options: PlayOptions

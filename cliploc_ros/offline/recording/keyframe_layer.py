@@ -17,7 +17,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes import layer
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import DatasetError, MappingError, OptionsError
+from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
 
 # Features extracted from an image, before those without a point are left out.
@@ -58,12 +58,6 @@ class LayerOptions:
     #: Whether to store small images of the keyframes, for visual inspection
     images: bool = False
     kind: FeatureKind = SIFT  #: Kind of the features
-
-    def __post_init__(self) -> None:
-        """Refuse a number of points out of range."""
-        if not _LEAST_POINTS <= self.most_points <= _MOST_FOUND:
-            raise OptionsError(f'{self.most_points} points of a keyframe: give {_LEAST_POINTS} '
-                               f'to {_MOST_FOUND}')
 
 
 _DEFAULT = LayerOptions()
