@@ -303,8 +303,8 @@ def significant_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[n
 
 def estimated_note(errors: PoseErrors) -> str:
     """Return a note for the user about the estimated errors of the poses."""
-    return (f'the poses have errors of about {100 * errors.sigma_m:.1f} cm, {errors.sigma_deg:.1f} '
-            f'degrees over {errors.correlation_s:.1f} s by the boxes; they are refined')
+    return (f'the poses are off by {100 * errors.sigma_m:.1f} cm, {errors.sigma_deg:.1f} degrees '
+            f'over {errors.correlation_s:.1f} s, estimated from the boxes; they are refined')
 
 
 def estimate_pose_errors(given: Views, landmarks: Landmarks, shown: NDArray[np.int64],
