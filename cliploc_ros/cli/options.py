@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
-# Options for folders only.
-_PLACING = ('images', 'axes', 'scale', 'known_distance')
 SIFT, XFEAT = FEATURES = 'sift', 'xfeat'
 
 
@@ -149,7 +147,7 @@ def given_options(options: argparse.Namespace, defaults: Mapping[str, Any]) -> d
 
 def check_folder_options(options: argparse.Namespace) -> None:
     """Refuse options of folders if the source is not a folder; OptionsError names them."""
-    given = given_options(options, dict.fromkeys(_PLACING))
+    given = given_options(options, dict.fromkeys(('images', 'axes', 'scale', 'known_distance')))
     if given and folder_of(options) is None:
         raise OptionsError(f'{", ".join(given)}: for folders of images only')
 

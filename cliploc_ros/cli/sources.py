@@ -130,16 +130,14 @@ def recording_of(options: argparse.Namespace, file: Path, scale: float,
     """Return the recording of a map, whose poses are those of a file, scaled and rotated."""
     folder = folder_of(options)
     source, layout = folder or (options.bag, '')
-    if options.bag is not None:
-        return MapRecording(file, source, options.image, options.camera_info, options.rectified,
-                            intrinsics=options.intrinsics, scale=scale, rotation=rotation.tolist())
+    topics = {} if options.bag is None else {
+        name: getattr(options, name) for name in ('image', 'camera_info', 'rectified')}
+    placing = {} if folder is None else {
+        name: getattr(options, name) for name in _PLACING if getattr(options, name)}
     # --rgbd detects its layout
     return MapRecording(file, source, layout='' if layout == 'rgbd' else layout,
-                        intrinsics=options.intrinsics, images=options.images,
-                        placing={} if folder is None else {
-                            name: getattr(options, name) for name in _PLACING
-                            if getattr(options, name)},
-                        scale=scale, rotation=rotation.tolist())
+                        intrinsics=options.intrinsics, images=options.images, placing=placing,
+                        scale=scale, rotation=rotation.tolist(), **topics)
 
 
 def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str, frames.Frames]:

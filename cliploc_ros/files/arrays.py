@@ -76,14 +76,9 @@ def _is_not_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
                            for rows in np.array_split(values, len(values) // _ROWS_AT_ONCE + 1)])
 
 
-def _is_repeated(values: NDArray[Any]) -> NDArray[np.bool_]:
-    repeated = np.ones(len(values), dtype=np.bool_)
-    repeated[np.unique(values, return_index=True)[1]] = False
-    return repeated
-
-
 FINITE = Check(f'is beyond {_MOST:g} or not finite', _is_not_finite)
-UNIQUE = Check('repeats an id', _is_repeated)
+UNIQUE = Check('repeats an id', lambda ids: np.isin(
+    np.arange(len(ids)), np.unique(ids, return_index=True)[1], invert=True))
 BOX = Check('is not in the order left, top, right, bottom',
             lambda boxes: (boxes[:, :2] >= boxes[:, 2:]).any(axis=1))
 SHARE = Check('is outside 0 to 1', lambda shares: (shares < 0) | (shares > 1))

@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from itertools import batched, chain
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,12 +49,8 @@ _QUERIES_A_PART = 8
 _AT = '@'
 
 
-class _Part(NamedTuple):
-    """One trial of a method on some queries, which are given by their indices."""
-
-    method: Method
-    trial: int
-    places: tuple[int, ...]
+# One trial of a method on some queries, which are given by their indices.
+_Part = tuple[Method, int, tuple[int, ...]]
 
 
 def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
@@ -90,7 +86,7 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
     """
     # parts that take longest come first
     parts = [
-        _Part(method, trial, places)
+        (method, trial, places)
         for method in sorted(methods, key=lambda method: not method.draws_nothing)
         for trial in range(count_trials(method, trials, bool(noisy)))
         for places in batched(range(len(queries)), max(1, len(queries)) if method.accumulates
@@ -100,11 +96,11 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
     workers = workers if len(parts) > 1 else 1
     make_search = partial(_make_search, landmark_map, noisy or [queries], layer)
     with closing(run_tasks(make_search, parts, workers=workers, scheduler=scheduler)) as finished:
-        for part, found in finished:
+        for (method, trial, places), found in finished:
             if found is None:
                 raise WorkersError(
-                    f'workers died repeatedly at {part.method.name}, trial {part.trial}, queries '
-                    f'{part.places[0]}-{part.places[-1]}; run again with fewer workers')
+                    f'workers died repeatedly at {method.name}, trial {trial}, queries '
+                    f'{places[0]}-{places[-1]}; run again with fewer workers')
             results += found
             advance(found)
     order = {method.name: number for number, method in enumerate(methods)}
@@ -126,8 +122,9 @@ def _make_search(landmark_map: LandmarkMap, queries: Sequence[Sequence[PosedQuer
     Relocalizer(landmark_map, RelocalizerOptions(matching='class', algorithm='bf')).warm_up()
 
     def run(part: _Part) -> list[Result]:
-        return run_trial(landmark_map, part.method, part.trial, [
-            queries[part.trial % len(queries)][place] for place in part.places], keyframes)
+        method, trial, places = part
+        return run_trial(landmark_map, method, trial, [
+            queries[trial % len(queries)][place] for place in places], keyframes)
     return run
 
 
