@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_type_hints
 
 from cliploc_ros import command
 from cliploc_ros.cli.options import add_topic_options, add_use_option, read_layer
@@ -73,19 +73,10 @@ def make_parser() -> argparse.ArgumentParser:
     option(group, '--min-confidence', 'min_confidence of the relocalizer (%(default)s)',
            command.within(0.0, 1.0), RelocalizerOptions().min_confidence)
     group = parser.add_argument_group('thresholds; if the map misses one, the exit code is 1')
-    share, count = command.within(0.0, 1.0), command.within(0, 10**9)
-    for name, kind, text in (
-            ('min_explained', share, 'share of held-out boxes that a landmark explains'),
-            ('min_iou', share, 'their median IoU'),
-            ('min_accepted', share, 'share of recorded frames that are accepted'),
-            ('max_misled', share, 'share of views in which a wrong pose is accepted'),
-            ('min_positions', share, 'share of grid positions with an accepted heading'),
-            ('min_by_objects', share, 'the same by objects alone, beside keyframes'),
-            ('max_faulty', share, 'share of landmarks with a serious fault'),
-            ('max_duplicates', count, 'pairs of landmarks that are one object'),
-            ('max_look_alikes', count, 'pairs of places that look alike')):
-        group.add_argument(f'--{name.replace("_", "-")}', type=kind, metavar='N',
-                           default=getattr(Thresholds, name), help=f'{text} (%(default)s)')
+    for name, hint in get_type_hints(Thresholds, include_extras=True).items():
+        option(group, f'--{name.replace("_", "-")} N', f'{hint.__metadata__[0]} (%(default)s)',
+               command.within(0.0, 1.0) if hint.__origin__ is float else command.within(0, 10**9),
+               getattr(Thresholds, name))
     add_topic_options(parser.add_argument_group('images of a bag'))
     return parser
 

@@ -3,6 +3,7 @@
 """Options of building and checking a map."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,20 +130,18 @@ class CheckOptions:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds that a map has to reach: guesses from a few maps of one office."""
+    """Thresholds that a map has to reach: guesses from a few maps of one office.
 
-    #: Held-out share of the boxes that a landmark of their class explains, and their median IoU
-    min_explained: float = 0.6
-    min_iou: float = 0.6
-    min_accepted: float = 0.4  #: Share of the recorded frames that the relocalizer accepts
-    #: Share of the recorded frames and grid views in which it accepts a wrong pose
-    max_misled: float = 0.01
-    #: Share of the grid positions near the recording with an accepted heading
-    min_positions: float = 0.4
-    #: The same share by objects alone, for maps with keyframes; below it, a map is "keyframes
-    #: only"
-    min_by_objects: float = 0.1
-    #: Share of the landmarks with a serious fault, each counted as often as it was seen
-    max_faulty: float = 0.15
-    max_duplicates: int = 0  #: Pairs of landmarks that are one object
-    max_look_alikes: int = 0  #: Pairs of places that a detector cannot tell apart
+    The texts are the help of check_map. A map that misses only min_by_objects is "keyframes only".
+    Landmarks are counted as often as they were seen.
+    """
+
+    min_explained: Annotated[float, 'share of held-out boxes that a landmark explains'] = 0.6
+    min_iou: Annotated[float, 'their median IoU'] = 0.6
+    min_accepted: Annotated[float, 'share of recorded frames that are accepted'] = 0.4
+    max_misled: Annotated[float, 'share of views in which a wrong pose is accepted'] = 0.01
+    min_positions: Annotated[float, 'share of grid positions with an accepted heading'] = 0.4
+    min_by_objects: Annotated[float, 'the same by objects alone, beside keyframes'] = 0.1
+    max_faulty: Annotated[float, 'share of landmarks with a serious fault'] = 0.15
+    max_duplicates: Annotated[int, 'pairs of landmarks that are one object'] = 0
+    max_look_alikes: Annotated[int, 'pairs of places that look alike'] = 0
