@@ -328,9 +328,10 @@ def as_csv(summaries: Sequence[Summary],
         spreads = summary.spreads
         values = {name: value for name, (value, _) in spreads.items()}
         values |= {f'{name}_std': deviation for name, (_, deviation) in spreads.items()}
+        rates = {name: values.pop(name) for name in [*values] if name.startswith('success')}
         rows.append({
             'method': summary.method, 'queries': len(summary.queries),
-            'trials': len(summary.errors_m), 'solved': summary.solved, **values,
+            'trials': len(summary.errors_m), **rates, 'solved': summary.solved, **values,
             **dict(zip(('relative_error_m', 'relative_error_deg'),
                        (relative or {}).get(summary.method, ('', '')), strict=True)),
             'mean_search_ms': float(summary.search_ms.mean()),
