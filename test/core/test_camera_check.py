@@ -326,6 +326,10 @@ def test_with_what_was_known_before_the_same_answer_comes_again(focal, rng):
         assert repeated.refusal_kind == found.refusal_kind
     assert again.cameras.faults == localizer.cameras.faults
     assert bool(again.cameras.faults) == (focal != 1.0)
+    older = localizer.cameras.fields()
+    for record in older.values():
+        record |= {some: record[some][:4] for some in ('views', 'since')}
+    assert CameraCheck.of_fields(older).values == localizer.cameras.values
 
 
 NOTHING_FOUND = Relocalization(False, '5 detections are too few; turn the camera to more objects',

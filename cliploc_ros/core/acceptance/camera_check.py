@@ -352,9 +352,10 @@ class _Record:
         record = cls(name, Camera(**camera | {'distortion': tuple(camera['distortion'])}))
         record.extent.boxes = np.array(fields['boxes'], dtype=np.float64).reshape(-1, 4)
         record.views, record.since = (Views._make(
-            np.array(part, dtype=empty.dtype).reshape(-1, *empty.shape[1:])
-            for part, empty in zip(fields[some], Views(), strict=True))
-            for some in ('views', 'since'))
+            np.array(part, dtype=empty.dtype).reshape(-1, *empty.shape[1:]) for part, empty in zip(
+                # earlier releases did not weigh looks
+                [*parts, [1.0] * len(parts[1])][:len(Views())], Views(), strict=True))
+            for parts in (fields['views'], fields['since']))
         if not (np.abs(record.extent.boxes) < _FAR).all() or not all(
                 np.isfinite(part).all() for part in (*record.views, *record.since)):
             raise ValueError(f'values must be finite, and box coordinates below {_FAR:g} px')
