@@ -6,6 +6,7 @@ The room is simulated and seen from many places."""
 
 import json
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -137,32 +138,41 @@ def test_on_a_rough_map_only_a_wrong_camera_is_called_wrong(change, level, is_wr
     assert any(result.cameras and not result.accepted for result in found) == is_wrong
 
 
-def views_of(step_m, scatter=0.0, size=400.0):
-    """Return four views from the corners of a square, whose focal lengths scatter around .2."""
-    views, information = Views(), size * np.eye(ERRORS)
-    for number, focal in enumerate(0.2 + scatter * np.array([-1.0, 1.0, -1.0, 1.0])):
-        views = views.with_look(CameraLook(
-            '', True, make_transform(np.eye(3), step_m * np.array([number % 2, number // 2, 0])),
-            information, information[0] * focal, np.zeros((6, ERRORS))))
-    return views
+def look_at(position, focal, size=400.0, careful=1.0):
+    """Return a look from a position [m] by which the focal length is off."""
+    information = size * np.eye(ERRORS)
+    return CameraLook('', True, make_transform(np.eye(3), np.array(position, dtype=float)),
+                      information, information[0] * focal, careful, np.zeros((6, ERRORS)))
 
 
-def test_views_that_contradict_each_other_are_weak_evidence():
-    """The mean of the errors is the same; errors of the map scatter, those of a camera do not."""
-    log_odds = [views_of(1.0, scatter).odds().log_odds for scatter in (0.0, 0.02, 0.25)]
-    assert log_odds[0] > CALIBRATION.camera.sure > log_odds[2] > 0.0
-    assert log_odds[1] == pytest.approx(log_odds[0], abs=0.1), 'as boxes alone scatter'
+def views_of(count, focal=0.2, **fields):
+    """Return views a metre apart."""
+    return reduce(Views.with_look, (look_at((number, 0, 0), focal, **fields)
+                                    for number in range(count)), Views())
 
 
-def test_a_camera_is_wrong_without_the_views_of_any_one_place():
-    """Objects that are seen from one place have the same errors of the map in all its views."""
-    apart, near = views_of(1.0), views_of(0.3)
-    assert apart.odds().log_odds == near.odds().log_odds > CALIBRATION.camera.sure
-    assert apart.odds().is_wrong and not near.odds().is_wrong
-    assert near.odds(CALIBRATION.camera.extent).is_wrong, 'boxes end at a line without looks'
-    far = CameraLook('', True, make_transform(np.eye(3), np.full(3, 5.0)), 1e-3 * np.eye(ERRORS),
-                     np.zeros(ERRORS), np.zeros((6, ERRORS)))
-    assert not near.with_look(far).odds().is_wrong
+def test_errors_of_the_map_do_not_average_out_over_many_views():
+    few, most = int(CALIBRATION.camera.independent), int(CALIBRATION.camera.most_views)
+    log_odds = [views_of(count, 0.11, size=300.0).odds().log_odds
+                for count in (few // 2, few, most)]
+    assert 0.0 < log_odds[0] < log_odds[1] < CALIBRATION.camera.sure
+    assert log_odds[2] == pytest.approx(log_odds[1])
+
+
+def test_poor_fits_name_a_wrong_camera_and_hardly_change_a_confidence():
+    good, poor = views_of(4), views_of(4, careful=0.1)
+    assert good.odds().is_wrong and poor.odds().is_wrong
+    assert good.careful_odds().log_odds > poor.careful_odds().log_odds + 3.0
+
+
+def test_a_wrong_camera_is_mended_by_views_of_several_places(rng):
+    check = CameraCheck()
+    check.see(query(rng).observation)
+    check.add([look_at((number, 0, 0), 0.2) for number in range(6)])
+    check.add([look_at((0, 1, 0.1 * number), 0.0) for number in range(4)])
+    assert check.faults, 'poses at one place may fit by chance'
+    check.add([look_at((5, 5, number), 0.0) for number in range(4)])
+    assert not check.faults
 
 
 def test_the_covariance_has_the_errors_of_a_camera_until_it_is_verified(rng):
@@ -190,7 +200,7 @@ def test_looks_from_one_view_count_once(rng):
     assert localizer.cameras.faults == []
     alone = [Views().with_look(look).odds().log_odds for one in found for look in one.cameras]
     assert len(alone) == 30 and max(alone) < CALIBRATION.camera.view + 0.1
-    views = views_of(9.0)
+    views = views_of(4)
     for number in range(3):
         views = views.with_look(found[number].cameras[0]._replace(vector=np.full(ERRORS, number)))
     assert views.counts.tolist()[1:] == [1, 1, 1, 3]
@@ -266,7 +276,7 @@ def test_nothing_is_known_of_a_new_camera():
     # the camera moves by 1 m if the focal length, or the ratio of fx to fy, changes by 1 %
     moves[0, 0] = moves[1, 1] = 100.0
     share, covariance, fault = CameraCheck().judge([CameraLook(
-        '', True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS), moves)], np.eye(6))
+        '', True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS), 1.0, moves)], np.eye(6))
     terms = CALIBRATION.camera
     expected = np.diag([*(1.0 + terms.unverified * (100.0 * error) ** 2
                           for error in (terms.wrong_focal, terms.wrong_aspect)), *[1.0] * 4])
@@ -282,7 +292,7 @@ def test_the_error_of_a_wrong_camera_is_named(error, size, said, rng):
     check, information = CameraCheck(), 1e4 * np.eye(ERRORS)
     check.see(query(rng).observation)
     looks = [CameraLook('', True, place(rng), information, information[error] * size,
-                        np.zeros((6, ERRORS))) for _ in range(12)]
+                        1.0, np.zeros((6, ERRORS))) for _ in range(12)]
     check.add([look._replace(is_new=False) for look in looks])
     assert not check.faults, 'these frames were seen before'
     check.add(looks)
@@ -295,7 +305,7 @@ def test_each_camera_of_a_rig_may_be_wrong(rng):
     moves = np.zeros((6, ERRORS))
     moves[0, 0] = 100.0
     looks = [CameraLook(name, True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS),
-                        errors)
+                        1.0, errors)
              for name, errors in (('front', moves), ('back', 0.0 * moves))]
     alone, both = (CameraCheck().judge(some, np.eye(6)) for some in (looks[:1], looks))
     assert both[0] == alone[0] < 0.6
@@ -316,6 +326,10 @@ def test_with_what_was_known_before_the_same_answer_comes_again(focal, rng):
         assert repeated.refusal_kind == found.refusal_kind
     assert again.cameras.faults == localizer.cameras.faults
     assert bool(again.cameras.faults) == (focal != 1.0)
+    older = localizer.cameras.fields()
+    for record in older.values():
+        record |= {some: record[some][:4] for some in ('views', 'since')}
+    assert CameraCheck.of_fields(older).values == localizer.cameras.values
 
 
 NOTHING_FOUND = Relocalization(False, '5 detections are too few; turn the camera to more objects',

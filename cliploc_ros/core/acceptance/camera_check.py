@@ -7,10 +7,9 @@ One image hardly shows this error, because the pose adapts to it. Many images sh
 their poses differ and the error stays the same. A look is the evidence of one frame about the
 errors of its camera, with the pose eliminated, see cliploc_ros.core.fit.camera_fit. It consists of
 an information matrix and a vector, which add up over looks. Looks from one view share the errors
-of their boxes. Their mean therefore counts as one look. Errors of the map are errors of all looks
-at an object: a view that contradicts the others has less weight, and a verdict must hold without
-the views of any one place, see Views.odds. Poses that are refused give looks, too, because the few
-poses that a wrong camera lets pass fit it well.
+of their boxes. Their mean therefore counts as one look. Errors of the map do not average out over
+views, so many views count as few. Poses that are refused give looks, too, because the few poses
+that a wrong camera lets pass fit it well.
 
 A camera is either right, with the small errors of any calibration, or wrong in one of a few ways
 (kinds), with large errors. The Bayes factor of wrong against right is a mean of likelihood ratios.
@@ -79,8 +78,6 @@ _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
 _WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
 _UNVERIFIED = math.log(_TERMS.unverified / (1.0 - _TERMS.unverified))
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
-# Rounds of weights and mean. Chosen; twelve call the same right cameras wrong.
-_ROUNDS = 4
 # The largest coordinate of a recorded box [px]. A file with a larger one is damaged.
 _FAR = 1e9
 
@@ -94,6 +91,8 @@ class CameraLook(NamedTuple):
     #: (7, 7), (7,): information matrix of the errors; its product with the most likely errors
     information: NDArray[np.float64]
     vector: NDArray[np.float64]
+    #: By what factor the information is smaller if the residuals are errors of the boxes
+    careful: float
     #: (6, 7): how the pose of the newest camera moves with each error [m] [rad]
     moves: NDArray[np.float64]
 
@@ -110,8 +109,6 @@ class CameraOdds(NamedTuple):
     odds: NDArray[np.float64]  #: (1 + k,): log likelihood of each hypothesis, up to a constant
     means: NDArray[np.float64]  #: (1 + k, 7): mean errors under each hypothesis
     squares: NDArray[np.float64]  #: (1 + k, 7, 7): second moments of the errors
-    #: The least log odds without the views of any one place; infinite if no verdict depends on it
-    least: float = math.inf
 
     @property
     def log_odds(self) -> float:
@@ -121,7 +118,7 @@ class CameraOdds(NamedTuple):
     @property
     def is_wrong(self) -> bool:
         """Return whether the camera is certainly wrong."""
-        return min(self.log_odds, self.least) > _TERMS.sure
+        return self.log_odds > _TERMS.sure
 
     def effect(self, covariance: NDArray[np.float64], moves: NDArray[np.float64]
                ) -> tuple[float, NDArray[np.float64]]:
@@ -198,13 +195,21 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
         vector = fit.information @ fit.errors + fit.errors / _WRONG ** 2
         if not np.isfinite([*fit.information.ravel(), *vector]).all():
             continue  # NaN or infinity would corrupt the sum over all later looks
-        weight = _TERMS.view / max(_TERMS.view, odds_of(fit.information, vector).log_odds)
+        noise = max(1.0, (fit.square + _TERMS.prior_square * _TERMS.prior_residuals)
+                    / (max(0, int(is_edge.sum()) - 6 - ERRORS) + _TERMS.prior_residuals))
+        weight = _limit(fit.information, vector)
+        careful = _limit(fit.information / noise, vector / noise) / noise
         looks.append(CameraLook(
             seen.camera_name, seen.stamp_ns == last.stamp_ns,
             invert_transform(make_transform(rotation, translation)),
-            weight * fit.information, weight * vector,
+            weight * fit.information, weight * vector, careful / weight,
             moves[names == seen.camera_name].sum(axis=0)))
     return looks
+
+
+def _limit(information: NDArray[np.float64], vector: NDArray[np.float64]) -> float:
+    """Return the weight of a look with which its log odds are at most those of a view."""
+    return _TERMS.view / max(_TERMS.view, odds_of(information, vector).log_odds)
 
 
 class Views(NamedTuple):
@@ -214,18 +219,19 @@ class Views(NamedTuple):
     counts: NDArray[np.int64] = np.empty(0, dtype=np.int64)  #: (v,): number of looks
     informations: NDArray[np.float64] = np.empty((0, ERRORS, ERRORS))  #: (v, 7, 7)
     vectors: NDArray[np.float64] = np.empty((0, ERRORS))  #: (v, 7)
+    careful: NDArray[np.float64] = np.empty(0)  #: (v,)
 
     def with_look(self, look: CameraLook) -> 'Views':
         """Return these views with a look added; the oldest views are dropped if too many."""
         same = np.nonzero(SAME_BOXES.agreeing(self.poses, look.map_from_camera[None])[:, 0])[0]
         if not len(same):
-            new = (look.map_from_camera, 1, look.information, look.vector)
+            new = (look.map_from_camera, 1, look.information, look.vector, look.careful)
             return self.joined(Views(*(np.array([field]) for field in new)))
         counts = self.counts + (np.arange(len(self.counts)) == same[0])
-        share = ((counts - self.counts) / counts)[:, None]
-        return Views(self.poses, counts, self.informations + share[:, None] * (
-            look.information - self.informations), self.vectors + share * (
-                look.vector - self.vectors))
+        share = (counts - self.counts) / counts
+        return Views(self.poses, counts, self.informations + share[:, None, None] * (
+            look.information - self.informations), self.vectors + share[:, None] * (
+                look.vector - self.vectors), self.careful + share * (look.careful - self.careful))
 
     def joined(self, other: 'Views') -> 'Views':
         """Return these views followed by others; the oldest views are dropped if too many."""
@@ -233,34 +239,28 @@ class Views(NamedTuple):
                        for both in zip(self, other, strict=True)))
 
     @property
-    def unweighted(self) -> float:
-        """Return the log odds of the camera from all looks, in which all views have one weight."""
-        return odds_of(self.informations.sum(axis=0), self.vectors.sum(axis=0)).log_odds
+    def sums(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the sums of information (7, 7) and vector (7,) over the views."""
+        return self.informations.sum(axis=0), self.vectors.sum(axis=0)
 
     def odds(self, extent: float = 0.0) -> CameraOdds:
-        """Return the odds of the camera from all looks; for extent see odds_of.
+        """Return the odds of the camera from all looks; for extent see odds_of."""
+        share = min(1.0, _TERMS.independent / max(1, len(self.poses)))
+        information, vector = self.sums
+        return odds_of(share * information, share * vector, extent)
 
-        Errors of the map scatter the views more than their boxes do. A view that is far from the
-        mean of all therefore has the weight of a Student distribution (Lange, Little and Taylor,
-        "Robust Statistical Modeling Using the t Distribution", 1989). Errors of the camera are
-        common to all views, and do not scatter. The objects near a place share the errors of the
-        map, so a camera is only wrong if it is wrong without the views of any one place, too.
-        """
-        prior, weights = np.diag(_WRONG ** -2.0), np.ones(len(self.poses))
-        each = np.linalg.inv(self.informations + prior)
-        for _ in range(_ROUNDS if len(weights) > 1 else 1):  # one view has nothing to contradict
-            informations = weights[:, None, None] * self.informations
-            vectors = weights[:, None] * self.vectors
-            mean = np.linalg.solve(informations.sum(axis=0) + prior, vectors.sum(axis=0))
-            apart = self.vectors - self.informations @ mean
-            squares = np.einsum('vi,vij,vj->v', apart, each, apart)
-            weights = np.minimum(1.0, (_TERMS.scatter + ERRORS) / (_TERMS.scatter + squares))
-        odds = odds_of(informations.sum(axis=0), vectors.sum(axis=0), extent)
-        if odds.is_wrong:
-            odds = odds._replace(least=min((
-                odds_of(informations[~near].sum(axis=0), vectors[~near].sum(axis=0), extent
-                        ).log_odds for near in SAME_PLACE.agreeing(self.poses)), default=math.inf))
-        return odds
+    def careful_odds(self, extent: float = 0.0) -> CameraOdds:
+        """Return the odds for the confidence of a pose, which poor fits hardly change."""
+        return self._replace(
+            informations=self.careful[:, None, None] * self.informations,
+            vectors=self.careful[:, None] * self.vectors).odds(extent)
+
+    @property
+    def are_right(self) -> bool:
+        """Return whether the looks verify the camera, also without those of any one place."""
+        return self.odds().log_odds < _TERMS.fits and all(
+            Views(*(part[~near] for part in self)).odds().log_odds < _TERMS.fits
+            for near in SAME_PLACE.agreeing(self.poses))
 
 
 class Extent:
@@ -324,11 +324,11 @@ class _Record:
         else:
             self.since = self.since.with_look(look)
             # by how much the looks since the verdict raise the odds of the same errors
-            # (with equal weights: looks at a repaired camera are outliers among the others)
-            gain = self.views.joined(self.since).unweighted - self.views.unweighted
+            gain = (odds_of(*self.views.joined(self.since).sums).log_odds
+                    - odds_of(*self.views.sums).log_odds)
             if gain > _TERMS.view:
                 self.views, self.since = self.views.joined(self.since), Views()
-            elif (gain < -_TERMS.view and self.since.odds().log_odds < _TERMS.fits
+            elif (gain < -_TERMS.view and self.since.are_right
                   and self.by_extent < -_TERMS.fits):
                 self.views, self.since = self.since, Views()
         self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds()
@@ -352,9 +352,10 @@ class _Record:
         record = cls(name, Camera(**camera | {'distortion': tuple(camera['distortion'])}))
         record.extent.boxes = np.array(fields['boxes'], dtype=np.float64).reshape(-1, 4)
         record.views, record.since = (Views._make(
-            np.array(part, dtype=empty.dtype).reshape(-1, *empty.shape[1:])
-            for part, empty in zip(fields[some], Views(), strict=True))
-            for some in ('views', 'since'))
+            np.array(part, dtype=empty.dtype).reshape(-1, *empty.shape[1:]) for part, empty in zip(
+                # earlier releases did not weigh looks
+                [*parts, [1.0] * len(parts[1])][:len(Views())], Views(), strict=True))
+            for parts in (fields['views'], fields['since']))
         if not (np.abs(record.extent.boxes) < _FAR).all() or not all(
                 np.isfinite(part).all() for part in (*record.views, *record.since)):
             raise ValueError(f'values must be finite, and box coordinates below {_FAR:g} px')
@@ -441,10 +442,10 @@ class CameraCheck:
             its_looks = [look for look in looks if look.camera_name == name]
             record = self._records.get(name)
             views = reduce(Views.with_look, its_looks, record.views if record else Views())
-            odds = views.odds(record.by_extent if record else 0.0)
-            near, added = odds.effect(covariance, its_looks[-1].moves)
+            extent = record.by_extent if record else 0.0
+            near, added = views.careful_odds(extent).effect(covariance, its_looks[-1].moves)
             share, wider = min(share, near), wider + added
-            if record is not None and odds.is_wrong:
+            if record is not None and (odds := views.odds(extent)).is_wrong:
                 fault = record.in_words(odds)
         return share, wider, fault or '; '.join(self.faults)
 

@@ -49,6 +49,8 @@ _FIRST_DAMPING, _SETTLED = 1e-3, 1e-5
 _LONGEST_STEP = 1.0
 # Information about a direction that no box determines [1 / m^2] [1 / rad^2].
 _LEAST_INFORMATION = 0.01
+# Limit of the residuals in the mean square.
+_MOST_RESIDUAL = 4.0
 
 
 class CameraFit(NamedTuple):
@@ -56,6 +58,7 @@ class CameraFit(NamedTuple):
 
     errors: NDArray[np.float64]  #: (7,): the most likely errors, given their prior deviations
     information: NDArray[np.float64]  #: (7, 7): information of the boxes alone about the errors
+    square: float  #: Sum of the squared residuals after the fit
 
 
 @compiled
@@ -159,7 +162,8 @@ def fit_camera(pairs, is_edge, vertical, rotation, translation, deviations):
         for column in range(ERRORS):
             for axis in range(6):
                 own[row, column] += information[6 + row, axis] * last[axis, column]
-    return CameraFit(errors, 0.5 * (own + own.T))
+    square = np.sum(np.minimum(np.abs(residuals[:5 * len(pairs)]), _MOST_RESIDUAL) ** 2)
+    return CameraFit(errors, 0.5 * (own + own.T), square)
 
 
 @compiled
