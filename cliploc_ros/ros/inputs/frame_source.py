@@ -25,7 +25,7 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
 # Messages that may wait for their counterparts: ten seconds of 30 Hz VGA images for a slow
-# detector. Of larger images, every n-th is kept.
+# detector.
 _MAX_WAITING = 2000
 _MAX_IMAGE_BYTES = 256 * 2**20
 _MAX_DETECTIONS_BYTES = 16 * 2**20
@@ -353,10 +353,9 @@ class FrameSource:
         if self._unsure is not None:
             return (f'too few images on {self._resolved("image")} to check that their stamps '
                     'differ: raise its rate, or timeout_s')
-        if self._pairing.outrun:
-            return (f'detections arrive {self._pairing.outrun} images late, more than fit in '
-                    f'{_MAX_IMAGE_BYTES // 2**20} MiB of memory: use smaller images, '
-                    'image_transport compressed, or a faster detector')
+        if self._pairing.is_outrun:
+            return (f'detections arrive later than {_MAX_IMAGE_BYTES // 2**20} MiB of images: use '
+                    'smaller images, image_transport compressed, or a faster detector')
         received_at, detected_at = self._arrived_at
         if detected_at >= since:
             return (f'detections arrive {detected_at - received_at:.1f} s after their image: '
