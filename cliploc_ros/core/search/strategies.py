@@ -322,15 +322,6 @@ class Leaders(NamedTuple):
 
 
 @compiled
-def worst_score(leaders):
-    """Return the score that a hypothesis must exceed to become a leader."""
-    worst = leaders.scores[0]
-    for row in range(1, leaders.scores.shape[0]):
-        worst = min(worst, leaders.scores[row])
-    return worst
-
-
-@compiled
 def remember(leaders, score, iteration, sample, rotation, translation):
     """Add a hypothesis, unless its place has a better leader; drop worse leaders of that place."""
     scores = leaders.scores
@@ -346,17 +337,9 @@ def remember(leaders, score, iteration, sample, rotation, translation):
         scores[row] = -1.0
         free = row
     if free < 0:
-        free = 0
-        for row in range(1, scores.shape[0]):
-            if scores[row] < scores[free]:
-                free = row
-    scores[free] = score
-    leaders.iterations[free] = iteration
-    for i in range(3):
-        leaders.samples[free, i] = sample[i]
-        leaders.translations[free, i] = translation[i]
-        for j in range(3):
-            leaders.rotations[free, i, j] = rotation[i, j]
+        free = scores.argmin()
+    scores[free], leaders.iterations[free], leaders.samples[free] = score, iteration, sample
+    leaders.rotations[free], leaders.translations[free] = rotation, translation
 
 
 @compiled
@@ -477,7 +460,7 @@ def _blocks(scene: Scene, constraint: Constraint | None, leaders: Leaders,
 def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
     """Make the hypotheses of the first `count` samples, and add the best to the leaders."""
     candidates, constraint, targets, sample, poses, overlaps = bench
-    floor = worst_score(leaders)
+    floor = leaders.scores.min()  # the score that a hypothesis must exceed to become a leader
     for number in range(count):
         if samples[number, 0] < 0:
             continue
@@ -488,4 +471,4 @@ def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
         if score > floor:
             remember(leaders, score, tried_before + number + 1, samples[number],
                      poses.rotations[which], poses.translations[which])
-            floor = worst_score(leaders)
+            floor = leaders.scores.min()
