@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from cliploc_ros.core.map.joined_map import JoinedMap, parts_of
+from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_details import WeightedLabels
 from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
@@ -47,8 +47,6 @@ from cliploc_ros.models.protocols import ClipOptions
 
 # Greatest number of crops or labels that are encoded at once; it limits the memory.
 _BATCH = 64
-#: Greatest number of labels encoded, cached and held at once: 134 MB with 512 numbers each.
-PART = 65_536
 _FORMAT = 1
 # A map of 1,000 labels takes 3 MB with ViT-L-14.
 _MOST_FILES = 32
@@ -96,14 +94,12 @@ def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequen
     unique = sorted(set(landmark_map.weighted_labels))
     rows = {description: row for row, description in enumerate(unique)}
     labels = LabelEmbeddings(
-        mixed_rows(unique, partial(_encoded_once, weights, options), weights.embed_dim),
+        mixed_rows(unique, partial(_encoded_once, weights, options)),
         np.array([rows[description] for description in landmark_map.weighted_labels],
                  dtype=np.int64))
     images = None if compare == 'text' else _images_of_all(weights, landmark_map, map_files)
     if images is not None:
         labels = with_images(labels, images, compare)
-    if isinstance(landmark_map, JoinedMap):
-        return labels.in_parts([len(part.landmark_map) for part in landmark_map.parts])
     return labels
 
 
@@ -251,13 +247,14 @@ class LabelCache:
             return None
         try:
             arrays = _SCHEMA.read(file)
+            embeddings = arrays['embeddings']
+            if (bytes(arrays['identity']), embeddings.shape) != (
+                    _identity(key, labels), (len(labels), embed_dim)):
+                raise ModelError('it is for other weights or labels')
         except ModelError as error:
-            return self._ignore(file, error)
-        embeddings = arrays['embeddings']
-        if bytes(arrays['identity']) != _identity(key, labels):
-            return self._ignore(file, 'it is for other weights or labels')
-        if embeddings.shape != (len(labels), embed_dim):
-            return self._ignore(file, 'its embeddings are not of the expected shape')
+            logger.warning('label embeddings in %s cannot be used (%s): encoding the labels again',
+                           file, error)
+            return None
         with contextlib.suppress(OSError):  # a read-only cache works too
             os.utime(file)
         return embeddings
@@ -281,24 +278,18 @@ class LabelCache:
         digest = hashlib.sha256(_identity(key, labels)).hexdigest()
         return self._folder / f'labels-{digest[:32]}.npz'
 
-    @staticmethod
-    def _ignore(file: Path, reason: object) -> None:
-        logger.warning('label embeddings in %s cannot be used (%s): encoding the labels again',
-                       file, reason)
-
 
 def _identity(key: str, labels: Sequence[str]) -> bytes:
     return json.dumps([_FORMAT, key, list(labels)]).encode()
 
 
 def mixed_rows(descriptions: Sequence[WeightedLabels],
-               encode: Callable[[Sequence[str]], NDArray[np.float32]], embed_dim: int
-               ) -> NDArray[np.float32]:
-    """Return the embeddings (R, embed_dim) of R descriptions.
+               encode: Callable[[Sequence[str]], NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Return the embeddings (R, d) of R descriptions.
 
     The embedding of a description is the weighted mean of the embeddings of its labels, scaled to
-    unit length. That of a single label is unchanged. ``encode`` returns the embeddings (m,
-    embed_dim) of m labels, as unit rows. It is called with sorted labels, at most PART at once.
+    unit length. That of a single label is unchanged. ``encode`` returns the embeddings (m, d)
+    of m labels, as unit rows. It is called with all labels, sorted.
     """
     labels = sorted({label for description in descriptions for label, _ in description})
     # the share of each label in each description, a sparse matrix (R, U)
@@ -311,10 +302,7 @@ def mixed_rows(descriptions: Sequence[WeightedLabels],
     weights = csr_matrix(
         (shares, [columns[label] for description in descriptions for label, _ in description],
          ends), shape=(len(descriptions), len(labels)))
-    rows = np.zeros((len(descriptions), embed_dim), dtype=np.float32)
-    for start in range(0, len(labels), PART):
-        part = slice(start, start + PART)
-        rows += weights[:, part] @ encode(labels[part])
+    rows = np.asarray(weights @ encode(labels))
     lengths = np.maximum(np.sqrt(np.einsum('ij,ij->i', rows, rows)), 1e-12)
     rows /= np.where(np.diff(weights.indptr) > 1, lengths, 1.0)[:, None]
     return rows

@@ -58,29 +58,22 @@ def check_weights_file(path: Path) -> None:
 
     Only the head and the end of the file are read; the loader checks the content.
     """
-    if path.is_dir():
-        raise ModelError(f'{path} is a folder: name the file with the weights')
-    if not path.exists():
-        raise ModelError(f'{path} does not exist: check the path of the weights')
     try:
         size = path.stat().st_size
         with open_file(path) as file:
             head = file.read(512)
     except OSError as error:
-        raise ModelError(f'{path} cannot be read: {error.strerror}') from error
-    if not size:
-        raise ModelError(f'{path} is empty: download it again')
+        raise ModelError(f'{path} cannot be read: {error.strerror}; check the path of the weights'
+                         ) from error
     if head.startswith(b'version https://git-lfs'):
         raise ModelError(f"{path} is a pointer of git-lfs, not the weights: run 'git lfs pull'")
-    if head.lstrip().lower().startswith((b'<!doctype', b'<html')):
-        raise ModelError(f'{path} is a web page, not weights: download the file behind it')
     if head.startswith(b'PK') and not zipfile.is_zipfile(path):
         raise damaged(path, 'the end of the archive is missing')
     if path.suffix == '.onnx' and not head.startswith(_ONNX_HEAD):
         raise damaged(path, 'it does not begin like an ONNX file')
     if path.suffix not in ('.onnx', '.safetensors') and not head.startswith(_HEADS):
-        raise ModelError(f'{path} holds no weights: it is not a file of PyTorch, and its name is '
-                         'not that of an ONNX or safetensors file')
+        raise ModelError(f'{path} holds no weights: it is empty or not a file of PyTorch, and its '
+                         'name is not that of an ONNX or safetensors file')
     # The format: eight bytes with the length of a JSON header, the header, the tensors.
     if path.suffix == '.safetensors' and (
             len(head) < 8 or struct.unpack('<Q', head[:8])[0] + 8 > size):

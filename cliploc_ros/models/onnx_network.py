@@ -34,7 +34,6 @@ from cliploc_ros.files.storage import (
 )
 from cliploc_ros.models.files import (
     check_weights_file,
-    damaged,
     fingerprint_file,
     first_line,
     remove_unused,
@@ -102,9 +101,15 @@ class OnnxNetwork:
 
     def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
         check_weights_file(file)
-        import_openvino()
+        openvino = import_openvino()
         self.file = file
-        stored = _stored_path(file, cache_dir, precision)
+        # A compiled network is named by a hash of all that it depends on, including the file of
+        # weights next to a large network.
+        files = sorted(file.parent.glob(f'{glob.escape(file.name)}*'))
+        depends = [_FORMAT, *map(fingerprint_file, files), precision, openvino.get_version(),
+                   openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME')]
+        digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
+        stored = resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}.blob'
         try:
             compiled, self.metadata = _load(stored, precision)
         except Exception as error:  # OpenVINO has no exception classes
@@ -193,17 +198,6 @@ def _settings(precision: str | None) -> dict[str, Any]:
 
 # ---- compiled networks on disk ------------------------------------------------------------------
 
-def _stored_path(file: Path, cache_dir: str, precision: str | None) -> Path:
-    """Return the path of a compiled network, named by a hash of all that it depends on."""
-    openvino = import_openvino()
-    # including the file of weights next to a large network
-    files = sorted(file.parent.glob(f'{glob.escape(file.name)}*'))
-    depends = [_FORMAT, *map(fingerprint_file, files), precision, openvino.get_version(),
-               openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME')]
-    digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
-    return resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}.blob'
-
-
 def _load(stored: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
     """Load a compiled network and its metadata, see _compile; any exception: it is unusable."""
     content = np.memmap(stored, dtype=np.uint8, mode='r')
@@ -229,7 +223,11 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
     try:
         network = core.read_model(file)
     except Exception as error:  # OpenVINO has no exception classes
-        raise _unreadable(file, str(error)) from error
+        # its last lines name the cause, such as a missing file of weights
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        raise ModelError(f'OpenVINO cannot read {file}: {" ".join(lines[-2:])[:300]}; download it '
+                         'again with all its files, update OpenVINO, or export it with an opset '
+                         'of 11 to 21') from error
     about = network.get_rt_info()
     metadata: dict[str, str] = {
         name: str(value.value) for name, value in about['framework'].items()
@@ -260,18 +258,6 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
                       'writable cache_dir')
     free_memory()
     return compiled, metadata
-
-
-def _unreadable(file: Path, reason: str) -> ModelError:
-    if "can't be parsed" in reason:
-        return damaged(file, 'its graph ends too early')
-    if 'externally stored data' in reason:
-        name = reason.partition('(')[2].partition(',')[0]
-        return ModelError(f'the weights of {file} are in a separate file, {name}, which is '
-                          'missing: put it next to the network')
-    lines = [line.strip() for line in reason.splitlines() if line.strip()]
-    return ModelError(f'OpenVINO cannot read {file}: {" ".join(lines[-2:])[:300]}; update '
-                      'OpenVINO, or export the network with an opset of 11 to 21')
 
 
 def _name_of(port: Any) -> str:

@@ -1,6 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The detector node: publishes detections in images, while the detections have a subscriber."""
+"""Publishes the detections of a network in the newest image, while they have a subscriber.
+
+  in    image, image/compressed
+  out   detections, /diagnostics
+
+The network is that of the parameter model, or of profile.
+"""
 
 import threading
 import time
@@ -33,12 +39,6 @@ from cliploc_ros.ros.node.threads import LatestOnly, Worker
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
 
 _LOG_PERIOD_S = 5.0
-ABOUT = """\
-Publishes the detections of a network in the newest image, while they have a subscriber.
-
-  in    image, image/compressed
-  out   detections, /diagnostics
-"""
 
 
 class TimedImage(NamedTuple):
@@ -259,7 +259,7 @@ def detector_options(parameters: DetectorParameters) -> DetectorOptions:
 
 def main() -> NoReturn:
     """Run the node until SIGINT or SIGTERM."""
-    run_node('detector', DetectorNode, ABOUT)
+    run_node('detector', DetectorNode, __doc__)
 
 
 if __name__ == '__main__':

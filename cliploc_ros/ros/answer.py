@@ -179,25 +179,20 @@ class RequestCounters:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._kinds: Counter[RefusalKind] = Counter()
-        self._total_s = self._longest_s = 0.0
 
-    def add(self, answer: Answer, duration_s: float) -> None:
-        """Count a request and add its duration [s]."""
+    def add(self, answer: Answer) -> None:
+        """Count a request."""
         with self._lock:
             self._counts[answer.verdict] += 1
             if answer.kind is not None:
                 self._kinds[answer.kind] += 1
-            self._total_s += duration_s
-            self._longest_s = max(self._longest_s, duration_s)
 
     def values(self) -> dict[str, object]:
         """Return the counts since the start of the node."""
         with self._lock:
             return {'requests': self._counts.total(),
                     **{f'requests {verdict}': self._counts[verdict] for verdict in Verdict},
-                    **{f'refused: {kind}': self._kinds[kind] for kind in RefusalKind},
-                    'requests total [s]': f'{self._total_s:.3f}',
-                    'requests longest [s]': f'{self._longest_s:.3f}'}
+                    **{f'refused: {kind}': self._kinds[kind] for kind in RefusalKind}}
 
 
 class CaseRecorder:

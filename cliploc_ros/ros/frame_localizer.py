@@ -28,7 +28,6 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
 from cliploc_ros.core.map.joined_map import join_maps, parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.similarities import split_similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
@@ -156,12 +155,9 @@ class FrameLocalizer:
             found.accepted and parameters.mode == 'continuous'
             and time.monotonic() < deadline) else found.covariance
         found, own = in_its_map(self.instants.explained(found), self.landmark_map)
-        parts = parts_of(self.landmark_map)
-        if seen.similarities is not None and len(parts) > 1:
-            pieces = split_similarities(seen.similarities, [len(part.landmark_map)
-                                                            for part in parts])
-            which = [part.first for part in parts].index(own.first)
-            seen = replace(seen, similarities=pieces[which])
+        if seen.similarities is not None and len(self.frame_ids) > 1:
+            seen = replace(seen, similarities=np.asarray(seen.similarities)[
+                :, own.first:own.first + len(own.landmark_map)])
         names = [camera_frame.camera_name for camera_frame in query.frames]
         layer = None if self.keyframes is None else self.keyframes.localizer.layer
         return Localized(

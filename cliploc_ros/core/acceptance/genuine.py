@@ -129,7 +129,8 @@ def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera,
 
 def chance_genuine(signs: Signs, motion: Motion | None = None) -> float:
     """Return the probability that a place is genuine and unchanged."""
-    odds = _TERMS.none + sum(getattr(_TERMS, name) * sign for name, sign in signs._asdict().items())
+    odds = _TERMS.none + sum(getattr(_TERMS, name) * sign
+                             for name, sign in signs._asdict().items())
     if motion is not None:
         odds -= 0.5 * max(0.0, motion.square - SURE_MOTION)
         if motion.square < SURE_MOTION:

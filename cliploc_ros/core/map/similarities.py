@@ -8,7 +8,6 @@ map take 4 U d + 8 L bytes, for U different labels of d dimensions and L landmar
 with 12 crops takes another .1 MB for each 1,000 labels.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -30,8 +29,6 @@ class LabelEmbeddings:
     unique: NDArray[np.float32]
     #: (L,): row of each landmark's label. Every row belongs to at least one landmark.
     of_landmarks: NDArray[np.int64]
-    #: Embeddings of each of several maps, see in_parts; empty for a single map
-    parts: tuple['LabelEmbeddings', ...] = ()
 
     @staticmethod
     def of(embeddings: 'LabelEmbeddings | NDArray[np.float32]') -> 'LabelEmbeddings':
@@ -39,22 +36,6 @@ class LabelEmbeddings:
         if isinstance(embeddings, LabelEmbeddings):
             return embeddings
         return LabelEmbeddings(embeddings, np.arange(len(embeddings)))
-
-    def in_parts(self, sizes: Sequence[int]) -> 'LabelEmbeddings':
-        """Return the embeddings with separate rows for each of several maps.
-
-        A label that two maps share is stored twice.
-        """
-        pieces = [np.unique(of_part, return_inverse=True)
-                  for of_part in np.split(self.of_landmarks, np.cumsum(sizes)[:-1])]
-        ends = np.cumsum([len(rows) for rows, _ in pieces])
-        starts = [0, *ends[:-1].tolist()]
-        unique = self.unique[np.concatenate([rows for rows, _ in pieces])]
-        return LabelEmbeddings(
-            unique,
-            np.concatenate([own + start for start, (_, own) in zip(starts, pieces, strict=True)]),
-            tuple(LabelEmbeddings(unique[start:end], own) for start, end, (_, own)
-                  in zip(starts, ends, pieces, strict=True)))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -97,23 +78,7 @@ class CropSimilarities:
 Similarities = NDArray[np.float32] | CropSimilarities
 
 
-def split_similarities(similarities: Similarities, sizes: Sequence[int]) -> list[Similarities]:
-    """Split similarities into those to the landmarks of each map.
-
-    Parameters
-    ----------
-    similarities : ndarray (n, L) or CropSimilarities
-    sizes : sequence of M int
-        Number of landmarks of each map, in order; L in total.
-    """
-    if not isinstance(similarities, CropSimilarities):
-        return [*np.split(similarities, np.cumsum(sizes)[:-1], axis=1)]
-    labels = similarities.labels
-    parts = labels.parts or labels.in_parts(sizes).parts
-    return [CropSimilarities(similarities.crops, part) for part in parts]
-
-
-def nearest_landmarks(similarities: Similarities, k: int
+def nearest_landmarks(similarities: Similarities, k: int, rows: slice = slice(None)
                       ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return the k landmarks (n, k) most similar to each crop, best first, and their similarities.
 
@@ -122,6 +87,8 @@ def nearest_landmarks(similarities: Similarities, k: int
     Parameters
     ----------
     similarities : ndarray (n, L) or CropSimilarities
+    rows : slice
+        The landmarks of one of several maps: only they are compared, and counted from the first.
 
     Raises
     ------
@@ -130,9 +97,13 @@ def nearest_landmarks(similarities: Similarities, k: int
     """
     if isinstance(similarities, CropSimilarities):
         alike = similarities.crops @ similarities.labels.unique.T
-        columns = similarities.labels.of_landmarks
+        columns = similarities.labels.of_landmarks[rows]
+        if len(columns) < similarities.shape[1]:
+            own, columns = np.unique(columns, return_inverse=True)
+            alike = alike[:, own]
     else:
-        alike, columns = similarities, np.arange(similarities.shape[1])
+        alike = similarities[:, rows]
+        columns = np.arange(alike.shape[1])
     if not np.isfinite(alike).all():
         raise OptionsError('similarities contain values that are not finite')
     # sort only the landmarks that are among the best of some crop

@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.depth import depth_deviations
 from cliploc_ros.core.map.culling import FEW, SortedLandmarks
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
-from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks, split_similarities
+from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import Deadline, RelocalizerOptions
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Constraint, Scene, make_scene
@@ -104,13 +104,14 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int |
     return Candidates(pairs[:, 0], pairs[:, 1], zeros.astype(np.int64), zeros)
 
 
-def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
+def nearest_candidates(similarities: Similarities, k: int, rows: slice = slice(None)
+                       ) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
 
-    The map has at least k landmarks.
+    They are among `rows`, at least k landmarks; see nearest_landmarks.
     """
     detection_count, _ = similarities.shape
-    landmarks, values = nearest_landmarks(similarities, k)
+    landmarks, values = nearest_landmarks(similarities, k, rows)
     return Candidates(np.repeat(np.arange(detection_count), k), landmarks.ravel(),
                       np.tile(np.arange(k), detection_count), values.ravel().astype(np.float64))
 
@@ -224,13 +225,11 @@ def _nearest(landmark_map: LandmarkMap, observation: Observation, options: Reloc
         found = 'none' if similarities is None else f'{similarities.shape}'
         raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
                            f'{shape}, found {found}')
-    parts = parts_of(landmark_map)
-    sizes = [len(part.landmark_map) for part in parts]
     # k landmarks from each map, so that the labels of one map do not hide rivals in other maps
     nearest = concatenated([
-        nearest_candidates(of_part, min(options.k, size)).moved(part.first)
-        for part, size, of_part in zip(parts, sizes, split_similarities(similarities, sizes),
-                                       strict=True)])
+        nearest_candidates(similarities, min(options.k, len(part.landmark_map)), slice(
+            part.first, part.first + len(part.landmark_map))).moved(part.first)
+        for part in parts_of(landmark_map)])
     nearest = nearest._replace(detections=compared[nearest.detections])
     return nearest.select(sound[nearest.detections])
 

@@ -110,8 +110,9 @@ class FrameSource:
                        'depth_camera_info': 'depth_camera_info'}
         #: The relative names of the topics
         self.topics = {name: of_camera(camera, topic) for name, topic in topics.items()}
-        #: The newest message of each topic and its arrival (monotonic clock) [s]
-        self.heard: dict[str, tuple[Any, float]] = {}
+        # Arrival of the newest message of each topic (monotonic clock) [s].
+        self._heard_at: dict[str, float] = {}
+        self._depth_camera: CameraInfo | None = None
         #: Delay of the newest image after its stamp, and the delay closest to 0 of all images [s]
         self.lag_s, self.nearest_lag_s = math.nan, math.inf
         self._depth_tolerance_ns = round(parameters.depth_tolerance_s * NS_PER_S)
@@ -206,7 +207,7 @@ class FrameSource:
         now = time.monotonic()
         with self._changed:
             for name in self.topics.keys() - {'depth_camera_info'}:
-                silent_s = now - max(self._heard_at(name), self._subscribed_at)
+                silent_s = now - max(self._heard_at.get(name, 0.0), self._subscribed_at)
                 nobody = not self._node.count_publishers(self._resolved(name))
                 if nobody or (self._subscriptions and silent_s > stale_after_s):
                     # Without camera_info no pose is possible; images and detections may pause.
@@ -258,8 +259,6 @@ class FrameSource:
         self._depths.clear()
         self._unsure = self._static_info = None
         self._arrived_at = (-math.inf, -math.inf)
-        self.heard |= {name: (None, self._heard_at(name))  # images are large
-                       for name in self.heard.keys() & {'image', 'depth'}}
 
     def _receive(self, name: str, msg: Any) -> None:
         """Store a message, and call on_frame with the frame that it completes."""
@@ -268,12 +267,13 @@ class FrameSource:
                 return
             if name == 'detections':
                 msg = self._converted(msg)
-            self.heard[name] = msg, time.monotonic()
-            frame = None
+            self._heard_at[name], frame = time.monotonic(), None
             if name == 'depth':
                 self._keep_depth(msg)
-            elif name != 'depth_camera_info':
-                frame = self._completed(name, *self.heard[name])
+            elif name == 'depth_camera_info':
+                self._depth_camera = msg
+            else:
+                frame = self._completed(name, msg, self._heard_at[name])
         if frame is not None:
             self._on_frame(frame)
 
@@ -315,8 +315,7 @@ class FrameSource:
                     (depth for depth in self._depths
                      if abs(stamp_ns(depth.header.stamp) - at_ns) <= self._depth_tolerance_ns),
                     key=lambda depth: abs(stamp_ns(depth.header.stamp) - at_ns), default=None),
-                self.heard.get('depth_camera_info', (None, 0.0))[0], self._camera,
-                image_topic=self._resolved('image'))
+                self._depth_camera, self._camera, image_topic=self._resolved('image'))
         frame = self._unsure
         # the next images may have the same stamp; wait until stamps are known to differ
         if frame is None or not (self._stamps['image'].are_own or all(
@@ -348,7 +347,7 @@ class FrameSource:
     def why_none(self, since: float) -> str:
         """Return why no frame was completed since a time (monotonic clock)."""
         if problems := [self._silence(name) for name in self.topics if name not in _OF_DEPTH
-                        and self._heard_at(name) < since] or self._stamp_problems():
+                        and self._heard_at.get(name, -math.inf) < since] or self._stamp_problems():
             return '; '.join(problems)
         if self._unsure is not None:
             return (f'too few images on {self._resolved("image")} to check that their stamps '
@@ -379,6 +378,3 @@ class FrameSource:
 
     def _resolved(self, name: str) -> str:
         return str(self._node.resolve_topic_name(self.topics[name]))
-
-    def _heard_at(self, name: str) -> float:
-        return self.heard.get(name, (None, -math.inf))[1]

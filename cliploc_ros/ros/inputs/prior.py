@@ -45,8 +45,7 @@ class PriorSource:
     def __init__(self, node: ManagedNode[RelocalizerParameters], transforms: CoordinateFrames
                  ) -> None:
         self._node, self._transforms = node, transforms
-        # The last message, and the same if it is valid.
-        self._heard: PoseWithCovarianceStamped | None = None
+        # The last message.
         self._told: PoseWithCovarianceStamped | None = None
         # The last pose of the previous run and the hash of its map, until a pose is accepted.
         self._last: tuple[PoseWithCovarianceStamped, str] | None = None
@@ -75,16 +74,7 @@ class PriorSource:
 
     def hear(self, msg: PoseWithCovarianceStamped) -> None:
         """Use a message as prior. An empty frame_id withdraws the prior."""
-        if msg == self._heard:  # the other subscription delivered it already
-            return
-        self._heard, self._told = msg, None
-        if not msg.header.frame_id:
-            return
-        try:
-            planar_of(msg)
-            self._told = msg
-        except CliplocError as error:
-            self._node.get_logger().warning(f'localizing without a prior: ~/prior: {error}')
+        self._told = msg if msg.header.frame_id else None
 
     def region(self, stamp: Time, parameters: RelocalizerParameters,
                camera_from_base: NDArray[np.float64], frame_ids: Sequence[str], map_hash: str

@@ -157,7 +157,16 @@ class VerticalSource(qos.Listener):
             return None
         if parameters.gravity == 'base_frame':
             return np.asarray(camera_from_base[:3, :3] @ _UP)
-        up_in_imu, imu_frame = self._up_in_imu(stamp_ns(stamp))
+        with self._lock:
+            imu_frame, samples = self._imu_frame, list(self._samples)
+        at_ns, topic = stamp_ns(stamp), self._node.resolve_topic_name('imu')
+        near = [sample for sample in samples if abs(sample.stamp_ns - at_ns) <= WINDOW_NS]
+        if not near:
+            raise NoVerticalError(self.problem or f'no message on {topic} within '
+                                  f'{WINDOW_NS // 1_000_000} ms of the image')
+        if not imu_frame:
+            raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: set it')
+        up_in_imu = mean_up(near, samples, topic)
         if imu_frame == camera_frame:
             return up_in_imu
         camera_from_imu = camera_from_base if imu_frame == parameters.base_frame else \
@@ -165,18 +174,6 @@ class VerticalSource(qos.Listener):
                                               parameters.tf_timeout_s)
         return np.asarray(camera_from_imu[:3, :3] @ up_in_imu)
 
-    def _up_in_imu(self, at_ns: int) -> tuple[NDArray[np.float64], str]:
-        """Return the mean vertical around an instant, and its coordinate frame."""
-        with self._lock:
-            frame, samples = self._imu_frame, list(self._samples)
-        near = [sample for sample in samples if abs(sample.stamp_ns - at_ns) <= WINDOW_NS]
-        topic = self._node.resolve_topic_name('imu')
-        if not near:
-            raise NoVerticalError(self.problem or f'no message on {topic} within '
-                                  f'{WINDOW_NS // 1_000_000} ms of the image')
-        if not frame:
-            raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: set it')
-        return mean_up(near, samples, topic), frame
 
 
 def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
