@@ -35,7 +35,7 @@ from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.arrays import Check, Field, Schema
 from cliploc_ros.files.storage import replace_file, resolve_cache_dir, warn_not_kept
 from cliploc_ros.models.files import remove_unused
-from cliploc_ros.models.images import check_image_rgb, crop_bounds
+from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.onnx_clip import (
     ClipWeights,
     OnnxTextTower,
@@ -179,10 +179,9 @@ class ClipEncoder:
         The boxes (n, 4) are left, top, right, bottom [px]. A crop contains all pixels that its box
         touches, see `crop_bounds`.
 
-        ImageError: the image has another shape or type, or no pixels. CliplocError: a box is not
-        finite, empty or outside the image. ModelError: embeddings are not finite.
+        CliplocError: a box is not finite, empty or outside the image. ModelError: embeddings are
+        not finite.
         """
-        check_image_rgb(image_rgb)
         bounds = crop_bounds(bboxes_xyxy, image_rgb.shape[1], image_rgb.shape[0])
         features = []
         for start in range(0, len(bounds), _BATCH):

@@ -1,22 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check images, and compute the crops that an encoder sees."""
+"""Compute the crops that an encoder sees."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.errors import CliplocError, ImageError
-
-
-def check_image_rgb(image_rgb: NDArray[np.uint8]) -> None:
-    """Raise an ImageError unless the image is (h, w, 3) uint8 with at least one pixel."""
-    if not isinstance(image_rgb, np.ndarray):
-        raise ImageError(f'an image must be a NumPy array, not {type(image_rgb).__name__}')
-    if image_rgb.ndim != 3 or image_rgb.shape[2] != 3 or image_rgb.dtype != np.uint8:
-        raise ImageError(f'an image must have shape (h, w, 3) and type uint8, not '
-                         f'{image_rgb.shape} and {image_rgb.dtype}')
-    if image_rgb.size == 0:
-        raise ImageError(f'the image has no pixels: its shape is {image_rgb.shape}')
+from cliploc_ros.errors import CliplocError
 
 
 def crop_bounds(bboxes_xyxy: NDArray[np.float64], width: int, height: int

@@ -26,7 +26,6 @@ from cliploc_ros.models.files import (
     is_hub_name,
     resolve_folder,
 )
-from cliploc_ros.models.images import check_image_rgb
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 
@@ -81,10 +80,7 @@ class OnnxDetector:
 
         Weak queries, and several texts of a class, give duplicate boxes of an object. They are
         removed, see ``iou``.
-
-        ImageError: the image has another shape or type, or no pixels.
         """
-        check_image_rgb(image_rgb)
         names = self._head.names
         rows = self._head.find(np.ascontiguousarray(image_rgb), self._options)
         numbers = np.array([self.class_names.index(names[int(row)]) for row in rows[:, 5]],

@@ -13,7 +13,6 @@ import atexit
 import logging
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -44,16 +43,12 @@ _LEAST_STRIDE = 32
 _EMBED_DIM = 512
 _TOWERS = {'mobileclip:blt': 'mobileclip_blt.ts', 'mobileclip2:b': 'mobileclip2_b.ts'}
 
-logger = logging.getLogger(__name__)
-
 
 @cache
 def import_ultralytics() -> Any:
     """Import ultralytics without network requests, installations and files in the home."""
     import torch  # noqa: F401  before ultralytics, which sets OMP_NUM_THREADS to 1
 
-    if 'ultralytics' in sys.modules:
-        logger.warning('ultralytics was imported before the detector: it may use the network')
     folder = tempfile.mkdtemp(prefix='cliploc_ros_ultralytics_')
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     threads = os.environ.get('OMP_NUM_THREADS')
