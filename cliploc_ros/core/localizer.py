@@ -216,18 +216,14 @@ class Localizer:
         self.depth_scale = DepthScale()
         self.cameras = CameraCheck()
 
-    def successor(self, relocalizer: Relocalizer) -> 'Localizer':
-        """Return a localizer with other options on the same map, which keeps the evidence.
+    def use(self, relocalizer: Relocalizer) -> None:
+        """Continue with a relocalizer with other options on the same map.
 
         Looks, cameras, depth scale and filter are kept. Instants are not, because they were
-        searched with these options. On another map, use a new localizer: cameras and depths were
-        compared with this map.
+        searched with the former options. On another map, use a new localizer: cameras and depths
+        were compared with this map.
         """
-        next_one = Localizer(relocalizer, self._keyframes)
-        next_one._looks, next_one._filter = self._looks, self._filter
-        next_one._run, next_one._stamp_ns = self._run, self._stamp_ns
-        next_one.depth_scale, next_one.cameras = self.depth_scale, self.cameras
-        return next_one
+        self._relocalizer, self._instants = relocalizer, []
 
     def answer(self, query: Query, crops: CropSource | None = None, deadline: float = math.inf,
                begin_stage: Callable[[str], None] = lambda stage: None) -> Relocalization:

@@ -33,7 +33,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.arrays import Check, Field, Schema
-from cliploc_ros.files.storage import replace_file, resolve_cache_dir, warn_not_kept
+from cliploc_ros.files.storage import MAKE_ROOM, replace_file, resolve_cache_dir, warn_not_kept
 from cliploc_ros.models.files import remove_unused
 from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.onnx_clip import (
@@ -269,9 +269,8 @@ class LabelCache:
                 np.savez(partial, embeddings=embeddings,
                          identity=np.frombuffer(_identity(key, labels), dtype=np.uint8))
         except OSError as error:
-            warn_not_kept('label embeddings are not cached and the next start is slow again: '
-                          f'cannot write {file} ({error.strerror or error}); make room, or '
-                          'choose a writable cache_dir')
+            warn_not_kept(f'label embeddings are not cached: cannot write {file} '
+                          f'({error.strerror or error}); {MAKE_ROOM} (cache_dir)')
 
     def _file(self, key: str, labels: Sequence[str]) -> Path:
         digest = hashlib.sha256(_identity(key, labels)).hexdigest()

@@ -226,9 +226,8 @@ class DetrHead:
                              f'shortest_edge: {size}')
         if ANY not in fixed:
             if 'height' in size and (size['height'], size['width']) != fixed:
-                raise ModelError(f'{file} has an image size of {size["height"]} x '
-                                 f'{size["width"]}, but {network.file} takes {fixed[0]} x '
-                                 f'{fixed[1]}: they are not from the same network')
+                raise ModelError(f'{file} has the size {size}, but {network.file} takes '
+                                 f'{fixed[0]} x {fixed[1]}: they are not from the same network')
             size = {'height': fixed[0], 'width': fixed[1]}
         self._size: dict[str, int] = size
         self._scale = np.float32(about.get('rescale_factor', 1 / 255)

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import (
+    MAKE_ROOM,
     parse_json,
     read_file,
     replace_file,
@@ -136,9 +137,8 @@ class OnnxNetwork:
             raise ModelError(f'{self.file} takes no single colour image: its inputs are '
                              f'{self.described_inputs()}, expected (1, 3, height, width)')
         if images[0].type not in (np.float32, np.float16):
-            raise ModelError(f'{self.file} takes images that are not floating-point numbers '
-                             f'({self.described_inputs()}), so their scale is unknown: export it '
-                             'with inputs in fp32')
+            raise ModelError(f'{self.file} takes images of integers, whose scale is unknown '
+                             f'({self.described_inputs()}): export it with inputs in fp32')
         return images[0]
 
     def described_inputs(self) -> str:
@@ -253,9 +253,8 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
         # Loaded from the file, so that the weights are in memory once, and the file is checked.
         compiled, _ = _load(stored, precision)
     except Exception as error:  # OpenVINO's errors for a full disk and a bad network are the same
-        warn_not_kept('the compiled network is not cached and the next start is slow again: '
-                      f'cannot write {stored} ({first_line(error)}); make room, or choose a '
-                      'writable cache_dir')
+        warn_not_kept(f'the compiled network is not cached: cannot write {stored} '
+                      f'({first_line(error)}); {MAKE_ROOM} (cache_dir)')
     free_memory()
     return compiled, metadata
 

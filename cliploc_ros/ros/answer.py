@@ -271,9 +271,8 @@ class CaseRecorder:
                 with suppress(FileNotFoundError):  # moved away meanwhile
                     used += (parent / name).stat().st_size
         if used + size > limit_mb * _MIB:
-            raise DatasetError(f'{folder} holds {used // _MIB} MiB and this case needs '
-                               f'{max(1, size // _MIB)} MiB, but record_limit_mb is {limit_mb}: '
-                               'move recordings away, or raise record_limit_mb')
+            raise DatasetError(f'{folder} holds {used // _MIB} of record_limit_mb {limit_mb} and '
+                               f'needs {max(1, size // _MIB)} more: move recordings, or raise it')
         now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]
         path = folder / f'case_{now}_{last.verdict}.npz'
         CASE.write(path, arrays, compress=True)

@@ -570,16 +570,16 @@ def test_a_changed_option_keeps_the_evidence(session):
     for number in range(4):
         drive(session, number, 3.0 * number, objects=3)
     session.depth_scale.add(DepthCheck(1, 0.0, 0.0, 2.0))
-    same = session.successor(Relocalizer(ROOM, RelocalizerOptions(matching='class', k=3)))
-    assert (same.cameras, same.depth_scale) == (session.cameras, session.depth_scale)
-    found = drive(same, 5.0, 12.0)
+    session.use(Relocalizer(ROOM, RelocalizerOptions(matching='class', k=3)))
+    assert session.depth_scale._ratios
+    found = drive(session, 5.0, 12.0)
     assert 'last 5 frames' in found.reason
-    found = drive(same, 4.0, 12.0)
+    found = drive(session, 4.0, 12.0)
     assert found.accepted, 'time went back'
-    same.covariance_for_filter(found)
-    again = same.successor(RELOCALIZER)
-    found = drive(again, 5.0, 12.0)
-    assert (np.diag(again.covariance_for_filter(found)) > np.diag(found.covariance)).all()
+    session.covariance_for_filter(found)
+    session.use(RELOCALIZER)
+    found = drive(session, 5.0, 12.0)
+    assert (np.diag(session.covariance_for_filter(found)) > np.diag(found.covariance)).all()
 
 
 def test_a_search_of_keyframes_that_time_cuts_off_is_named_and_repeated():

@@ -196,7 +196,7 @@ def refusal(load, model) -> str:
     (YOLO, {'names': 'what('}, {}, 'class names in its metadata cannot be read'),
     (YOLO, {'names': "{0: 'mug', 2: 'box'}"}, {}, 'with the keys 0, 1'),
     ({'output0': np.zeros((1, 9, 84), np.float32)}, TWO, {}, r'of 2 classes: .*\(9, 84\)'),
-    (YOLO, TWO, {'kind': TensorProto.UINT8}, 'not floating-point numbers'),
+    (YOLO, TWO, {'kind': TensorProto.UINT8}, 'images of integers'),
     (YOLO, TWO, {'shape': (4, 3, 64, 64)}, 'takes no single colour image'),
     (YOLO, TWO, {'shape': (1, 1, 64, 64)}, 'takes no single colour image'),
     (DETR, {}, {}, 'config.json is missing')])

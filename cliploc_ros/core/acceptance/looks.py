@@ -59,10 +59,6 @@ class Looks:
     past: tuple[Look, ...] = ()  #: The looks since the last accepted pose
     recognized: tuple[Look, ...] = ()  #: The last looks by keyframes, accepted or not
 
-    def __len__(self) -> int:
-        """Return the number of looks."""
-        return len(self.past)
-
     def with_look(self, look: Look, accepted: bool = False) -> 'Looks':
         """Return these looks and a new one; looks at the same or a later stamp are dropped.
 

@@ -359,26 +359,20 @@ def linearize_rig(inliers, rotation, translation, residuals):
             for row in range(3):
                 lever[axis] += (rotation[row, axis] * translation[row]
                                 - own_rotation[row, axis] * own_translation[row])
-        _move_to_reference(lever, own_information, own_gradient)
+        for axis in range(3):  # the reference turns about this axis: w x l = -[l] w
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            own_gradient[3 + axis] += lever[i] * own_gradient[j] - lever[j] * own_gradient[i]
+            for row in range(6):
+                own_information[row, 3 + axis] += (lever[i] * own_information[row, j]
+                                                   - lever[j] * own_information[row, i])
+        for axis in range(3):
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            for column in range(6):
+                own_information[3 + axis, column] += (lever[i] * own_information[j, column]
+                                                      - lever[j] * own_information[i, column])
         gradient += own_gradient
         information += own_information
     return information, gradient
-
-
-@compiled
-def _move_to_reference(lever, information, gradient):
-    """Transform a camera's information and gradient to steps of the reference camera, in place."""
-    for axis in range(3):  # the reference turns about this axis: w x l = -[l] w
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        gradient[3 + axis] += lever[i] * gradient[j] - lever[j] * gradient[i]
-        for row in range(6):
-            information[row, 3 + axis] += (lever[i] * information[row, j]
-                                           - lever[j] * information[row, i])
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        for column in range(6):
-            information[3 + axis, column] += (lever[i] * information[j, column]
-                                              - lever[j] * information[i, column])
 
 
 @compiled

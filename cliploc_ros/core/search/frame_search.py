@@ -177,19 +177,15 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
 
 def _depths(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64] | None:
     """Return the depths of a scene (n, 2), or None: the paper's algorithms do not use depths."""
-    depths, deviations = observation.depths, observation.depth_deviations
+    depths = observation.depths
     if depths is None or options.algorithm != 'auto':
         return None
-    if deviations is None:
-        deviations = depth_deviations(depths)
-    for name, values in (('depths', depths), ('depth_deviations', deviations)):
-        if values.shape != (len(observation.detections),):
-            raise OptionsError(f'{name} has shape {values.shape}, but there are '
-                               f'{len(observation.detections)} detections')
+    if depths.shape != (len(observation.detections),):
+        raise OptionsError(f'depths has shape {depths.shape}, but there are '
+                           f'{len(observation.detections)} detections')
     with np.errstate(invalid='ignore'):
-        known = ((depths > 0.0) & (depths < _FARTHEST_M)
-                 & (deviations > 0.0) & (deviations < np.inf))
-    return np.where(known[:, None], np.column_stack([depths, deviations]), 0.0)
+        known = (depths > 0.0) & (depths < _FARTHEST_M)
+    return np.where(known[:, None], np.column_stack([depths, depth_deviations(depths)]), 0.0)
 
 
 def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: Candidates | None
@@ -310,7 +306,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
         none = np.empty(0, dtype=np.int64)
         observation = replace(
             observation, detections=observation.detections.select(none), compared=none,
-            similarities=np.empty((0, 0), dtype=np.float32), depths=None, depth_deviations=None)
+            similarities=np.empty((0, 0), dtype=np.float32), depths=None)
     scene, left_out = match_frame(landmark_map, observation, options)
     frame = SearchedFrame(
         observation, scene, vertical_of(observation, options),

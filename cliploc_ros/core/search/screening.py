@@ -164,7 +164,13 @@ def _choose_pose(constraint, sample, size, poses, count, least_iou):
         uppers[which] = -1.0
         if _agrees(constraint, poses, which):
             project(sample.landmarks, ZERO, size, poses, which, outlines, 3 * which)
-            uppers[which] = _sampled_bound(boxes, size, outlines, 3 * which)
+            upper = 0.0  # of the sum of IoUs
+            for row in range(size):
+                if not outlines[3 * which + row, 2] > 0.0:
+                    upper = -1.0
+                    break
+                upper += _outline_bound(boxes, row, outlines, 3 * which + row)
+            uppers[which] = upper
         if uppers[which] >= least_iou:
             visible += 1
             last = which
@@ -197,20 +203,6 @@ def _agrees(constraint, poses, which):
         cosine += up * constraint[axis]
         height -= up * translations[which, axis]
     return constraint[6] <= height <= constraint[7] and cosine >= constraint[8]
-
-
-@compiled
-def _sampled_bound(boxes, size, outlines, first):
-    """Return an upper bound of the sum of IoUs of the sampled pairs.
-
-    -1 if a sampled landmark is not entirely in front of the camera.
-    """
-    upper = 0.0
-    for row in range(size):
-        if not outlines[first + row, 2] > 0.0:
-            return -1.0
-        upper += _outline_bound(boxes, row, outlines, first + row)
-    return upper
 
 
 @compiled

@@ -329,8 +329,16 @@ def remember(leaders, score, iteration, sample, rotation, translation):
     for row in range(scores.shape[0]):
         if scores[row] < 0.0:
             continue
-        if not same_place(rotation, translation, leaders.rotations[row],
-                          leaders.translations[row]):
+        # the trace of the rotation between two poses is 1 + 2 cos(angle)
+        trace, square = 0.0, 0.0
+        for i in range(3):
+            center, other = 0.0, 0.0
+            for j in range(3):
+                trace += rotation[i, j] * leaders.rotations[row, i, j]
+                center -= rotation[j, i] * translation[j]
+                other -= leaders.rotations[row, j, i] * leaders.translations[row, j]
+            square += (center - other) ** 2
+        if not (trace >= _PLACE_TRACE and square <= _PLACE_M * _PLACE_M):
             continue
         if scores[row] >= score - _TIE:
             return
@@ -340,23 +348,6 @@ def remember(leaders, score, iteration, sample, rotation, translation):
         free = scores.argmin()
     scores[free], leaders.iterations[free], leaders.samples[free] = score, iteration, sample
     leaders.rotations[free], leaders.translations[free] = rotation, translation
-
-
-@compiled
-def same_place(rotation_a, translation_a, rotation_b, translation_b):
-    """Check whether two camera_from_map poses are within SAME_PLACE of each other.
-
-    The trace of the rotation between them is 1 + 2 cos(angle).
-    """
-    trace, square = 0.0, 0.0
-    for i in range(3):
-        center_a, center_b = 0.0, 0.0
-        for j in range(3):
-            trace += rotation_a[i, j] * rotation_b[i, j]
-            center_a -= rotation_a[j, i] * translation_a[j]
-            center_b -= rotation_b[j, i] * translation_b[j]
-        square += (center_a - center_b) ** 2
-    return trace >= _PLACE_TRACE and square <= _PLACE_M * _PLACE_M
 
 
 class Progress(NamedTuple):

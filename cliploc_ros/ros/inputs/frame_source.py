@@ -368,9 +368,8 @@ class FrameSource:
         topic = self._resolved(name)
         publishers = self._node.count_publishers(topic)
         if publishers and name == 'detections':
-            return (f'no detections on {topic} from its {publishers} publisher(s): the detector '
-                    'is too slow or has stopped; choose a faster profile or a smaller detector, '
-                    'raise timeout_s, or see its log')
+            return (f'no detections on {topic} from its {publishers} publisher(s): see its log, '
+                    'choose a faster profile or a smaller detector, or raise timeout_s')
         if publishers:
             return (f'no {name} on {topic} from its {publishers} publisher(s): check that it '
                     'publishes, and that its QoS is compatible')

@@ -201,9 +201,8 @@ def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
     contradiction_deg = float(np.degrees(np.median(np.arccos(np.clip(cosines, -1.0, 1.0)))))
     if contradiction_deg > _MAX_CONTRADICTION_DEG:
         raise NoVerticalError(
-            f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity '
-            f'(limit {_MAX_CONTRADICTION_DEG:g}): correct it, or set '
-            'orientation_covariance[0] to -1')
+            f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity (limit '
+            f'{_MAX_CONTRADICTION_DEG:g}): correct it, or set orientation_covariance[0] to -1')
     mean = np.mean(ups, axis=0)
     length = float(np.linalg.norm(mean))
     if not length > _MIN_MEAN_LENGTH:
@@ -323,7 +322,18 @@ class RobotStateSource:
 
         NoTransformError: the mount is unknown.
         """
-        camera_from_base = self._mount(image, parameters, deadline)
+        begun_s, wait_s, camera_from_base = time.monotonic(), parameters.tf_timeout_s, None
+        until = begun_s + wait_s if math.isinf(deadline) else 0.5 * (begun_s + deadline)
+        while camera_from_base is None:
+            try:
+                camera_from_base = self.transforms.camera_from_base(
+                    parameters.base_frame, parameters.base_from_camera, image.frame_id,
+                    image.stamp, min(wait_s, max(0.0, until - time.monotonic())))
+            except NoTransformError:
+                if time.monotonic() + _RETRY_S > until:
+                    raise
+                self._node.check_active()
+                time.sleep(_RETRY_S)
         up_in_camera = None
         try:
             up_in_camera = self.vertical.up_in_camera(parameters, camera_from_base,
@@ -337,23 +347,6 @@ class RobotStateSource:
                 camera_from_depth = self._lookup(image, depth_frame, parameters)
         return RobotState(camera_from_base, up_in_camera,
                           self._place(image, parameters, camera_from_base), camera_from_depth)
-
-    def _mount(self, image: Header, parameters: RelocalizerParameters, deadline: float
-               ) -> NDArray[np.float64]:
-        now = time.monotonic()
-        slice_s = parameters.tf_timeout_s
-        until = now + slice_s if math.isinf(deadline) else 0.5 * (now + deadline)
-        while True:
-            wait_s = min(slice_s, max(0.0, until - time.monotonic()))
-            try:
-                return self.transforms.camera_from_base(
-                    parameters.base_frame, parameters.base_from_camera, image.frame_id,
-                    image.stamp, wait_s)
-            except NoTransformError:
-                if time.monotonic() + _RETRY_S > until:
-                    raise
-                self._node.check_active()
-                time.sleep(_RETRY_S)
 
     def _place(self, image: Header, parameters: RelocalizerParameters,
                camera_from_base: NDArray[np.float64]) -> OdometryPlace | None:
