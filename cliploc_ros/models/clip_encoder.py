@@ -35,7 +35,7 @@ from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.arrays import Check, Field, Schema
 from cliploc_ros.files.storage import MAKE_ROOM, replace_file, resolve_cache_dir, warn_not_kept
 from cliploc_ros.models.files import remove_unused
-from cliploc_ros.models.images import crop_bounds
+from cliploc_ros.models.observer import crop_bounds
 from cliploc_ros.models.onnx_clip import (
     ClipWeights,
     OnnxTextTower,

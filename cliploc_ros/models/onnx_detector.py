@@ -140,7 +140,7 @@ class YoloHead:
         self._stride = int(about['stride']) if about.get('stride', '').isdecimal() else _STRIDE
         height, width = self._input.shape[2:]
         self._size = None if ANY in (height, width) else (height, width)
-        self._layout = self._layout_of(self._run(np.zeros((1, 3, *(
+        self._is_end2end = self._removes_doubles(self._run(np.zeros((1, 3, *(
             self._size or (2 * self._stride,) * 2)))))
 
     def _run(self, pixels: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -154,24 +154,21 @@ class YoloHead:
                 f"shape (1, boxes, classes), or '{_LOGITS}' and '{_BOXES}'")
         return boxes[0][0]
 
-    def _layout_of(self, output: NDArray[np.float32]) -> str:
-        """Return the layout of an output by its shape; see ``find``."""
-        count, file = len(self.names), self._network.file
-        # the export of YOLOv5 has no task, but a column for the confidence in any object
-        if 'task' not in self._network.metadata and output.shape[1] == 5 + count:
-            return 'objectness'
-        if output.shape[1] == 6 and output.shape[0] != 4 + count:
-            return 'selected'
+    def _removes_doubles(self, output: NDArray[np.float32]) -> bool:
+        """Return whether the network removes duplicates itself, by an output; see select_boxes."""
+        count, task = len(self.names), self._network.metadata.get('task')
         if output.shape[0] == 4 + count:
-            return 'classes'
-        # YOLOE's masks follow the classes
-        if self._network.metadata.get('task') == 'segment':
-            if self._network.metadata.get('end2end') == 'True' and output.shape[1] > 6:
-                return 'selected'
+            return False
+        if task and output.shape[1] == _END2END:  # without a task: YOLOv5, with other columns
+            return True
+        if task == 'segment':  # YOLOE's masks follow the classes
+            if self._network.metadata.get('end2end') == 'True' and output.shape[1] > _END2END:
+                return True
             if output.shape[0] > 4 + count:
-                return 'classes'
-        raise ModelError(f'{file} is not a detector of {count} classes: its output has the shape '
-                         f'{output.shape}, expected ({4 + count}, boxes) or (boxes, 6)')
+                return False
+        raise ModelError(f'{self._network.file} is not a detector of {count} classes: its output '
+                         f'has the shape {output.shape}, expected ({4 + count}, boxes) or '
+                         '(boxes, 6)')
 
     def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
         """Return the boxes (n, 6) in an image: left, top, right, bottom, score, class.
@@ -193,12 +190,9 @@ class YoloHead:
                                     cv2.BORDER_CONSTANT, value=_GREY)
         output = self._run(np.ascontiguousarray(filled.transpose(2, 0, 1)[None], np.float32)
                            / np.float32(255))
-        if self._layout == 'objectness':
-            output = np.hstack([output[:, :4], output[:, 4:5] * output[:, 5:]]).T
-        elif self._layout == 'classes':
+        if not self._is_end2end:
             output = output[:4 + len(self.names)]
-        rows = select_boxes(output, options.conf, options.iou, options.max_det,
-                            self._layout == 'selected')
+        rows = select_boxes(output, options.conf, options.iou, options.max_det, self._is_end2end)
         ours, theirs, corner = (np.array(pair * 2, dtype=np.float32)
                                 for pair in (scaled, size, (left, top)))
         boxes = np.clip((rows[:, :4] - corner) / (ours / theirs), 0, theirs)

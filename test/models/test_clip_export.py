@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from cliploc_ros.cli.export_network import main as export_network
 from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
-from cliploc_ros.models.images import crop_bounds
+from cliploc_ros.models.observer import crop_bounds
 from cliploc_ros.models.onnx_clip import OnnxTextTower, resolve_clip_weights
 from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions

@@ -34,8 +34,7 @@ from cliploc_ros.models.clip_encoder import (
     mixed_rows,
 )
 from cliploc_ros.models.files import fingerprint_file
-from cliploc_ros.models.images import crop_bounds
-from cliploc_ros.models.observer import Observer
+from cliploc_ros.models.observer import Observer, crop_bounds
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions
 from cliploc_ros.offline.mapping.labelling import embed_phrases

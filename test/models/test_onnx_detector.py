@@ -136,15 +136,6 @@ def test_an_image_is_scaled_into_a_grey_border_and_boxes_back(tmp_path, load, ki
                                                     21 * scale]] * 2, atol=1e-3)
 
 
-def test_the_confidence_in_any_object_of_the_first_yolov5(tmp_path, load):
-    rows = np.array([[[32, 32, 20, 10, 0.9, 0.1, 0.8], [10, 10, 4, 4, 0.05, 0.9, 0.9]]],
-                    np.float32)
-    write_network(tmp_path / 'v5.onnx', {'output0': rows}, {'names': "['mug', 'box']"})
-    found = load(tmp_path / 'v5.onnx', conf=0.2).detect(an_image(64, 64))
-    assert found.class_ids == ('box',) and found.scores == pytest.approx([0.72])
-    np.testing.assert_allclose(found.bboxes_xyxy, [[22, 27, 42, 37]], atol=1e-4)
-
-
 def write_network(file, outputs, metadata=None, kind=TensorProto.FLOAT, shape=(1, 3, 64, 64),
                   opset=17):
     """Write a network with constant outputs for every image."""
