@@ -110,8 +110,7 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
                                float(np.arctan(tangents[of_group].max()))) for of_group in rows],
                        dtype=np.float64)
     # row and group of each landmark whose class is among the shown classes
-    groups = np.full(max(sorted_landmarks.classes.max(initial=0), shown.max(initial=0)) + 1, -1,
-                     dtype=np.int32)
+    groups = np.full(1 + np.append(sorted_landmarks.classes, shown).max(initial=0), -1, np.int32)
     groups[shown] = np.arange(len(shown))
     groups = groups[sorted_landmarks.classes]
     numbers = np.nonzero(groups >= 0)[0]
