@@ -13,7 +13,6 @@ import logging
 import os
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -93,8 +92,12 @@ def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequen
     # Unique and sorted, so that moving or reordering landmarks needs no new embeddings.
     unique = sorted(set(landmark_map.weighted_labels))
     rows = {description: row for row, description in enumerate(unique)}
+
+    def encode(texts: Sequence[str]) -> NDArray[np.float32]:
+        return encoded_once(weights.key, texts, weights.embed_dim, options.cache_dir,
+                            lambda missing: encode_labels(weights, missing, options))
     labels = LabelEmbeddings(
-        mixed_rows(unique, partial(_encoded_once, weights, options)),
+        mixed_rows(unique, encode),
         np.array([rows[description] for description in landmark_map.weighted_labels],
                  dtype=np.int64))
     images = None if compare == 'text' else _images_of_all(weights, landmark_map, map_files)
@@ -143,17 +146,15 @@ def _images(weights: ClipWeights, landmark_map: LandmarkMap, map_file: str
     return images
 
 
-def _encoded_once(weights: ClipWeights, options: ClipOptions, labels: Sequence[str]
-                  ) -> NDArray[np.float32]:
-    """Return the embeddings of labels from the cache, or encode and cache them."""
-    cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
-    embeddings = cache.load(weights.key, labels, weights.embed_dim)
-    source = 'cached'
+def encoded_once(key: str, labels: Sequence[str], embed_dim: int, cache_dir: str,
+                 encode: Callable[[Sequence[str]], NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Return the embeddings of labels from the cache, or encode and cache them; see LabelCache."""
+    cache = LabelCache(resolve_cache_dir(cache_dir) / 'labels')
+    embeddings = cache.load(key, labels, embed_dim)
+    logger.info('%d labels %s', len(labels), 'encoded' if embeddings is None else 'cached')
     if embeddings is None:
-        source = 'encoded'
-        embeddings = encode_labels(weights, labels, options)
-        cache.store(weights.key, labels, embeddings)
-    logger.info('CLIP %s: %d labels %s', weights.model, len(labels), source)
+        embeddings = encode(labels)
+        cache.store(key, labels, embeddings)
     return embeddings
 
 
@@ -263,8 +264,7 @@ class LabelCache:
         file = self._file(key, labels)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            remove_unused(self._folder.glob('labels-*.npz'),
-                          self._folder.glob('.*.labels-*.npz'), self._most_files - 1)
+            remove_unused(self._folder, self._most_files - 1)
             with replace_file(file) as partial:
                 np.savez(partial, embeddings=embeddings,
                          identity=np.frombuffer(_identity(key, labels), dtype=np.uint8))

@@ -12,7 +12,7 @@ import shutil
 import struct
 import time
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -109,16 +109,18 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
         raise ModelError(f'cannot download {what}: {reason}. {remedy}') from error
 
 
-def remove_unused(entries: Iterable[Path], partial: Iterable[Path], most: int) -> None:
-    """Remove the least recently used entries of a cache, and partial files of killed writers."""
+def remove_unused(folder: Path, most: int) -> None:
+    """Remove the least recently used entries of a cache, and hidden files of killed writers."""
     def modified(entry: Path) -> float:
         try:
             return entry.stat().st_mtime
         except OSError:  # another process has removed it
             return -1.0
 
-    stale = [path for path in partial if 0.0 <= modified(path) < time.time() - _STALE_S]
-    for entry in sorted(entries, key=modified, reverse=True)[most:] + stale:
+    entries = sorted(folder.iterdir(), key=modified, reverse=True)
+    unused = [entry for entry in entries if not entry.name.startswith('.')][most:]
+    for entry in unused + [entry for entry in entries if entry.name.startswith('.')
+                           and 0.0 <= modified(entry) < time.time() - _STALE_S]:
         if entry.is_dir():
             shutil.rmtree(entry, ignore_errors=True)
         else:

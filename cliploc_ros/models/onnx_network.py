@@ -247,7 +247,7 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
         for part in parts:
             digest.update(part)
         stored.parent.mkdir(parents=True, exist_ok=True)
-        remove_unused(stored.parent.glob('[!.]*'), stored.parent.glob('.*'), _MOST_NETWORKS - 1)
+        remove_unused(stored.parent, _MOST_NETWORKS - 1)
         with replace_file(stored) as partial, partial.open('wb') as opened:
             opened.writelines((digest.digest(), *parts))
         # Loaded from the file, so that the weights are in memory once, and the file is checked.

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_encoder import LabelCache, encode_labels
+from cliploc_ros.models.clip_encoder import encode_labels, encoded_once
 from cliploc_ros.models.export import OPSET, compare, halve, quiet_export
 from cliploc_ros.models.exports import (
     CHECKPOINT,
@@ -190,12 +190,8 @@ def set_prompts(model: Any, options: DetectorOptions) -> None:
                            'YOLOE with prompts, such as yolov8s-worldv2.pt')
     key, encode = _tower(getattr(network, 'text_model', 'mobileclip:blt') if is_yoloe else 'clip',
                          options)
-    cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
-    rows = cache.load(key, texts, _EMBED_DIM)
-    if rows is None:
-        rows = encode(texts)
-        cache.store(key, texts, rows)
-    embedded = torch.from_numpy(rows)[None]
+    embedded = torch.from_numpy(
+        encoded_once(key, texts, _EMBED_DIM, options.cache_dir, encode))[None]
     if is_yoloe:
         with torch.no_grad():
             network.set_classes(texts, head.get_tpe(embedded))

@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from enum import StrEnum
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -44,7 +43,6 @@ _PHRASES: tuple[tuple[str, tuple[object, ...], str], ...] = (
     ('keyframe search', ('none', 'fast'), '{keyframe search} search of keyframes'),
     ('depth', ('',), '{depth}'), ('cameras', (1,), '{cameras} cameras'),
     ('left out', ('',), 'no image of {left out}'), ('prior', (0.0,), 'prior {prior:.1f}'))
-_LIBRARIES = ('cliploc_ros', 'numpy', 'scipy', 'numba')
 
 
 class Verdict(StrEnum):
@@ -255,15 +253,10 @@ class CaseRecorder:
             make_folder(folder)
         except (CliplocError, RuntimeError) as error:
             raise DatasetError(f'record_folder: {error}') from error
-        versions = {}
-        for name in _LIBRARIES:
-            with suppress(PackageNotFoundError):
-                versions[name] = version(name)
         arrays = case_arrays(Case(tuple(queries), {
             'verdict': last.verdict, 'message': last.message, 'found': found.verdict,
             'reason': found.detail, 'map_hash': found.map_hash,
-            'parameters': asdict(parameters), 'options': asdict(parameters.options()),
-            'versions': versions}))
+            'parameters': asdict(parameters), 'options': asdict(parameters.options())}))
         size, limit_mb, used = sum(array.nbytes for array in arrays.values()), \
             parameters.record_limit_mb, 0
         for parent, _, names in folder.walk():

@@ -553,7 +553,7 @@ def test_looks_by_keyframes_remain_and_the_farthest_is_compared():
     passed, then_from_now = looks.passed(frame(3.0, 0.0, 2.0))
     assert passed.observation.stamp_ns == 10**9 and then_from_now[0, 3] == 5.0
     alone = looks.with_look(Look(replace(frame(4.0), odom_from_camera=None), pose(), 0.8))
-    assert len(alone) == 1 and alone.recognized == ()
+    assert len(alone.past) == 1 and alone.recognized == ()
 
 
 def test_doubts_about_the_camera_count_for_the_view_alone(office_map, office_frames):
