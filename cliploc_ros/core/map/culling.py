@@ -110,7 +110,8 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
                                float(np.arctan(tangents[of_group].max()))) for of_group in rows],
                        dtype=np.float64)
     # row and group of each landmark whose class is among the shown classes
-    groups = np.full(1 + np.append(sorted_landmarks.classes, shown).max(initial=0), -1, np.int32)
+    most = int(np.append(sorted_landmarks.classes, shown).max(initial=0))
+    groups = np.full(1 + most, -1, dtype=np.int32)
     groups[shown] = np.arange(len(shown))
     groups = groups[sorted_landmarks.classes]
     numbers = np.nonzero(groups >= 0)[0]

@@ -98,7 +98,8 @@ def set_up(scene: Scene, constraint: Constraint | None = None) -> Bench:
     sample = Sample(np.empty((3, 3)), np.empty((3, 4)), np.empty((3, 9)),
                     np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS))
     return Bench(candidates, (constraint or Constraint()).as_array(), targets, sample,
-                 Poses.allocate(), _overlaps(targets))
+                 Poses(np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3))),
+                 _overlaps(targets))
 
 
 def _overlaps(targets: Targets) -> Overlaps:
