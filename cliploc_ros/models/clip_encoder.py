@@ -96,10 +96,8 @@ def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequen
     def encode(texts: Sequence[str]) -> NDArray[np.float32]:
         return encoded_once(weights.key, texts, weights.embed_dim, options.cache_dir,
                             lambda missing: encode_labels(weights, missing, options))
-    labels = LabelEmbeddings(
-        mixed_rows(unique, encode),
-        np.array([rows[description] for description in landmark_map.weighted_labels],
-                 dtype=np.int64))
+    labels = LabelEmbeddings(mixed_rows(unique, encode), np.array(
+        [rows[description] for description in landmark_map.weighted_labels], dtype=np.int64))
     images = None if compare == 'text' else _images_of_all(weights, landmark_map, map_files)
     if images is not None:
         labels = with_images(labels, images, compare)

@@ -67,11 +67,6 @@ def check_weights_file(path: Path) -> None:
                          'name is not that of an ONNX or safetensors file')
 
 
-def damaged(path: Path, reason: object) -> ModelError:
-    """Return the error for weights that are truncated or corrupt."""
-    return ModelError(f'{path} is truncated or corrupt ({reason}): download it again')
-
-
 def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path],
              setting: str = 'cache_dir') -> Path:
     """Download a file with a function of a library; ModelError: that fails.

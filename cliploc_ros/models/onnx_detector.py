@@ -59,8 +59,7 @@ class OnnxDetector:
             file = find_network(resolve_folder(options.model, [NETWORKS], BESIDE,
                                                options.cache_dir), options.model, NETWORKS)
         network = OnnxNetwork(file, options.cache_dir)
-        self._head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs)
-                      else YoloHead)(network)
+        self._head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs) else YoloHead)(network)
         #: All classes of the network
         self.class_names = tuple(dict.fromkeys(self._head.names.values()))
         self.configure(options)

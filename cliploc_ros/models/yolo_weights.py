@@ -77,15 +77,13 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
     ModelError: the file is missing, damaged or unknown, or the download fails; the message names
     the option.
     """
-    file = Path(given).expanduser().absolute()
-    if file.exists() or Path(given).name != given:
+    file, folder = Path(given).expanduser().absolute(), resolve_cache_dir(cache_dir) / 'weights'
+    name = given if file.suffix in ('.pt', '.ts') else f'{given}.pt'
+    if not file.exists() and Path(given).name == given:
+        file = folder / name
+    if file.exists() or file.parent != folder:
         check_weights_file(file)
         return file
-    name = given if file.suffix in ('.pt', '.ts') else f'{given}.pt'
-    folder = resolve_cache_dir(cache_dir) / 'weights'
-    if (folder / name).exists():
-        check_weights_file(folder / name)
-        return folder / name
     with needs_pytorch(f'{name}, which is not a local file and not in {folder},'):
         import_ultralytics()
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset

@@ -36,13 +36,12 @@ from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health
-from cliploc_ros.ros.node.lifecycle import ManagedNode, run_node
+from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode, run_node
 from cliploc_ros.ros.node.threads import MAX_REQUESTS, BoundedCallbackGroup, LatestOnly
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
 from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.ros.watch import Watcher
 
-_LOG_PERIOD_S = 5.0
 # Topics, besides those of its cameras, that the diagnostics list for the doctor.
 _OTHER_TOPICS = ('odom', 'imu', 'initialpose', '/tf', '/tf_static')
 
@@ -265,7 +264,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         except CliplocError as error:
             answer = Answer(Verdict.FAILED, str(error))
         self._record(answer)
-        self.get_logger().info(answer.message, throttle_duration_sec=_LOG_PERIOD_S)
+        self.get_logger().info(answer.message, throttle_duration_sec=LOG_PERIOD_S)
 
     def _record(self, answer: Answer) -> None:
         """Publish the answer, and the diagnostics with its verdict."""

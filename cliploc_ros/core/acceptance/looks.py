@@ -110,5 +110,9 @@ class Looks:
         return max(found, key=lambda pair: float(np.linalg.norm(pair[1][:3, 3])), default=None)
 
 
+#: No earlier looks
+NO_LOOKS = Looks()
+
+
 def _before(looks: tuple[Look, ...], observation: Observation) -> tuple[Look, ...]:
     return tuple(look for look in looks if look.observation.stamp_ns < observation.stamp_ns)

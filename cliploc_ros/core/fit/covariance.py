@@ -212,7 +212,12 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
                  np.zeros((6, 6)))
     matched = _sandwich(information, noise)
     # errors common to all objects, which remain if an object is left out
-    common = _calibration_noise(fit.calibrations, instants, camera_deviations)
+    # cameras have the same order at each instant
+    cameras = np.array([list(instants[row + 1:]).count(number)
+                        for row, number in enumerate(instants)])
+    common = np.asarray(sum((_squared(fit.calibrations[cameras == number].sum(axis=0)
+                                      * camera_deviations)
+                             for number in set(cameras.tolist())), np.zeros((6, 6))))
     deviations = np.repeat(shared[fit.numbers], 3, axis=1)
     common += _squared((of_objects * deviations[:, None, :]).sum(axis=0))
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
@@ -338,16 +343,6 @@ def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float6
         noise += _squared(_about(information[beyond].sum(axis=0), cameras,
                                  after if is_before else before) * deviations)
     return noise
-
-
-def _calibration_noise(calibrations: NDArray[np.float64], instants: NDArray[np.int64],
-                       deviations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the part of M (6, 6) that errors of the cameras' calibrations cause."""
-    # cameras have the same order at each instant
-    cameras = np.array([list(instants[row + 1:]).count(number)
-                        for row, number in enumerate(instants)])
-    return np.asarray(sum((_squared(calibrations[cameras == number].sum(axis=0) * deviations)
-                           for number in set(cameras.tolist())), np.zeros((6, 6))))
 
 
 def _about(information: NDArray[np.float64], cameras: NDArray[np.float64], row: int

@@ -217,13 +217,20 @@ class KeyframeLocalizer:
                      ) -> tuple['_Place | None', _Matched]:
         """Find the best pose from a few similar keyframes; return it and all matches with them."""
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
-        chosen = self._choose(ranks, guesses)
+        # similar keyframes, similar ones at other places, and keyframes near the guesses
+        poses, chosen = self.layer.map_from_camera, ranks[:_SIMILAR]
+        others = np.array(ranks[_SIMILAR:_MOST_RANKED], dtype=np.int64)
+        for _ in range(_ELSEWHERE):
+            others = others[~SAME_ANSWER.agreeing(poses[others], poses[chosen]).any(axis=1)]
+            chosen += others[:1].tolist()
+        for guess in guesses:
+            chosen += [keyframe for keyframe in keyframes_near(poses, guess)[:PROPOSED].tolist()
+                       if keyframe not in chosen]
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
         if first is None or first.agreed < _ENOUGH_INLIERS:
             # also match keyframes near the pose, and the next similar keyframes
-            near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
-                                   )[:_MORE].tolist() if first else []
+            near = keyframes_near(poses, first.map_from_camera)[:_MORE].tolist() if first else []
             more = [rank for rank in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
                     if rank not in chosen]
             matched = matched.join(self._match(descriptors, more, deadline))
@@ -233,8 +240,7 @@ class KeyframeLocalizer:
             further = _place(self._match(descriptors[:_STRONGEST], ranks[_SIMILAR + _MORE:][
                 :_FURTHER], deadline), look, _RIVAL_ITERATIONS)
             if further is not None and further.agreed >= _CLEAR:
-                near = keyframes_near(self.layer.map_from_camera, further.map_from_camera
-                                      )[:_MORE].tolist()
+                near = keyframes_near(poses, further.map_from_camera)[:_MORE].tolist()
                 matched = matched.join(self._match(descriptors, near, deadline))
                 first = _place(matched, look)
         return first, matched
@@ -343,20 +349,6 @@ class KeyframeLocalizer:
             tuple(shares.tolist()), look.features.pixels[place.inliers.features],
             place.inliers.rows, place.inliers.points, is_thorough,
             float(_distances(self.layer.map_from_camera[used], pose).min()))
-
-    def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
-        """Choose the keyframes to match: similar keyframes, and keyframes near the guesses."""
-        poses = self.layer.map_from_camera
-        chosen = list(ranks[:_SIMILAR])
-        others = np.array(ranks[_SIMILAR:_MOST_RANKED], dtype=np.int64)
-        for _ in range(_ELSEWHERE):
-            others = others[~SAME_ANSWER.agreeing(poses[others], poses[chosen]).any(axis=1)]
-            chosen += others[:1].tolist()
-        for guess in guesses:
-            near = keyframes_near(poses, guess)
-            chosen += [keyframe for keyframe in near[:PROPOSED].tolist()
-                       if keyframe not in chosen]
-        return chosen
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:

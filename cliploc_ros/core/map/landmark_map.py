@@ -98,11 +98,6 @@ class ClassIndex:
         """Return a mask (n,): the class is some landmark's own class, not only a confusion."""
         return np.asarray((classes >= 0) & (classes <= self.of_landmarks.max(initial=-1)))
 
-    def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
-             ) -> NDArray[np.bool_]:
-        """Return a mask (p,): the landmark is a member of the class; False for classes below 0."""
-        return self.shares(landmarks, classes) > 0.0
-
     def shares(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
                ) -> NDArray[np.float64]:
         """Return the frequency (p,) of a class relative to the landmark's most frequent class.

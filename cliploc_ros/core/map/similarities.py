@@ -37,11 +37,6 @@ class LabelEmbeddings:
             return embeddings
         return LabelEmbeddings(embeddings, np.arange(len(embeddings)))
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Return the number of landmarks and the length of an embedding."""
-        return len(self.of_landmarks), self.unique.shape[1]
-
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return the embedding of each landmark (L, d)."""
         return np.asarray(self.unique[self.of_landmarks], dtype=dtype)

@@ -200,8 +200,8 @@ def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: C
                 joined(nearest, of_class, len(landmark_map))).pairs, None
     if nearest is None:
         return np.empty((0, 2), dtype=np.int64), landmark_map.sorted_landmarks
-    by_class = landmark_map.classes.have(nearest.landmarks, classes[nearest.detections])
-    return nearest.select(~by_class).pairs, landmark_map.sorted_landmarks
+    shares = landmark_map.classes.shares(nearest.landmarks, classes[nearest.detections])
+    return nearest.select(shares == 0.0).pairs, landmark_map.sorted_landmarks
 
 
 def _nearest(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions,

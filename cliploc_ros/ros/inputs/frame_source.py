@@ -268,27 +268,23 @@ class FrameSource:
             if name == 'detections':
                 msg = self._converted(msg)
             self._heard_at[name], frame = time.monotonic(), None
-            if name == 'depth':
-                self._keep_depth(msg)
+            if name == 'depth':  # kept as long as images wait; if memory is short, every n-th
+                self._depths.append(msg)
+                oldest = self._pairing.oldest('image')
+                # if no image waits, the next image will have about the stamp of this depth image
+                useful_ns = stamp_ns((msg if oldest is None else oldest[0]).header.stamp) \
+                    - self._depth_tolerance_ns
+                while len(self._depths) > 1 and sum(
+                        len(depth.data) for depth in self._depths) > _MAX_DEPTH_BYTES:
+                    stamps = [stamp_ns(depth.header.stamp) for depth in self._depths]
+                    del self._depths[0 if stamps[0] < useful_ns or len(stamps) < 3 else 1 + min(
+                        range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
             elif name == 'depth_camera_info':
                 self._depth_camera = msg
             else:
                 frame = self._completed(name, msg, self._heard_at[name])
         if frame is not None:
             self._on_frame(frame)
-
-    def _keep_depth(self, msg: Image | CompressedImage) -> None:
-        """Keep depth images as long as images wait; if memory is short, every n-th."""
-        self._depths.append(msg)
-        oldest = self._pairing.oldest('image')
-        # if no image waits, the next image will have about the stamp of this depth image
-        useful_ns = (stamp_ns(msg.header.stamp) if oldest is None
-                     else stamp_ns(oldest[0].header.stamp)) - self._depth_tolerance_ns
-        while len(self._depths) > 1 and sum(
-                len(depth.data) for depth in self._depths) > _MAX_DEPTH_BYTES:
-            stamps = [stamp_ns(depth.header.stamp) for depth in self._depths]
-            del self._depths[0 if stamps[0] < useful_ns or len(stamps) < 3 else 1 + min(
-                range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
 
     def _completed(self, name: str, msg: Any, received_at: float) -> Frame | None:
         """Return the frame that a message completes, once its stamps are reliable; else None."""

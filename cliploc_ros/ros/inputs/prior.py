@@ -29,10 +29,9 @@ from cliploc_ros.files.storage import parse_json, read_file, write_text
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_from_msg, pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
-from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
-_LOG_PERIOD_S = 5.0
 # Least time between two stored poses of a localizer [s].
 _WRITE_PERIOD_S = 1.0
 _PLANAR = np.array([0, 1, 5])  # x, y and yaw in a covariance of ROS
@@ -171,7 +170,7 @@ class PriorSource:
         return Region(frame_id, mean, covariance, probability, camera_from_body)
 
     def _warn(self, text: str) -> None:
-        self._node.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_S)
+        self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)
 
 
 def planar_of(msg: PoseWithCovarianceStamped

@@ -30,7 +30,7 @@ from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometryPlace, Odom
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.stamps import StampOrder, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health
-from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -49,7 +49,6 @@ WINDOW_NS = 100_000_000
 _MAX_SAMPLES = 1000
 # sensor_msgs/Imu: the first element of the covariance of a field that is not measured.
 _NOT_MEASURED = -1.0
-_LOG_PERIOD_S = 5.0
 _RETRY_S = 0.02
 # Longest wait for the first message of a publisher of odometry that was just discovered.
 _DISCOVERY_S = 1.0
@@ -381,4 +380,4 @@ class RobotStateSource:
 
     def _warn(self, what: str, text: str) -> None:
         self.problems[what] = text
-        self._node.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_S)
+        self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)

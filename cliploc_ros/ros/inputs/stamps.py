@@ -172,8 +172,7 @@ class ExactPairing:
         while len(waiting) > self._max_count or (
                 self._bytes[topic] > self._max_bytes[topic] and len(waiting) > 1):
             dropped = min(waiting, key=lambda stamp: (
-                stamp == stamp_ns,
-                topic == self._early and waiting[stamp][2] in self._expected))
+                stamp == stamp_ns, topic == self._early and waiting[stamp][2] in self._expected))
             self._forget(topic, dropped)
             if topic == self._early:
                 self._without_room.append(dropped)
