@@ -305,8 +305,9 @@ class Instants:
                     frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
                     frame.depth_camera_info, state.camera_from_depth)
             elif parameters.depth_transport != 'none':
-                self.note(f'no depth within depth_tolerance_s ({parameters.depth_tolerance_s:g} s): '
-                          'remap depth, start its publisher, or set depth_transport to none')
+                self.note('no depth within depth_tolerance_s '
+                          f'({parameters.depth_tolerance_s:g} s): remap depth, start its '
+                          'publisher, or set depth_transport to none')
         except CliplocError as error:
             self.note(f'localizing without depth: {error}')
         return image, Observation(
