@@ -226,8 +226,7 @@ def faults_of_headers(image: str, camera_info: str, detections: str = '') -> lis
             if other and image and other.strip('/') != image.strip('/')]
 
 
-def faults_of_rectified(image_topic: str, rectified: bool,
-                        msg: CameraInfoMessage | None = None) -> list[Fault]:
+def faults_of_rectified(image_topic: str, rectified: bool, msg: CameraInfoMessage) -> list[Fault]:
     """Return a fault if the topic's name contradicts the parameter `rectified`; else nothing.
 
     There is no fault if raw and rectified images are the same by the camera_info `msg`. If they
@@ -236,13 +235,13 @@ def faults_of_rectified(image_topic: str, rectified: bool,
     name = image_topic.removesuffix('/compressed')
     sounds = 'raw' if name.endswith('/image_raw') else \
         'rectified' if re.search('[/_]rect(?!.*raw)', name) else ''
-    is_same = msg is not None and msg.distortion_model != 'equidistant' and not any(msg.d) and \
+    is_same = msg.distortion_model != 'equidistant' and not any(msg.d) and \
         np.array_equal(_left_of_p(msg), np.reshape(msg.k, (3, 3)))
     if is_same or sounds != ('raw' if rectified else 'rectified'):
         return []
     return [Fault(f'by its name, {image_topic} is {sounds}, but the parameter rectified is '
                   f'{str(rectified).lower()}: poses would be wrong by the distortion of the lens',
-                  msg is not None and '/image_rect' in name)]
+                  '/image_rect' in name)]
 
 
 def _left_of_p(msg: CameraInfoMessage) -> NDArray[np.float64]:

@@ -86,9 +86,9 @@ class DetectorCheck:
         elif len(scores) and not names:
             left, top, right, bottom = next(
                 box for given, _ in frames for box in given.bboxes_xyxy[np.isfinite(given.scores)])
-            text = (f'none of its {len(scores)} boxes lies in the image and is at least a pixel '
-                    f'wide, for example {right - left:.3g} x {bottom - top:.3g} px at '
-                    f'({left:.3g}, {top:.3g}): publish pixels of the image')
+            text = (f'none of its {len(scores)} boxes lies in the image and is a pixel wide, such '
+                    f'as {right - left:.3g} x {bottom - top:.3g} px at ({left:.3g}, {top:.3g}): '
+                    'publish pixels of the image')
         elif names and self._by_class and not self._known.keys() & {*names}:
             numbers = ', which are numbers' if all(name.isdigit() for name in names) else ''
             hint = next(filter(None, (did_you_mean(name, self._known)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
-from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.acceptance.looks import NO_LOOKS, Look, Looks
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.fit.succession import FilterState, succeed
 from cliploc_ros.core.fit.verification import MAX_FRAMES
@@ -53,7 +53,6 @@ BATCH = 4
 _SEARCHES, _MOST_SHARE, _ANSWER_S = 2.0, 0.2, 0.1
 # Remedy where the end of a request cuts off the search.
 _RAISE = '; raise timeout_s'
-_NO_LOOKS = Looks()
 _NO_ROWS = np.empty(0, dtype=np.int64)
 
 
@@ -122,7 +121,7 @@ def informative_first(landmark_map: LandmarkMap, observation: Observation) -> ND
 
 def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame],
                        observation: Observation, crops: Crops | None = None,
-                       looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
+                       looks: Looks = NO_LOOKS, recognizer: ImageRecognizer | None = None,
                        budget: TimeBudget | None = None, cameras: CameraCheck | None = None,
                        request: float = math.inf) -> tuple[SearchedFrame, Relocalization]:
     """Localize a frame with more and more of its crops until its pose is accepted.
@@ -216,18 +215,14 @@ class Localizer:
         self.depth_scale = DepthScale()
         self.cameras = CameraCheck()
 
-    def successor(self, relocalizer: Relocalizer) -> 'Localizer':
-        """Return a localizer with other options on the same map, which keeps the evidence.
+    def use(self, relocalizer: Relocalizer) -> None:
+        """Continue with a relocalizer with other options on the same map.
 
         Looks, cameras, depth scale and filter are kept. Instants are not, because they were
-        searched with these options. On another map, use a new localizer: cameras and depths were
-        compared with this map.
+        searched with the former options. On another map, use a new localizer: cameras and depths
+        were compared with this map.
         """
-        next_one = Localizer(relocalizer, self._keyframes)
-        next_one._looks, next_one._filter = self._looks, self._filter
-        next_one._run, next_one._stamp_ns = self._run, self._stamp_ns
-        next_one.depth_scale, next_one.cameras = self.depth_scale, self.cameras
-        return next_one
+        self._relocalizer, self._instants = relocalizer, []
 
     def answer(self, query: Query, crops: CropSource | None = None, deadline: float = math.inf,
                begin_stage: Callable[[str], None] = lambda stage: None) -> Relocalization:
@@ -382,7 +377,7 @@ class Localizer:
                 return rooms[-1]
             crops = replace(crops, room=recorded_room)
         is_alone = newest.odom_from_camera is None or query.run is None
-        earlier, looks = list[KeptInstant](), _NO_LOOKS
+        earlier, looks = list[KeptInstant](), NO_LOOKS
         if not is_alone:
             if query.run != self._run or newest.stamp_ns < self._stamp_ns:
                 self._instants, self._looks, self._filter = [], Looks(), None

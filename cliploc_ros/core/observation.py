@@ -115,8 +115,6 @@ class Observation:
     #: (n,): median depth of the inner half of each box, along z of the camera [m]; NaN if unknown.
     #: None for a camera without depth.
     depths: NDArray[np.float64] | None = None
-    #: (n,): standard deviation of each depth [m]; None for that of a typical RGB-D camera
-    depth_deviations: NDArray[np.float64] | None = None
     region: Region | None = None  #: Where the robot probably is; None if unknown
 
     @property

@@ -103,7 +103,15 @@ def case_arrays(case: Case) -> Arrays:
         crops += [frame.similarities.crops if isinstance(frame.similarities, CropSimilarities)
                   else frame.similarities for frame in query.frames
                   if frame.similarities is not None]
-    about = {'report': case.report, 'queries': [_fields_of(query) for query in case.queries]}
+    about = {'report': case.report, 'queries': [{
+        **{name: getattr(query, name) for name in
+           ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},
+        'cameras': None if query.cameras is None else query.cameras.fields(),
+        'has_images': bool(query.images),
+        'frames': [asdict(replace(frame, similarities=None)) | {'crops': (
+            '' if frame.similarities is None else 'embeddings' if isinstance(
+                frame.similarities, CropSimilarities) else 'similarities')}
+            for frame in query.frames]} for query in case.queries]}
     return {
         # NumPy arrays and scalars become lists and numbers
         'about': np.frombuffer(json.dumps(about, default=lambda value: value.tolist()).encode(),
@@ -135,19 +143,6 @@ def read_case(path: Path) -> Case:
 
 def _parts(arrays: Arrays, name: str) -> Iterator[NDArray[Any]]:
     return (arrays[f'{name}s'][first:last] for first, last in pairwise(arrays[f'{name}_offsets']))
-
-
-def _fields_of(query: Query) -> dict[str, Any]:
-    """Convert a query to fields for JSON."""
-    return {
-        **{name: getattr(query, name) for name in
-           ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},
-        'cameras': None if query.cameras is None else query.cameras.fields(),
-        'has_images': bool(query.images),
-        'frames': [asdict(replace(frame, similarities=None)) | {'crops': (
-            '' if frame.similarities is None else 'embeddings' if isinstance(
-                frame.similarities, CropSimilarities) else 'similarities')}
-            for frame in query.frames]}
 
 
 def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
@@ -194,14 +189,13 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
         _expect(bool(np.isfinite(rows).all()), 'crops')
         similarities = rows if kind == 'similarities' else CropSimilarities(rows, LabelEmbeddings(
             np.empty((0, rows.shape[1]), np.float32), np.empty(0, np.int64)))
-    up, odom, depths, spreads = (None if known[name] is None else _numbers(
-        known[name], *shape, nan=name.startswith('depth')) for name, shape in (
-            ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,)),
-            ('depth_deviations', (count,))))
+    up, odom, depths = (None if known[name] is None else _numbers(
+        known[name], *shape, nan=name == 'depths') for name, shape in (
+            ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,))))
     return Observation(
         Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
         similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,
-        float(_numbers(known['odom_way_m'])), compared, depths, spreads, region)
+        float(_numbers(known['odom_way_m'])), compared, depths, region)
 
 
 def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:

@@ -22,7 +22,7 @@ from cliploc_ros.core.acceptance.contenders import (
 )
 from cliploc_ros.core.acceptance.depth_check import DepthCheck, check_depth
 from cliploc_ros.core.acceptance.links import Link, weakest_link
-from cliploc_ros.core.acceptance.looks import Looks
+from cliploc_ros.core.acceptance.looks import NO_LOOKS, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Match, find_with_rivals
@@ -47,7 +47,6 @@ _SEARCH_SHARE, _REFINEMENT_SHARE = 0.8, 0.9
 # poses are scored and compared on all frames. A budget below _SHORT_BUDGET_S scales them down.
 _EARLIER_SEARCH_S, _EARLIER_REFINEMENT_S, _SHORT_BUDGET_S = 0.0065, 0.003, 0.05
 _MOST_FRAMES = 5
-_NO_LOOKS = Looks()
 
 
 @dataclass(frozen=True)
@@ -254,7 +253,7 @@ class Relocalizer:
         return search_frame(self.landmark_map, observation, self.options, deadline)
 
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
-               looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
+               looks: Looks = NO_LOOKS, recognizer: ImageRecognizer | None = None,
                cameras: CameraCheck | None = None) -> Relocalization:
         """Find the pose of the camera at the last of one or more searched frames.
 
@@ -327,7 +326,7 @@ class Relocalizer:
             cameras=tuple(seen))
 
     def look_again(self, found: Relocalization, frames: Sequence[SearchedFrame],
-                   looks: Looks = _NO_LOOKS, recognizer: ImageRecognizer | None = None,
+                   looks: Looks = NO_LOOKS, recognizer: ImageRecognizer | None = None,
                    cameras: CameraCheck | None = None) -> Relocalization:
         """Repeat a refused result of locate with a thorough search of the keyframes.
 

@@ -13,14 +13,13 @@ import logging
 import os
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from cliploc_ros.core.map.joined_map import JoinedMap, parts_of
+from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_details import WeightedLabels
 from cliploc_ros.core.map.landmark_embeddings import (
     LandmarkEmbeddings,
@@ -33,9 +32,9 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.arrays import Check, Field, Schema
-from cliploc_ros.files.storage import replace_file, resolve_cache_dir, warn_not_kept
+from cliploc_ros.files.storage import MAKE_ROOM, replace_file, resolve_cache_dir, warn_not_kept
 from cliploc_ros.models.files import remove_unused
-from cliploc_ros.models.images import check_image_rgb, crop_bounds
+from cliploc_ros.models.observer import crop_bounds
 from cliploc_ros.models.onnx_clip import (
     ClipWeights,
     OnnxTextTower,
@@ -47,8 +46,6 @@ from cliploc_ros.models.protocols import ClipOptions
 
 # Greatest number of crops or labels that are encoded at once; it limits the memory.
 _BATCH = 64
-#: Greatest number of labels encoded, cached and held at once: 134 MB with 512 numbers each.
-PART = 65_536
 _FORMAT = 1
 # A map of 1,000 labels takes 3 MB with ViT-L-14.
 _MOST_FILES = 32
@@ -95,15 +92,15 @@ def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequen
     # Unique and sorted, so that moving or reordering landmarks needs no new embeddings.
     unique = sorted(set(landmark_map.weighted_labels))
     rows = {description: row for row, description in enumerate(unique)}
-    labels = LabelEmbeddings(
-        mixed_rows(unique, partial(_encoded_once, weights, options), weights.embed_dim),
-        np.array([rows[description] for description in landmark_map.weighted_labels],
-                 dtype=np.int64))
+
+    def encode(texts: Sequence[str]) -> NDArray[np.float32]:
+        return encoded_once(weights.key, texts, weights.embed_dim, options.cache_dir,
+                            lambda missing: encode_labels(weights, missing, options))
+    labels = LabelEmbeddings(mixed_rows(unique, encode), np.array(
+        [rows[description] for description in landmark_map.weighted_labels], dtype=np.int64))
     images = None if compare == 'text' else _images_of_all(weights, landmark_map, map_files)
     if images is not None:
         labels = with_images(labels, images, compare)
-    if isinstance(landmark_map, JoinedMap):
-        return labels.in_parts([len(part.landmark_map) for part in landmark_map.parts])
     return labels
 
 
@@ -147,17 +144,15 @@ def _images(weights: ClipWeights, landmark_map: LandmarkMap, map_file: str
     return images
 
 
-def _encoded_once(weights: ClipWeights, options: ClipOptions, labels: Sequence[str]
-                  ) -> NDArray[np.float32]:
-    """Return the embeddings of labels from the cache, or encode and cache them."""
-    cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
-    embeddings = cache.load(weights.key, labels, weights.embed_dim)
-    source = 'cached'
+def encoded_once(key: str, labels: Sequence[str], embed_dim: int, cache_dir: str,
+                 encode: Callable[[Sequence[str]], NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Return the embeddings of labels from the cache, or encode and cache them; see LabelCache."""
+    cache = LabelCache(resolve_cache_dir(cache_dir) / 'labels')
+    embeddings = cache.load(key, labels, embed_dim)
+    logger.info('%d labels %s', len(labels), 'encoded' if embeddings is None else 'cached')
     if embeddings is None:
-        source = 'encoded'
-        embeddings = encode_labels(weights, labels, options)
-        cache.store(weights.key, labels, embeddings)
-    logger.info('CLIP %s: %d labels %s', weights.model, len(labels), source)
+        embeddings = encode(labels)
+        cache.store(key, labels, embeddings)
     return embeddings
 
 
@@ -183,10 +178,9 @@ class ClipEncoder:
         The boxes (n, 4) are left, top, right, bottom [px]. A crop contains all pixels that its box
         touches, see `crop_bounds`.
 
-        ImageError: the image has another shape or type, or no pixels. CliplocError: a box is not
-        finite, empty or outside the image. ModelError: embeddings are not finite.
+        CliplocError: a box is not finite, empty or outside the image. ModelError: embeddings are
+        not finite.
         """
-        check_image_rgb(image_rgb)
         bounds = crop_bounds(bboxes_xyxy, image_rgb.shape[1], image_rgb.shape[0])
         features = []
         for start in range(0, len(bounds), _BATCH):
@@ -251,13 +245,14 @@ class LabelCache:
             return None
         try:
             arrays = _SCHEMA.read(file)
+            embeddings = arrays['embeddings']
+            if (bytes(arrays['identity']), embeddings.shape) != (
+                    _identity(key, labels), (len(labels), embed_dim)):
+                raise ModelError('it is for other weights or labels')
         except ModelError as error:
-            return self._ignore(file, error)
-        embeddings = arrays['embeddings']
-        if bytes(arrays['identity']) != _identity(key, labels):
-            return self._ignore(file, 'it is for other weights or labels')
-        if embeddings.shape != (len(labels), embed_dim):
-            return self._ignore(file, 'its embeddings are not of the expected shape')
+            logger.warning('label embeddings in %s cannot be used (%s): encoding the labels again',
+                           file, error)
+            return None
         with contextlib.suppress(OSError):  # a read-only cache works too
             os.utime(file)
         return embeddings
@@ -267,24 +262,17 @@ class LabelCache:
         file = self._file(key, labels)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            remove_unused(self._folder.glob('labels-*.npz'),
-                          self._folder.glob('.*.labels-*.npz'), self._most_files - 1)
+            remove_unused(self._folder, self._most_files - 1)
             with replace_file(file) as partial:
                 np.savez(partial, embeddings=embeddings,
                          identity=np.frombuffer(_identity(key, labels), dtype=np.uint8))
         except OSError as error:
-            warn_not_kept('label embeddings are not cached and the next start is slow again: '
-                          f'cannot write {file} ({error.strerror or error}); make room, or '
-                          'choose a writable cache_dir')
+            warn_not_kept(f'label embeddings are not cached: cannot write {file} '
+                          f'({error.strerror or error}); {MAKE_ROOM} (cache_dir)')
 
     def _file(self, key: str, labels: Sequence[str]) -> Path:
         digest = hashlib.sha256(_identity(key, labels)).hexdigest()
         return self._folder / f'labels-{digest[:32]}.npz'
-
-    @staticmethod
-    def _ignore(file: Path, reason: object) -> None:
-        logger.warning('label embeddings in %s cannot be used (%s): encoding the labels again',
-                       file, reason)
 
 
 def _identity(key: str, labels: Sequence[str]) -> bytes:
@@ -292,13 +280,12 @@ def _identity(key: str, labels: Sequence[str]) -> bytes:
 
 
 def mixed_rows(descriptions: Sequence[WeightedLabels],
-               encode: Callable[[Sequence[str]], NDArray[np.float32]], embed_dim: int
-               ) -> NDArray[np.float32]:
-    """Return the embeddings (R, embed_dim) of R descriptions.
+               encode: Callable[[Sequence[str]], NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Return the embeddings (R, d) of R descriptions.
 
     The embedding of a description is the weighted mean of the embeddings of its labels, scaled to
-    unit length. That of a single label is unchanged. ``encode`` returns the embeddings (m,
-    embed_dim) of m labels, as unit rows. It is called with sorted labels, at most PART at once.
+    unit length. That of a single label is unchanged. ``encode`` returns the embeddings (m, d)
+    of m labels, as unit rows. It is called with all labels, sorted.
     """
     labels = sorted({label for description in descriptions for label, _ in description})
     # the share of each label in each description, a sparse matrix (R, U)
@@ -311,10 +298,7 @@ def mixed_rows(descriptions: Sequence[WeightedLabels],
     weights = csr_matrix(
         (shares, [columns[label] for description in descriptions for label, _ in description],
          ends), shape=(len(descriptions), len(labels)))
-    rows = np.zeros((len(descriptions), embed_dim), dtype=np.float32)
-    for start in range(0, len(labels), PART):
-        part = slice(start, start + PART)
-        rows += weights[:, part] @ encode(labels[part])
+    rows = np.asarray(weights @ encode(labels))
     lengths = np.maximum(np.sqrt(np.einsum('ij,ij->i', rows, rows)), 1e-12)
     rows /= np.where(np.diff(weights.indptr) > 1, lengths, 1.0)[:, None]
     return rows

@@ -31,13 +31,7 @@ from cliploc_ros.models.exports import (
     ExportError,
     describe_export,
 )
-from cliploc_ros.models.files import (
-    check_weights_file,
-    damaged,
-    download,
-    fingerprint_file,
-    first_line,
-)
+from cliploc_ros.models.files import check_weights_file, download, fingerprint_file, first_line
 from cliploc_ros.models.onnx_network import CompiledNetwork, import_openvino, read_config
 from cliploc_ros.models.protocols import ClipOptions
 
@@ -191,7 +185,8 @@ def _load(weights: _Weights) -> Any:
         cause = next((line.strip() for line in lines if 'Unsupported' in line), lines[0])
         raise ModelError(f'{file} is not a checkpoint of CLIP: {cause}') from error
     except Exception as error:  # each format and version has different exceptions
-        raise damaged(file, first_line(error)) from error
+        raise ModelError(f'{file} is truncated or corrupt ({first_line(error)}): download it again'
+                         ) from error
     try:
         state = convert_to_custom_text_state_dict(convert_state_dict(model, state))
         for tower in ('visual', 'text'):

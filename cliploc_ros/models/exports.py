@@ -104,8 +104,7 @@ def exported(cache_dir: str, kind: str, name: str, identity: Sequence[str],
         run_export(name, export, written, otherwise)
         try:
             cache.mkdir(parents=True, exist_ok=True)
-            remove_unused([entry for entry in cache.iterdir() if not entry.name.startswith('.')],
-                          cache.glob('.*.tmp'), _MOST_EXPORTS - 1)
+            remove_unused(cache, _MOST_EXPORTS - 1)
             with tempfile.TemporaryDirectory(dir=cache, prefix='.', suffix='.tmp',
                                              ignore_cleanup_errors=True) as beside:
                 whole = Path(shutil.copytree(written, Path(beside) / folder.name))

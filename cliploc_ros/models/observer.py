@@ -5,6 +5,7 @@
 import time
 from collections import deque
 from collections.abc import Mapping
+from copy import copy
 from typing import NamedTuple
 
 import cv2
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
-from cliploc_ros.models.images import crop_bounds
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.models.protocols import ImageTextEncoder
 
 # A box is unchanged if no edge has moved by more [px].
@@ -34,50 +35,34 @@ _SLOWER = 1.3
 _MOST_CROPS = 64
 
 
+def crop_bounds(bboxes_xyxy: NDArray[np.float64], width: int, height: int
+                ) -> NDArray[np.int64]:
+    """Return the pixels (n, 4) that boxes touch: left, top, and right, bottom (exclusive).
+
+    The bounds are clipped to the image. Each crop has at least one pixel. CliplocError: a box
+    (n, 4), left, top, right, bottom [px], is not finite, empty or inverted, or does not overlap
+    the image.
+    """
+    bboxes_xyxy = np.asarray(bboxes_xyxy, dtype=np.float64).reshape(-1, 4)
+    left, top, right, bottom = bboxes_xyxy.T
+    with np.errstate(invalid='ignore'):
+        overlaps = ((np.minimum(right, width) > np.maximum(left, 0.0))
+                    & (np.minimum(bottom, height) > np.maximum(top, 0.0)))
+    hidden = np.flatnonzero(~(np.isfinite(bboxes_xyxy).all(axis=1) & overlaps))
+    if len(hidden):
+        raise CliplocError(f'box {hidden[0]}, {bboxes_xyxy[hidden[0]].tolist()}, cannot be '
+                           f'cropped from an image of {width}x{height} px')
+    clamped = np.clip(bboxes_xyxy, 0, np.array([width, height, width, height]))
+    return np.concatenate(
+        [np.floor(clamped[:, :2]), np.ceil(clamped[:, 2:])], axis=1).astype(np.int64)
+
+
 class _Known(NamedTuple):
     """A box (4,) [px], its thumbnail, and the embedding (d,) of its crop."""
 
     bbox_xyxy: NDArray[np.float64]
     picture: NDArray[np.int16]
     embedding: NDArray[np.float32]
-
-
-class CropMemory:
-    """The newest embeddings of an encoder, at most 256."""
-
-    def __init__(self) -> None:
-        self._known: deque[_Known] = deque(maxlen=_LIMIT)
-
-    def __len__(self) -> int:
-        """Return the number of embeddings."""
-        return len(self._known)
-
-    def recall(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
-               ) -> dict[int, NDArray[np.float32]]:
-        """Return the embeddings of unchanged crops, by the rows of their boxes.
-
-        Each crop is compared with the crop that was embedded, so that slow changes are noticed.
-        Each box (n, 4) must overlap the image (h, w, 3) uint8.
-        """
-        if not self._known:
-            return {}
-        pictures = _pictures(image_rgb, bboxes_xyxy)
-        boxes = np.array([known.bbox_xyxy for known in self._known])
-        found = {}
-        for row, (bbox, picture) in enumerate(zip(bboxes_xyxy, pictures, strict=True)):
-            near = np.nonzero(np.abs(boxes - bbox).max(axis=1) <= _MOVED_PX)[0]
-            for candidate in reversed(near):
-                change = np.abs(picture - self._known[candidate].picture)
-                if change.mean() < _CHANGED and change.max() < _CELL_CHANGED:
-                    found[row] = self._known[candidate].embedding
-                    break
-        return found
-
-    def keep(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64],
-             embeddings: NDArray[np.float32]) -> None:
-        """Store the embeddings (n, d) of boxes (n, 4); the oldest embeddings are dropped."""
-        self._known.extend(map(_Known, bboxes_xyxy, _pictures(image_rgb, bboxes_xyxy),
-                               embeddings))
 
 
 def _pictures(image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
@@ -96,13 +81,13 @@ class Observer:
                  label_embeddings: LabelEmbeddings | NDArray[np.float32]) -> None:
         self._encoder = encoder
         self._labels = LabelEmbeddings.of(label_embeddings)
-        self._memory = CropMemory()
+        self._known: deque[_Known] = deque(maxlen=_LIMIT)  # the newest embeddings
         self._crop_s: float | None = None
 
     def with_labels(self, label_embeddings: LabelEmbeddings) -> 'Observer':
         """Return an observer with the same encoder for the labels of another map."""
-        observer = Observer(self._encoder, label_embeddings)
-        observer._memory, observer._crop_s = self._memory, self._crop_s
+        observer = copy(self)
+        observer._labels = label_embeddings
         return observer
 
     def measure(self) -> None:
@@ -125,14 +110,34 @@ class Observer:
         `known` has known embeddings (d,) by row; default: those of crops that have not changed
         since an earlier image.
         """
-        return ObservedCrops(self, image_rgb, bboxes_xyxy, self._memory.recall(
+        return ObservedCrops(self, image_rgb, bboxes_xyxy, self._unchanged(
             image_rgb, bboxes_xyxy) if known is None else known)
+
+    def _unchanged(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
+                   ) -> dict[int, NDArray[np.float32]]:
+        """Return the embeddings of unchanged crops, by the rows of their boxes.
+
+        Each crop is compared with the crop that was embedded, so that slow changes are noticed.
+        """
+        if not self._known:
+            return {}
+        boxes, found = np.array([known.bbox_xyxy for known in self._known]), {}
+        for row, (bbox, picture) in enumerate(zip(bboxes_xyxy, _pictures(image_rgb, bboxes_xyxy),
+                                                  strict=True)):
+            near = np.nonzero(np.abs(boxes - bbox).max(axis=1) <= _MOVED_PX)[0]
+            for candidate in reversed(near):
+                change = np.abs(picture - self._known[candidate].picture)
+                if change.mean() < _CHANGED and change.max() < _CELL_CHANGED:
+                    found[row] = self._known[candidate].embedding
+                    break
+        return found
 
     def encode(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
                ) -> NDArray[np.float32]:
         """Encode and store the embeddings (n, d) of at least one crop."""
         embeddings = self._encode(image_rgb, bboxes_xyxy)
-        self._memory.keep(image_rgb, bboxes_xyxy, embeddings)
+        self._known.extend(map(_Known, bboxes_xyxy, _pictures(image_rgb, bboxes_xyxy),
+                               embeddings))
         return embeddings
 
     def _encode(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]
@@ -144,7 +149,7 @@ class Observer:
 
     def similarities(self, embeddings: NDArray[np.float32]) -> CropSimilarities:
         """Return the similarities of crops, given by embeddings (n, d), to the labels."""
-        return CropSimilarities(embeddings.reshape(-1, self._labels.shape[1]), self._labels)
+        return CropSimilarities(embeddings.reshape(-1, self._labels.unique.shape[1]), self._labels)
 
 
 class ObservedCrops:

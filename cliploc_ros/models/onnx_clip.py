@@ -168,8 +168,7 @@ class CropPreparation:
                 raise ValueError('a number is out of range')
         except (LookupError, ValueError, TypeError, OverflowError) as error:
             raise ModelError(f'{file} does not define the preparation of images: expected a size '
-                             f'up to {_MOST_PX} x {_MOST_PX}, and a mean and a standard deviation '
-                             'of three numbers each') from error
+                             f'up to {_MOST_PX}, mean and standard deviation') from error
         if any(want not in (ANY, has) for want, has in zip(fixed, (height, width), strict=True)):
             raise ModelError(f'{file} has an image size of {height} x {width}, but the network '
                              f'takes {fixed[0]} x {fixed[1]}: they are not from the same CLIP')

@@ -7,10 +7,10 @@ The meaning of the outputs is read from the metadata of the file and the configu
 
 import ast
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +26,6 @@ from cliploc_ros.models.files import (
     is_hub_name,
     resolve_folder,
 )
-from cliploc_ros.models.images import check_image_rgb
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 
@@ -42,19 +41,6 @@ _GREY = (114, 114, 114)
 _MOST_BOXES = 30_000
 # Columns of the output of a network that removes duplicates itself: box, score, class.
 _END2END = 6
-
-
-class _Head(Protocol):
-    """Pre- and postprocessing of a network."""
-
-    names: dict[int, str]  #: Class names by index
-    has_doubles: bool  #: Whether an object may have several boxes of a class
-
-    def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
-        """Return the boxes (n, 6) in an image: left, top, right, bottom, score, class.
-
-        The most confident box is first.
-        """
 
 
 class OnnxDetector:
@@ -73,8 +59,7 @@ class OnnxDetector:
             file = find_network(resolve_folder(options.model, [NETWORKS], BESIDE,
                                                options.cache_dir), options.model, NETWORKS)
         network = OnnxNetwork(file, options.cache_dir)
-        self._head: _Head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs)
-                             else YoloHead)(network)
+        self._head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs) else YoloHead)(network)
         #: All classes of the network
         self.class_names = tuple(dict.fromkeys(self._head.names.values()))
         self.configure(options)
@@ -94,10 +79,7 @@ class OnnxDetector:
 
         Weak queries, and several texts of a class, give duplicate boxes of an object. They are
         removed, see ``iou``.
-
-        ImageError: the image has another shape or type, or no pixels.
         """
-        check_image_rgb(image_rgb)
         names = self._head.names
         rows = self._head.find(np.ascontiguousarray(image_rgb), self._options)
         numbers = np.array([self.class_names.index(names[int(row)]) for row in rows[:, 5]],
@@ -157,7 +139,7 @@ class YoloHead:
         self._stride = int(about['stride']) if about.get('stride', '').isdecimal() else _STRIDE
         height, width = self._input.shape[2:]
         self._size = None if ANY in (height, width) else (height, width)
-        self._layout = self._layout_of(self._run(np.zeros((1, 3, *(
+        self._is_end2end = self._removes_doubles(self._run(np.zeros((1, 3, *(
             self._size or (2 * self._stride,) * 2)))))
 
     def _run(self, pixels: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -171,39 +153,49 @@ class YoloHead:
                 f"shape (1, boxes, classes), or '{_LOGITS}' and '{_BOXES}'")
         return boxes[0][0]
 
-    def _layout_of(self, output: NDArray[np.float32]) -> str:
-        """Return the layout of an output by its shape; see ``find``."""
-        count, file = len(self.names), self._network.file
-        # the export of YOLOv5 has no task, but a column for the confidence in any object
-        if 'task' not in self._network.metadata and output.shape[1] == 5 + count:
-            return 'objectness'
-        if output.shape[1] == 6 and output.shape[0] != 4 + count:
-            return 'selected'
+    def _removes_doubles(self, output: NDArray[np.float32]) -> bool:
+        """Return whether the network removes duplicates itself, by an output; see select_boxes."""
+        count, task = len(self.names), self._network.metadata.get('task')
         if output.shape[0] == 4 + count:
-            return 'classes'
-        # YOLOE's masks follow the classes
-        if self._network.metadata.get('task') == 'segment':
-            if self._network.metadata.get('end2end') == 'True' and output.shape[1] > 6:
-                return 'selected'
+            return False
+        if task and output.shape[1] == _END2END:  # without a task: YOLOv5, with other columns
+            return True
+        if task == 'segment':  # YOLOE's masks follow the classes
+            if self._network.metadata.get('end2end') == 'True' and output.shape[1] > _END2END:
+                return True
             if output.shape[0] > 4 + count:
-                return 'classes'
-        raise ModelError(f'{file} is not a detector of {count} classes: its output has the shape '
-                         f'{output.shape}, expected ({4 + count}, boxes) or (boxes, 6)')
+                return False
+        raise ModelError(f'{self._network.file} is not a detector of {count} classes: its output '
+                         f'has the shape {output.shape}, expected ({4 + count}, boxes) or '
+                         '(boxes, 6)')
 
     def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
-        """Return the boxes (n, 6) in an image, see _Head.find."""
+        """Return the boxes (n, 6) in an image: left, top, right, bottom, score, class.
+
+        The image is scaled and centred in grey borders. The most confident box is first.
+        """
         side = -(-options.imgsz // self._stride) * self._stride
-        letterbox = Letterbox.of(image_rgb.shape[1::-1], *(self._size or (side, side)),
-                                 None if self._size else self._stride)
-        pixels = letterbox.fill(image_rgb).transpose(2, 0, 1)[None]
-        output = self._run(np.ascontiguousarray(pixels, dtype=np.float32) / np.float32(255))
-        if self._layout == 'objectness':
-            output = np.hstack([output[:, :4], output[:, 4:5] * output[:, 5:]]).T
-        elif self._layout == 'classes':
+        height, width = self._size or (side, side)
+        size = image_rgb.shape[1::-1]
+        scale = min(height / size[1], width / size[0])
+        scaled = max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
+        free_x, free_y = width - scaled[0], height - scaled[1]
+        if self._size is None:  # the input shrinks to a multiple of the stride
+            free_x, free_y = free_x % self._stride, free_y % self._stride
+        left, top = round(free_x / 2 - 0.1), round(free_y / 2 - 0.1)
+        image = image_rgb if scaled == size else \
+            cv2.resize(image_rgb, scaled, interpolation=cv2.INTER_LINEAR)
+        filled = cv2.copyMakeBorder(image, top, free_y - top, left, free_x - left,
+                                    cv2.BORDER_CONSTANT, value=_GREY)
+        output = self._run(np.ascontiguousarray(filled.transpose(2, 0, 1)[None], np.float32)
+                           / np.float32(255))
+        if not self._is_end2end:
             output = output[:4 + len(self.names)]
-        rows = select_boxes(output, options.conf, options.iou, options.max_det,
-                            self._layout == 'selected')
-        return np.hstack([letterbox.in_image(rows[:, :4]), rows[:, 4:]])
+        rows = select_boxes(output, options.conf, options.iou, options.max_det, self._is_end2end)
+        ours, theirs, corner = (np.array(pair * 2, dtype=np.float32)
+                                for pair in (scaled, size, (left, top)))
+        boxes = np.clip((rows[:, :4] - corner) / (ours / theirs), 0, theirs)
+        return np.hstack([boxes, rows[:, 4:]])
 
 
 class DetrHead:
@@ -227,9 +219,8 @@ class DetrHead:
                              f'shortest_edge: {size}')
         if ANY not in fixed:
             if 'height' in size and (size['height'], size['width']) != fixed:
-                raise ModelError(f'{file} has an image size of {size["height"]} x '
-                                 f'{size["width"]}, but {network.file} takes {fixed[0]} x '
-                                 f'{fixed[1]}: they are not from the same network')
+                raise ModelError(f'{file} has the size {size}, but {network.file} takes '
+                                 f'{fixed[0]} x {fixed[1]}: they are not from the same network')
             size = {'height': fixed[0], 'width': fixed[1]}
         self._size: dict[str, int] = size
         self._scale = np.float32(about.get('rescale_factor', 1 / 255)
@@ -277,7 +268,7 @@ class DetrHead:
         return {name: outputs[name][0] for name in (_LOGITS, _BOXES)}
 
     def find(self, image_rgb: NDArray[np.uint8], options: DetectorOptions) -> NDArray[np.float32]:
-        """Return the boxes (n, 6) in an image, see _Head.find."""
+        """Return the boxes (n, 6) in an image, see YoloHead.find."""
         found = self._run(image_rgb)
         logits = found[_LOGITS].astype(np.float64)
         scores: NDArray[Any]
@@ -330,43 +321,6 @@ def _names(network: OnnxNetwork) -> dict[int, str]:
 
 # ---- boxes of YOLO, as in ultralytics -----------------------------------------------------------
 
-@dataclass(frozen=True)
-class Letterbox:
-    """The place of an image in a network's input: scaled, and centred in grey borders [px]."""
-
-    image_size: tuple[int, int]  #: Width and height of the image
-    scaled_size: tuple[int, int]  #: Width and height of the scaled image
-    #: Widths of the borders: left, top, right, bottom
-    borders: tuple[int, int, int, int]
-
-    @staticmethod
-    def of(image_size: tuple[int, int], height: int, width: int, stride: int | None
-           ) -> 'Letterbox':
-        """Fit an image into an input; with a stride, the input shrinks to a multiple of it."""
-        scale = min(height / image_size[1], width / image_size[0])
-        scaled = max(round(image_size[0] * scale), 1), max(round(image_size[1] * scale), 1)
-        free_x, free_y = width - scaled[0], height - scaled[1]
-        if stride is not None:
-            free_x, free_y = free_x % stride, free_y % stride
-        return Letterbox(image_size, scaled, (
-            round(free_x / 2 - 0.1), round(free_y / 2 - 0.1),
-            round(free_x / 2 + 0.1), round(free_y / 2 + 0.1)))
-
-    def fill(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Scale an image (h, w, 3) and add borders, giving an input (H, W, 3)."""
-        if self.scaled_size != self.image_size:
-            image = cv2.resize(image, self.scaled_size, interpolation=cv2.INTER_LINEAR)
-        left, top, right, bottom = self.borders
-        return np.asarray(cv2.copyMakeBorder(image, top, bottom, left, right,
-                                             cv2.BORDER_CONSTANT, value=_GREY))
-
-    def in_image(self, boxes_xyxy: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Convert boxes (n, 4) in the input to boxes in the image, clipped to it."""
-        scaled, size, corner = (np.array(pair * 2, dtype=np.float32) for pair in
-                                (self.scaled_size, self.image_size, self.borders[:2]))
-        return np.clip((boxes_xyxy - corner) / (scaled / size), 0, size)
-
-
 def select_boxes(output: NDArray[np.float32], conf: float, iou: float, max_det: int,
                  is_end2end: bool) -> NDArray[np.float32]:
     """Return the boxes (n, 6) of an output: left, top, right, bottom, score, class.
@@ -374,7 +328,7 @@ def select_boxes(output: NDArray[np.float32], conf: float, iou: float, max_det: 
     The output is (4 + classes, boxes), with centre and size of each box. A network that removes
     duplicates itself has the output (boxes, 6 or more), the most confident box first.
     """
-    if is_end2end or output.shape[-1] == _END2END:
+    if is_end2end:
         return output[output[:, 4] > conf][:max_det, :_END2END]
     scores = output[4:].max(axis=0)
     rows = np.flatnonzero(scores > conf)

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import (
+    MAKE_ROOM,
     parse_json,
     read_file,
     replace_file,
@@ -34,7 +35,6 @@ from cliploc_ros.files.storage import (
 )
 from cliploc_ros.models.files import (
     check_weights_file,
-    damaged,
     fingerprint_file,
     first_line,
     remove_unused,
@@ -102,9 +102,15 @@ class OnnxNetwork:
 
     def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
         check_weights_file(file)
-        import_openvino()
+        openvino = import_openvino()
         self.file = file
-        stored = _stored_path(file, cache_dir, precision)
+        # A compiled network is named by a hash of all that it depends on, including the file of
+        # weights next to a large network.
+        files = sorted(file.parent.glob(f'{glob.escape(file.name)}*'))
+        depends = [_FORMAT, *map(fingerprint_file, files), precision, openvino.get_version(),
+                   openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME')]
+        digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
+        stored = resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}.blob'
         try:
             compiled, self.metadata = _load(stored, precision)
         except Exception as error:  # OpenVINO has no exception classes
@@ -131,9 +137,8 @@ class OnnxNetwork:
             raise ModelError(f'{self.file} takes no single colour image: its inputs are '
                              f'{self.described_inputs()}, expected (1, 3, height, width)')
         if images[0].type not in (np.float32, np.float16):
-            raise ModelError(f'{self.file} takes images that are not floating-point numbers '
-                             f'({self.described_inputs()}), so their scale is unknown: export it '
-                             'with inputs in fp32')
+            raise ModelError(f'{self.file} takes images of integers, whose scale is unknown '
+                             f'({self.described_inputs()}): export it with inputs in fp32')
         return images[0]
 
     def described_inputs(self) -> str:
@@ -193,17 +198,6 @@ def _settings(precision: str | None) -> dict[str, Any]:
 
 # ---- compiled networks on disk ------------------------------------------------------------------
 
-def _stored_path(file: Path, cache_dir: str, precision: str | None) -> Path:
-    """Return the path of a compiled network, named by a hash of all that it depends on."""
-    openvino = import_openvino()
-    # including the file of weights next to a large network
-    files = sorted(file.parent.glob(f'{glob.escape(file.name)}*'))
-    depends = [_FORMAT, *map(fingerprint_file, files), precision, openvino.get_version(),
-               openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME')]
-    digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
-    return resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}.blob'
-
-
 def _load(stored: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
     """Load a compiled network and its metadata, see _compile; any exception: it is unusable."""
     content = np.memmap(stored, dtype=np.uint8, mode='r')
@@ -229,7 +223,11 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
     try:
         network = core.read_model(file)
     except Exception as error:  # OpenVINO has no exception classes
-        raise _unreadable(file, str(error)) from error
+        # its last lines name the cause, such as a missing file of weights
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        raise ModelError(f'OpenVINO cannot read {file}: {" ".join(lines[-2:])[:300]}; download it '
+                         'again with all its files, update OpenVINO, or export it with an opset '
+                         'of 11 to 21') from error
     about = network.get_rt_info()
     metadata: dict[str, str] = {
         name: str(value.value) for name, value in about['framework'].items()
@@ -249,29 +247,16 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
         for part in parts:
             digest.update(part)
         stored.parent.mkdir(parents=True, exist_ok=True)
-        remove_unused(stored.parent.glob('[!.]*'), stored.parent.glob('.*'), _MOST_NETWORKS - 1)
+        remove_unused(stored.parent, _MOST_NETWORKS - 1)
         with replace_file(stored) as partial, partial.open('wb') as opened:
             opened.writelines((digest.digest(), *parts))
         # Loaded from the file, so that the weights are in memory once, and the file is checked.
         compiled, _ = _load(stored, precision)
     except Exception as error:  # OpenVINO's errors for a full disk and a bad network are the same
-        warn_not_kept('the compiled network is not cached and the next start is slow again: '
-                      f'cannot write {stored} ({first_line(error)}); make room, or choose a '
-                      'writable cache_dir')
+        warn_not_kept(f'the compiled network is not cached: cannot write {stored} '
+                      f'({first_line(error)}); {MAKE_ROOM} (cache_dir)')
     free_memory()
     return compiled, metadata
-
-
-def _unreadable(file: Path, reason: str) -> ModelError:
-    if "can't be parsed" in reason:
-        return damaged(file, 'its graph ends too early')
-    if 'externally stored data' in reason:
-        name = reason.partition('(')[2].partition(',')[0]
-        return ModelError(f'the weights of {file} are in a separate file, {name}, which is '
-                          'missing: put it next to the network')
-    lines = [line.strip() for line in reason.splitlines() if line.strip()]
-    return ModelError(f'OpenVINO cannot read {file}: {" ".join(lines[-2:])[:300]}; update '
-                      'OpenVINO, or export the network with an opset of 11 to 21')
 
 
 def _name_of(port: Any) -> str:

@@ -28,10 +28,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DetectorOptions:
-    """The detector to load, and how to run it. The names are those of ultralytics.
-
-    OptionsError: a value is out of range.
-    """
+    """The detector to load, and how to run it. The names are those of ultralytics."""
 
     #: Path of an ONNX file, of a folder with one or of a ``.pt`` file; or a network that is
     #: downloaded once: OWNER/NAME[@REVISION][:FILE] of the hub, or a published ``.pt`` file.
@@ -49,15 +46,6 @@ class DetectorOptions:
     #: YOLOE; '': downloaded once. Any other tower must be a TorchScript file (.ts) that converts
     #: CLIP's tokens to embeddings
     text_model: str = ''
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        for name in ('conf', 'iou'):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise OptionsError(f'{name} must be 0 to 1, not {getattr(self, name)}')
-        for name in ('imgsz', 'max_det'):
-            if getattr(self, name) < 1:
-                raise OptionsError(f'{name} must be at least 1, not {getattr(self, name)}')
 
 
 @dataclass(frozen=True)
@@ -103,8 +91,7 @@ class ObjectDetector(Protocol):
     def detect(self, image_rgb: 'NDArray[np.uint8]') -> 'Detections':
         """Return the objects in an image (h, w, 3) uint8, the most confident first.
 
-        Boxes are in pixels of that image. ImageError: the image has another shape or type, or no
-        pixels.
+        Boxes are in pixels of that image, which has at least one pixel.
         """
 
 

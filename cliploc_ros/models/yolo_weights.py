@@ -13,7 +13,6 @@ import atexit
 import logging
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_encoder import LabelCache, encode_labels
+from cliploc_ros.models.clip_encoder import encode_labels, encoded_once
 from cliploc_ros.models.export import OPSET, compare, halve, quiet_export
 from cliploc_ros.models.exports import (
     CHECKPOINT,
@@ -44,16 +43,12 @@ _LEAST_STRIDE = 32
 _EMBED_DIM = 512
 _TOWERS = {'mobileclip:blt': 'mobileclip_blt.ts', 'mobileclip2:b': 'mobileclip2_b.ts'}
 
-logger = logging.getLogger(__name__)
-
 
 @cache
 def import_ultralytics() -> Any:
     """Import ultralytics without network requests, installations and files in the home."""
     import torch  # noqa: F401  before ultralytics, which sets OMP_NUM_THREADS to 1
 
-    if 'ultralytics' in sys.modules:
-        logger.warning('ultralytics was imported before the detector: it may use the network')
     folder = tempfile.mkdtemp(prefix='cliploc_ros_ultralytics_')
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     threads = os.environ.get('OMP_NUM_THREADS')
@@ -82,15 +77,13 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
     ModelError: the file is missing, damaged or unknown, or the download fails; the message names
     the option.
     """
-    file = Path(given).expanduser().absolute()
-    if file.exists() or Path(given).name != given:
+    file, folder = Path(given).expanduser().absolute(), resolve_cache_dir(cache_dir) / 'weights'
+    name = given if file.suffix in ('.pt', '.ts') else f'{given}.pt'
+    if not file.exists() and Path(given).name == given:
+        file = folder / name
+    if file.exists() or file.parent != folder:
         check_weights_file(file)
         return file
-    name = given if file.suffix in ('.pt', '.ts') else f'{given}.pt'
-    folder = resolve_cache_dir(cache_dir) / 'weights'
-    if (folder / name).exists():
-        check_weights_file(folder / name)
-        return folder / name
     with needs_pytorch(f'{name}, which is not a local file and not in {folder},'):
         import_ultralytics()
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES, attempt_download_asset
@@ -195,12 +188,8 @@ def set_prompts(model: Any, options: DetectorOptions) -> None:
                            'YOLOE with prompts, such as yolov8s-worldv2.pt')
     key, encode = _tower(getattr(network, 'text_model', 'mobileclip:blt') if is_yoloe else 'clip',
                          options)
-    cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'labels')
-    rows = cache.load(key, texts, _EMBED_DIM)
-    if rows is None:
-        rows = encode(texts)
-        cache.store(key, texts, rows)
-    embedded = torch.from_numpy(rows)[None]
+    embedded = torch.from_numpy(
+        encoded_once(key, texts, _EMBED_DIM, options.cache_dir, encode))[None]
     if is_yoloe:
         with torch.no_grad():
             network.set_classes(texts, head.get_tpe(embedded))

@@ -1,6 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The detector node: publishes detections in images, while the detections have a subscriber."""
+"""Publishes the detections of a network in the newest image, while they have a subscriber.
+
+  in    image, image/compressed
+  out   detections, /diagnostics
+
+The network is that of the parameter model, or of profile.
+"""
 
 import threading
 import time
@@ -28,17 +34,9 @@ from cliploc_ros.models.protocols import (
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg, of_camera, stamp_ns
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
-from cliploc_ros.ros.node.lifecycle import ManagedNode, run_node
+from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode, run_node
 from cliploc_ros.ros.node.threads import LatestOnly, Worker
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
-
-_LOG_PERIOD_S = 5.0
-ABOUT = """\
-Publishes the detections of a network in the newest image, while they have a subscriber.
-
-  in    image, image/compressed
-  out   detections, /diagnostics
-"""
 
 
 class TimedImage(NamedTuple):
@@ -77,11 +75,9 @@ class NewestInstant:
     def offer(self, camera: str, image: TimedImage) -> None:
         """Queue an image of a camera."""
         with self._lock:
-            images = self._waiting.setdefault(camera, deque())
+            images = self._waiting.setdefault(camera, deque(maxlen=2))
+            self.dropped += len(images) == 2  # the oldest image
             images.append(image)
-            if len(images) > 2:
-                images.popleft()
-                self.dropped += 1
         self._signal.offer(camera)
 
     def _take(self, camera: str) -> None:
@@ -242,7 +238,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
             detections = self.detector.detect(pixels)
         except CliplocError as error:
             self._last_error = str(error)
-            self.get_logger().error(self._last_error, throttle_duration_sec=_LOG_PERIOD_S)
+            self.get_logger().error(self._last_error, throttle_duration_sec=LOG_PERIOD_S)
             return
         self._last_error = ''
         self.stages.add(times.ms)
@@ -259,7 +255,7 @@ def detector_options(parameters: DetectorParameters) -> DetectorOptions:
 
 def main() -> NoReturn:
     """Run the node until SIGINT or SIGTERM."""
-    run_node('detector', DetectorNode, ABOUT)
+    run_node('detector', DetectorNode, __doc__)
 
 
 if __name__ == '__main__':

@@ -1,12 +1,20 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The relocalizer node: computes the robot's pose from image and detections, on request."""
+"""Localizes the robot in a map of objects, on request or with every image.
+
+  in         image, image/compressed, camera_info, detections; optional: odom, imu, depth
+  out        ~/pose, initialpose, ~/hypotheses, ~/landmarks, ~/matches, ~/debug_image, ~/answer,
+             /diagnostics
+  services   ~/relocalize, ~/relocalize_fields, ~/record, ~/reload_map,
+             reinitialize_global_localization
+
+It needs a map: -p map_file:=MAP.yaml, which build_map writes.
+"""
 
 import importlib
 import math
 import os
 import threading
-import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
@@ -28,24 +36,12 @@ from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health
-from cliploc_ros.ros.node.lifecycle import ManagedNode, run_node
+from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode, run_node
 from cliploc_ros.ros.node.threads import MAX_REQUESTS, BoundedCallbackGroup, LatestOnly
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
 from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.ros.watch import Watcher
 
-_LOG_PERIOD_S = 5.0
-ABOUT = """\
-Localizes the robot in a map of objects, on request or with every image.
-
-  in         image, image/compressed, camera_info, detections; optional: odom, imu, depth
-  out        ~/pose, initialpose, ~/hypotheses, ~/landmarks, ~/matches, ~/debug_image, ~/answer,
-             /diagnostics
-  services   ~/relocalize, ~/relocalize_fields, ~/record, ~/reload_map,
-             reinitialize_global_localization
-
-It needs a map: -p map_file:=MAP.yaml, which build_map writes.
-"""
 # Topics, besides those of its cameras, that the diagnostics list for the doctor.
 _OTHER_TOPICS = ('odom', 'imu', 'initialpose', '/tf', '/tf_static')
 
@@ -250,12 +246,11 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             [Parameter(name, value=value) for name, value in values.items()])
 
     def _answer(self) -> Answer:
-        began_at = time.monotonic()
         answer = self._requests.answer()
         localizer = self._pipeline.localizer
         if not answer.map_hash and localizer is not None:
             answer = replace(answer, map_hash=localizer.map_hash)
-        self._counters.add(answer, time.monotonic() - began_at)
+        self._counters.add(answer)
         self._cases.end(answer)
         if answer.verdict is Verdict.ACCEPTED:
             self._watcher.start_over()
@@ -269,7 +264,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         except CliplocError as error:
             answer = Answer(Verdict.FAILED, str(error))
         self._record(answer)
-        self.get_logger().info(answer.message, throttle_duration_sec=_LOG_PERIOD_S)
+        self.get_logger().info(answer.message, throttle_duration_sec=LOG_PERIOD_S)
 
     def _record(self, answer: Answer) -> None:
         """Publish the answer, and the diagnostics with its verdict."""
@@ -281,7 +276,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
 def main() -> NoReturn:
     """Run the node until SIGINT or SIGTERM."""
-    run_node('relocalizer', RelocalizerNode, ABOUT)
+    run_node('relocalizer', RelocalizerNode, __doc__)
 
 
 if __name__ == '__main__':

@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from enum import StrEnum
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -44,7 +43,6 @@ _PHRASES: tuple[tuple[str, tuple[object, ...], str], ...] = (
     ('keyframe search', ('none', 'fast'), '{keyframe search} search of keyframes'),
     ('depth', ('',), '{depth}'), ('cameras', (1,), '{cameras} cameras'),
     ('left out', ('',), 'no image of {left out}'), ('prior', (0.0,), 'prior {prior:.1f}'))
-_LIBRARIES = ('cliploc_ros', 'numpy', 'scipy', 'numba')
 
 
 class Verdict(StrEnum):
@@ -179,25 +177,20 @@ class RequestCounters:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._kinds: Counter[RefusalKind] = Counter()
-        self._total_s = self._longest_s = 0.0
 
-    def add(self, answer: Answer, duration_s: float) -> None:
-        """Count a request and add its duration [s]."""
+    def add(self, answer: Answer) -> None:
+        """Count a request."""
         with self._lock:
             self._counts[answer.verdict] += 1
             if answer.kind is not None:
                 self._kinds[answer.kind] += 1
-            self._total_s += duration_s
-            self._longest_s = max(self._longest_s, duration_s)
 
     def values(self) -> dict[str, object]:
         """Return the counts since the start of the node."""
         with self._lock:
             return {'requests': self._counts.total(),
                     **{f'requests {verdict}': self._counts[verdict] for verdict in Verdict},
-                    **{f'refused: {kind}': self._kinds[kind] for kind in RefusalKind},
-                    'requests total [s]': f'{self._total_s:.3f}',
-                    'requests longest [s]': f'{self._longest_s:.3f}'}
+                    **{f'refused: {kind}': self._kinds[kind] for kind in RefusalKind}}
 
 
 class CaseRecorder:
@@ -260,15 +253,10 @@ class CaseRecorder:
             make_folder(folder)
         except (CliplocError, RuntimeError) as error:
             raise DatasetError(f'record_folder: {error}') from error
-        versions = {}
-        for name in _LIBRARIES:
-            with suppress(PackageNotFoundError):
-                versions[name] = version(name)
         arrays = case_arrays(Case(tuple(queries), {
             'verdict': last.verdict, 'message': last.message, 'found': found.verdict,
             'reason': found.detail, 'map_hash': found.map_hash,
-            'parameters': asdict(parameters), 'options': asdict(parameters.options()),
-            'versions': versions}))
+            'parameters': asdict(parameters), 'options': asdict(parameters.options())}))
         size, limit_mb, used = sum(array.nbytes for array in arrays.values()), \
             parameters.record_limit_mb, 0
         for parent, _, names in folder.walk():
@@ -276,9 +264,8 @@ class CaseRecorder:
                 with suppress(FileNotFoundError):  # moved away meanwhile
                     used += (parent / name).stat().st_size
         if used + size > limit_mb * _MIB:
-            raise DatasetError(f'{folder} holds {used // _MIB} MiB and this case needs '
-                               f'{max(1, size // _MIB)} MiB, but record_limit_mb is {limit_mb}: '
-                               'move recordings away, or raise record_limit_mb')
+            raise DatasetError(f'{folder} holds {used // _MIB} of record_limit_mb {limit_mb} and '
+                               f'needs {max(1, size // _MIB)} more: move recordings, or raise it')
         now = datetime.now(UTC).strftime('%Y%m%dT%H%M%S.%f')[:-3]
         path = folder / f'case_{now}_{last.verdict}.npz'
         CASE.write(path, arrays, compress=True)

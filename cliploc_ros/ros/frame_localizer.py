@@ -28,7 +28,6 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
 from cliploc_ros.core.map.joined_map import join_maps, parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.similarities import split_similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
@@ -61,8 +60,6 @@ logger = logging.getLogger(__name__)
 #: Value of keyframes_file that selects the layer next to the map, if it exists.
 NEXT_TO_MAP = 'auto'
 _DIGITS = 12
-# A map file that changes while it is read is read again.
-_ATTEMPTS = 3
 # The vertical in the frame of a body that is tilted by less than 45 degrees and rolled by less
 # than 17. In an optical frame, only a camera that looks up by more than 72 degrees has it there.
 _LEAST_Z, _MOST_Y = 0.7, 0.3
@@ -156,12 +153,9 @@ class FrameLocalizer:
             found.accepted and parameters.mode == 'continuous'
             and time.monotonic() < deadline) else found.covariance
         found, own = in_its_map(self.instants.explained(found), self.landmark_map)
-        parts = parts_of(self.landmark_map)
-        if seen.similarities is not None and len(parts) > 1:
-            pieces = split_similarities(seen.similarities, [len(part.landmark_map)
-                                                            for part in parts])
-            which = [part.first for part in parts].index(own.first)
-            seen = replace(seen, similarities=pieces[which])
+        if seen.similarities is not None and len(self.frame_ids) > 1:
+            seen = replace(seen, similarities=np.asarray(seen.similarities)[
+                :, own.first:own.first + len(own.landmark_map)])
         names = [camera_frame.camera_name for camera_frame in query.frames]
         layer = None if self.keyframes is None else self.keyframes.localizer.layer
         return Localized(
@@ -210,11 +204,11 @@ class FrameLocalizer:
         return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
 
     def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
-        """Return the localizer. If the options changed, it has a successor, and the watch too."""
+        """Return the localizer. If the options changed, it uses them, and the watch is new."""
         if options != self._options:
             relocalizer = Relocalizer(self.landmark_map, options)
             self._options, self.watch = options, Watch(relocalizer)
-            self.localizer = self.localizer.successor(relocalizer)
+            self.localizer.use(relocalizer)
         return self.localizer
 
 
@@ -311,8 +305,8 @@ class Instants:
                     frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
                     frame.depth_camera_info, state.camera_from_depth)
             elif parameters.depth_transport != 'none':
-                self.note('an image without depth: no depth within depth_tolerance_s '
-                          f'({parameters.depth_tolerance_s:g} s) of it: remap depth, start its '
+                self.note('no depth within depth_tolerance_s '
+                          f'({parameters.depth_tolerance_s:g} s): remap depth, start its '
                           'publisher, or set depth_transport to none')
         except CliplocError as error:
             self.note(f'localizing without depth: {error}')
@@ -421,16 +415,14 @@ def load_map(node: Node, files: Sequence[str]) -> tuple[LandmarkMap, str]:
     it is the hash of its landmarks.
 
     MapError: the map is invalid, and the message names the source, the landmark and the field; or
-    a file changes repeatedly while it is read.
+    a file changes while it is read.
     """
-    for _ in range(_ATTEMPTS if files else 0):
+    if files:
         before = _hash_of(files)
         landmark_map = join_maps([LandmarkMap.from_file(file) for file in files], files)
-        if before == _hash_of(files):
-            return landmark_map, before
-    if files:
-        raise MapError(f'{", ".join(files)}: changes while it is read; write a new file, then '
-                       'rename it')
+        if before != _hash_of(files):
+            raise MapError(f'{", ".join(files)}: changed while it was read: reload the map')
+        return landmark_map, before
     parameters = node.get_parameters_by_prefix('map')
     if not parameters:
         raise MapError('no map: set map_file, or load a map with --params-file')

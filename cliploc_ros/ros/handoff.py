@@ -121,8 +121,7 @@ class HandOff:
         """Return why there is no localizer, and what to do; empty if there is one."""
         if not self._publisher.get_subscription_count():
             return (f'nobody subscribes to {self._publisher.topic_name}: start the localizer '
-                    '(AMCL); if it has just started, retry; without a localizer, set '
-                    'require_localizer: false')
+                    '(AMCL), then retry; without one, set require_localizer: false')
         if self._subscription is not None and not self._node.count_publishers(self._pose_topic):
             return (f'nobody publishes {self._pose_topic}: start the localizer (AMCL); if it has '
                     'just started, retry; or set localizer_pose to the topic of its pose')
@@ -170,12 +169,12 @@ class HandOff:
             with self._changed:
                 self._changed.wait(min(_POLL_S, _left_s(until)))
         must_show = parameters.require_localizer and self._subscription is not None
-        given, times, begun_at = pose, 0, time.monotonic()
+        given, times = pose, 0
         while not times or (must_show and not self._is_shown(given, deadline)):
             # first, because with any time left a robot that moves is told to stop
             self.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s, deadline)
             if must_show and _left_s(deadline) < _LEAST_S:
-                raise NoLocalizerError(self._not_taken(given, times, begun_at))
+                raise NoLocalizerError(self._not_taken(given, times))
             self._check_place(pose.header.stamp, deadline)
             jumps.check(pose.header.stamp, received_at)
             if self._stopped.is_set():
@@ -188,7 +187,7 @@ class HandOff:
             raise NoLocalizerError('the localizer took the pose, but has ended or hangs: '
                                    f'{gone}; see its log, then retry')
         if must_show and not self._is_taken(given, _CARRY_S):
-            raise NoLocalizerError(self._not_taken(given, times, begun_at))
+            raise NoLocalizerError(self._not_taken(given, times))
         if silent:
             self._node.get_logger().warning(
                 f'{silent}: the localizer has the pose, but may not converge while the robot is '
@@ -235,15 +234,14 @@ class HandOff:
             pose @ base_from_body @ motion @ invert_transform(base_from_body))
         return carried
 
-    def _not_taken(self, given: PoseWithCovarianceStamped, times: int, begun_at: float) -> str:
+    def _not_taken(self, given: PoseWithCovarianceStamped, times: int) -> str:
         """Return why the localizer has not taken the given pose, for a message."""
         shown, why = self._shown, 'the localizer did not take the pose: '
         if not times:
             return 'too little time is left for the localizer to take the pose: retry'
         if shown is None:
             return (f'{why}no message on {self._pose_topic} since initialpose was published '
-                    f'{times} times in {time.monotonic() - begun_at:.0f} s: check that the '
-                    'localizer is active and receives scans')
+                    f'{times} times: check that the localizer is active and receives scans')
         given = self._carried(given, shown.header.stamp)
         return f'{why}{self._pose_topic} {difference(given, shown)}'
 
@@ -291,9 +289,9 @@ class HandOff:
                                'stamp both by the same clock, publish at 1 Hz or more, then retry')
         distance_m, angle_deg = moved or (0.0, 0.0)
         if distance_m > SAME_SPOT.distance_m or angle_deg > SAME_SPOT.angle_deg:
-            raise HandOffError(f'the robot has moved by {distance_m:.2f} m and {angle_deg:.0f} '
-                               f'degrees since its image (limits {SAME_SPOT.distance_m:g} and '
-                               f'{SAME_SPOT.angle_deg:g}): stop it, then retry')
+            raise HandOffError(
+                f'the robot has moved by {distance_m:.2f} m and {angle_deg:.0f} degrees since its '
+                f'image (limits {SAME_SPOT.distance_m:g} and {SAME_SPOT.angle_deg:g}): stop it')
 
     def _settle(self, updates: int, deadline: float) -> str:
         """Make AMCL process some scans while the robot is at rest, as far as time allows.

@@ -264,9 +264,6 @@ class RelocalizerParameters(CommonParameters):
             raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
         if self.camera_names and not self.base_frame:
             raise OptionsError('cameras: several cameras need the parameter base_frame')
-        if len(self.mount_deviation) != 2 or not all(
-                0.0 <= deviation < math.inf for deviation in self.mount_deviation):
-            raise OptionsError('mount_deviation: needs two numbers of 0 or more')
         if self.publish_tf and not self.base_frame:
             raise OptionsError('publish_tf: needs the parameter base_frame')
         if self.watch == 'amcl_pose' and not self.localizer_pose:

@@ -131,8 +131,15 @@ class AdaptiveSubscription:
         self._node.destroy_subscription(former)
 
     def _take(self, data: bytes) -> None:
-        if not data:
-            self._take_empty()
+        if not data:  # subscribe again, see the class
+            with self._lock:
+                now = time.monotonic()
+                if self._subscription is None or now - self._renewed_at < _RENEWAL_PERIOD_S:
+                    return
+                self._renewed_at = now
+                self._renew(self._subscription)
+            self._node.get_logger().warning(
+                f'an empty message on {self._topic}: subscribed again')
             return
         try:
             message = deserialize_message(data, self._message_type)
@@ -143,16 +150,6 @@ class AdaptiveSubscription:
             return
         self._callback(message)
 
-    def _take_empty(self) -> None:
-        """Subscribe again, see the class."""
-        with self._lock:
-            now = time.monotonic()
-            if self._subscription is None or now - self._renewed_at < _RENEWAL_PERIOD_S:
-                return
-            self._renewed_at = now
-            self._renew(self._subscription)
-        self._node.get_logger().warning(
-            f'an empty message on {self._topic}: subscribed again')
 
 
 class Listener(ABC):

@@ -30,11 +30,10 @@ from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.node.lifecycle import ManagedNode, NotActiveError
+from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode, NotActiveError
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.visualization import Visualization
 
-_LOG_PERIOD_S = 5.0
 # Each frame without odometry adds to the risk of a false accept.
 _MAX_UNLINKED = 3
 # The current request ends at its own deadline, shortly before that of the waiting requests.
@@ -124,7 +123,7 @@ class Pipeline:
         stages_ms = times.ms
         self._node.stages.add(stages_ms)
         if faults := '; '.join(fault.text for fault in localizer.instants.faults):
-            self._node.get_logger().warning(faults, throttle_duration_sec=_LOG_PERIOD_S)
+            self._node.get_logger().warning(faults, throttle_duration_sec=LOG_PERIOD_S)
         return Look(answer_to(frame, localized, known.state, parameters, localizer.map_hash,
                               stages_ms), localized, known.state, frame.image.header)
 

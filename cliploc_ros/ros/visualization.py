@@ -83,14 +83,16 @@ def _markers_of(landmark_map: LandmarkMap, first: int) -> list[Marker]:
     for number, (center, semi_axes, quat_xyzw, label, class_id) in enumerate(rows, start=first):
         ellipsoid = Marker(header=header, ns='landmarks', id=number, type=Marker.SPHERE,
                            color=class_color(class_id))
-        _place(ellipsoid, center)
+        ellipsoid.pose.position = _point(center)
         q = ellipsoid.pose.orientation
         q.x, q.y, q.z, q.w = map(float, quat_xyzw)
         scale = ellipsoid.scale
         scale.x, scale.y, scale.z = map(float, 2.0 * semi_axes)
         text = Marker(header=header, ns='labels', id=number, type=Marker.TEXT_VIEW_FACING,
                       text=label, color=ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0))
-        _place(text, center + np.array([0.0, 0.0, semi_axes.max() + _TEXT_HEIGHT_M]))
+        text.pose.position = _point(center)
+        text.pose.position.z += float(semi_axes.max()) + _TEXT_HEIGHT_M
+        text.pose.orientation.w = 1.0
         text.scale.z = _TEXT_HEIGHT_M
         markers += [ellipsoid, text]
     return markers
@@ -133,11 +135,6 @@ def class_color(class_id: str) -> ColorRGBA:
     hue = zlib.crc32(class_id.encode()) / 2**32
     r, g, b = colorsys.hsv_to_rgb(hue, 0.7, 0.95)
     return ColorRGBA(r=r, g=g, b=b, a=0.6)
-
-
-def _place(marker: Marker, position: NDArray[np.float64]) -> None:
-    marker.pose.position = _point(position)
-    marker.pose.orientation.w = 1.0
 
 
 def _point(position: NDArray[np.float64]) -> Point:

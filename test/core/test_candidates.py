@@ -64,7 +64,7 @@ def test_landmarks_of_several_classes_agree_with_their_mask(landmarks, others, d
     assert sorted(rarest.tolist()) == np.argwhere(mask).tolist()
     assert (class_candidates(index, classes, limit).pairs == rarest[:limit]).all()
     rows, columns = np.indices(mask.shape).reshape(2, -1)
-    assert (index.have(columns, classes[rows]) == mask.ravel()).all()
+    assert ((index.shares(columns, classes[rows]) > 0.0) == mask.ravel()).all()
     assert (np.diff(index.members[:, 0]) >= 0).all()  # in the map's order
     assert (index.of_landmarks == index.classes_of(landmarks)).all()
 

@@ -553,7 +553,7 @@ def test_looks_by_keyframes_remain_and_the_farthest_is_compared():
     passed, then_from_now = looks.passed(frame(3.0, 0.0, 2.0))
     assert passed.observation.stamp_ns == 10**9 and then_from_now[0, 3] == 5.0
     alone = looks.with_look(Look(replace(frame(4.0), odom_from_camera=None), pose(), 0.8))
-    assert len(alone) == 1 and alone.recognized == ()
+    assert len(alone.past) == 1 and alone.recognized == ()
 
 
 def test_doubts_about_the_camera_count_for_the_view_alone(office_map, office_frames):
@@ -570,16 +570,16 @@ def test_a_changed_option_keeps_the_evidence(session):
     for number in range(4):
         drive(session, number, 3.0 * number, objects=3)
     session.depth_scale.add(DepthCheck(1, 0.0, 0.0, 2.0))
-    same = session.successor(Relocalizer(ROOM, RelocalizerOptions(matching='class', k=3)))
-    assert (same.cameras, same.depth_scale) == (session.cameras, session.depth_scale)
-    found = drive(same, 5.0, 12.0)
+    session.use(Relocalizer(ROOM, RelocalizerOptions(matching='class', k=3)))
+    assert session.depth_scale._ratios
+    found = drive(session, 5.0, 12.0)
     assert 'last 5 frames' in found.reason
-    found = drive(same, 4.0, 12.0)
+    found = drive(session, 4.0, 12.0)
     assert found.accepted, 'time went back'
-    same.covariance_for_filter(found)
-    again = same.successor(RELOCALIZER)
-    found = drive(again, 5.0, 12.0)
-    assert (np.diag(again.covariance_for_filter(found)) > np.diag(found.covariance)).all()
+    session.covariance_for_filter(found)
+    session.use(RELOCALIZER)
+    found = drive(session, 5.0, 12.0)
+    assert (np.diag(session.covariance_for_filter(found)) > np.diag(found.covariance)).all()
 
 
 def test_a_search_of_keyframes_that_time_cuts_off_is_named_and_repeated():

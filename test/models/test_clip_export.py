@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from cliploc_ros.cli.export_network import main as export_network
 from cliploc_ros.errors import ModelError
 from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
-from cliploc_ros.models.images import crop_bounds
+from cliploc_ros.models.observer import crop_bounds
 from cliploc_ros.models.onnx_clip import OnnxTextTower, resolve_clip_weights
 from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
@@ -206,8 +206,7 @@ def test_an_export_that_gives_other_results_is_refused(small_clip, tmp_path):
 
 
 @pytest.mark.parametrize(('content', 'message'), [
-    (b'', 'is empty'),
-    (b'\n<!DOCTYPE html><html><body>Sign in</body></html>', 'is a web page'),
+    (b'', 'holds no weights'),
     (b'just text', 'holds no weights'), (b'PK\x03\x04' + bytes(1000), 'truncated'),
     (b'\x80\x02garbage', 'not a checkpoint')])
 def test_files_that_are_no_weights(small_clip, tmp_path, content, message):

@@ -37,7 +37,6 @@ def test_a_recorded_failure_replays_to_the_same_verdict(own_relocalizer, tester,
     assert f'map {digest}' in answer.message and f'map {digest}\n' in output
     found = read_case(case)
     np.testing.assert_array_equal(found.queries[0].images[0], image_from_msg(four_of()[0]))
-    assert found.report['versions'].keys() >= {'numpy'}
     full = tester.trigger('record')
     assert not full.success and 'record_limit_mb' in full.message
     assert len(list((tmp_path / 'cases').iterdir())) == 1

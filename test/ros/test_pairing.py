@@ -50,20 +50,19 @@ def test_a_set_is_complete_if_and_only_if_nothing_of_it_was_evicted(additions):
         assert sum(pairing._bytes.values()) == sum(map(expected.size, TOPICS))
 
 
-def paired_by_a_slow_detector(behind, room, images, queue=False, begin=0):
+def paired_by_a_slow_detector(behind, room, images, begin):
     """Return the paired images of a camera whose detections arrive a number of images later.
 
-    A detector processes the newest image when it is ready, or all images from a queue.
+    A detector processes the newest image when it is ready.
     """
     pairing = ExactPairing({'image': 100 * room, 'detections': 10**9}, 2000, 'image', 'detections')
     paired, taken, done_at = [], 0, begin
     for number in range(1, images + 1):
         pairing.add('image', number, number, 100)
         assert sum(pairing._bytes.values()) <= 100 * room
-        stamp = number - behind if queue else taken
-        if queue or number >= done_at:
-            if stamp and pairing.add('detections', stamp, 'boxes', 0):
-                paired.append(stamp)
+        if number >= done_at:
+            if taken and pairing.add('detections', taken, 'boxes', 0):
+                paired.append(taken)
             taken, done_at = number, number + behind
     return paired
 
@@ -72,18 +71,18 @@ def paired_by_a_slow_detector(behind, room, images, queue=False, begin=0):
 def test_images_pair_however_slow_the_detector_is(behind, room):
     """4K images at 30 Hz, of which 10 fit into memory, and 1080p: .2 to 10 s late."""
     for begin in (0, behind // 2):  # it starts with the first image, or was already running
-        paired = paired_by_a_slow_detector(behind, room, 10 * behind, begin=begin)
+        paired = paired_by_a_slow_detector(behind, room, 10 * behind, begin)
         assert len(paired) >= 8, paired
-    assert len(paired_by_a_slow_detector(behind, room, 10 * behind, queue=True)) >= 6
 
 
-def test_how_late_detections_of_forgotten_images_are():
+def test_detections_of_forgotten_images_are_noticed():
     pairing = ExactPairing({'image': 300, 'detections': 10**9}, 2000, 'image', 'detections')
     for number in range(1, 10):
         pairing.add('image', number, number, 100)
-    assert pairing.add('detections', 3, 'boxes', 0) is None and pairing.outrun == 7
+    assert pairing.add('detections', 3, 'boxes', 0) is None and pairing.is_outrun
     assert pairing.received == {'image': 9, 'detections': 1}
     assert pairing.last_stamp_ns == {'image': 9, 'detections': 3}
+    assert pairing.add('detections', 10, 'boxes', 0) is None and not pairing.is_outrun
     pairing.clear()
     assert pairing.received == {'image': 0, 'detections': 0} and pairing.last_stamp_ns == {}
     assert pairing.add('image', 3, 3, 100) is None

@@ -42,8 +42,8 @@ from cliploc_ros.core.acceptance.contenders import (
 )
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, signs_of
 from cliploc_ros.core.acceptance.look_alikes import find_twins, lead_over_twin, turned_about_axis
-from cliploc_ros.core.acceptance.looks import Looks
-from cliploc_ros.core.acceptance.verdict import Evidence, Rival, is_exhaustive
+from cliploc_ros.core.acceptance.looks import NO_LOOKS, Looks
+from cliploc_ros.core.acceptance.verdict import Evidence, Rival
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import POSE_UNKNOWN, fuse, refined_covariance, share_within
 from cliploc_ros.core.fit.finalists import (
@@ -64,7 +64,6 @@ from cliploc_ros.core.options import NEVER
 from cliploc_ros.core.search.frame_search import constraint_of, coverage_of, search_frame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
 
-_NO_LOOKS = Looks()
 _FLIP = np.diag([-1.0, 1.0, 1.0, 1.0])
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -99,7 +98,7 @@ class Comparison:
         Search of keyframes for the last image. The places that it recognizes compete, too.
     """
 
-    def __init__(self, joined: JoinedFrames, met: Sequence[Contender], looks: Looks = _NO_LOOKS,
+    def __init__(self, joined: JoinedFrames, met: Sequence[Contender], looks: Looks = NO_LOOKS,
                  recognizer: ImageRecognizer | None = None) -> None:
         self._joined, self._looks, self._recognizer = joined, looks, recognizer
         self._last, self._none = joined.frames[-1].observation, none_right(joined.setting)
@@ -232,8 +231,9 @@ class Comparison:
             else share_within(RIGHT_M, CALIBRATION.covariance.caution * covariance),
             deviation_m=math.sqrt(np.trace(covariance[:3, :3])), coverage=coverage,
             tried=sum(frame.known_tried for frame in frames),
-            meetings=math.inf if self.by_objects is None or is_exhaustive(
-                coverage, self._joined.options)
+            # infinite for a search that tried every sample
+            meetings=math.inf if self.by_objects is None or (
+                coverage == 1.0 and self._joined.options.algorithm in ('auto', 'bf'))
             else meetings_of(frames, best.finalist, best.matches),
             unexplained=best.support.unexplained, signs=self._signs(best), motion=self._motion(),
             not_mirrored=self._not_mirrored(by_points), uncontradicted=self._uncontradicted(),

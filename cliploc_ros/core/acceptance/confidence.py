@@ -302,28 +302,28 @@ def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> floa
             + terms.vertical * setting.vertical)
 
 
-def counted_points(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
+def counted_points(place: RecognizedPlace) -> float:
     """Return how many of the features that agree with a place count as evidence, at least 1."""
-    share = calibration.keyframes.thorough if place.is_thorough else 1.0
+    share = CALIBRATION.keyframes.thorough if place.is_thorough else 1.0
     return max(1.0, share * place.inliers)
 
 
-def points_utility(place: RecognizedPlace, calibration: Calibration = CALIBRATION) -> float:
+def points_utility(place: RecognizedPlace) -> float:
     """Return the log odds of a recognized place by its points, against a chance agreement.
 
     A keyframe near the pose shows the same as the image: if few cells match there, the points are
     a pattern that repeats elsewhere. From farther away, a right pose has fewer points. Features
     do not match across much larger angles or distances.
     """
-    terms = calibration.keyframes
+    terms = CALIBRATION.keyframes
     return min(terms.most, terms.none + terms.confirmed * place.confirmed
-               + terms.inliers * math.log(counted_points(place, calibration))
+               + terms.inliers * math.log(counted_points(place))
                + terms.apart * min(1.0, place.apart) + terms.far * max(0.0, place.apart - 2.0))
 
 
-def objects_utility(support: Support, calibration: Calibration = CALIBRATION) -> float:
+def objects_utility(support: Support) -> float:
     """Return the log odds of a pose that keyframes propose, from its objects alone."""
-    terms = calibration.keyframes
+    terms = CALIBRATION.keyframes
     return (terms.explained * min(terms.most_objects, support.inliers)
             + terms.unexplained * min(terms.most_objects, support.unexplained))
 

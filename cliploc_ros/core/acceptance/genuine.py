@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.calibration import CALIBRATION, Calibration
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_covariance, pose_difference
@@ -127,15 +127,14 @@ def signs_of(place: RecognizedPlace, boxes: NDArray[np.float64], camera: Camera,
         contradicted * max(0.0, 1.0 - place.inliers / _TERMS.sure_points))
 
 
-def chance_genuine(signs: Signs, motion: Motion | None = None,
-                   calibration: Calibration = CALIBRATION) -> float:
+def chance_genuine(signs: Signs, motion: Motion | None = None) -> float:
     """Return the probability that a place is genuine and unchanged."""
-    terms = calibration.genuine
-    odds = terms.none + sum(getattr(terms, name) * sign for name, sign in signs._asdict().items())
+    odds = _TERMS.none + sum(getattr(_TERMS, name) * sign
+                             for name, sign in signs._asdict().items())
     if motion is not None:
         odds -= 0.5 * max(0.0, motion.square - SURE_MOTION)
         if motion.square < SURE_MOTION:
-            odds += min(terms.most_motion, 0.5 * max(0.0, motion.picture - SURE_MOTION))
+            odds += min(_TERMS.most_motion, 0.5 * max(0.0, motion.picture - SURE_MOTION))
     return 1.0 / (1.0 + math.exp(-min(max(odds, -50.0), 50.0)))
 
 

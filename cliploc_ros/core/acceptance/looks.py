@@ -59,10 +59,6 @@ class Looks:
     past: tuple[Look, ...] = ()  #: The looks since the last accepted pose
     recognized: tuple[Look, ...] = ()  #: The last looks by keyframes, accepted or not
 
-    def __len__(self) -> int:
-        """Return the number of looks."""
-        return len(self.past)
-
     def with_look(self, look: Look, accepted: bool = False) -> 'Looks':
         """Return these looks and a new one; looks at the same or a later stamp are dropped.
 
@@ -112,6 +108,10 @@ class Looks:
             found.append((look, invert_transform(look.observation.odom_from_camera)
                           @ odom_from_camera))
         return max(found, key=lambda pair: float(np.linalg.norm(pair[1][:3, 3])), default=None)
+
+
+#: No earlier looks
+NO_LOOKS = Looks()
 
 
 def _before(looks: tuple[Look, ...], observation: Observation) -> tuple[Look, ...]:

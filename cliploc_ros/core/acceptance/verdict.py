@@ -178,11 +178,6 @@ class Evidence:
         return float(np.mean([self.confidence, *(look.confidence for look in self.earlier)]))
 
 
-def is_exhaustive(coverage: float, options: RelocalizerOptions) -> bool:
-    """Return whether a search has tried every sample."""
-    return coverage == 1.0 and options.algorithm in ('auto', 'bf')
-
-
 def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
     """Return the refusal of the leading pose; None if it is accepted.
 

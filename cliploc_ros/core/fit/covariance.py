@@ -204,11 +204,20 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     of_frames = _sums(of_matches, fit.frames, len(fit.cameras)) + fit.verticals
     known = max(1, int(fit.verticals.any(axis=(1, 2)).sum()))
     noise = (noise_of_objects.sum(axis=0) + known * verticals + prior
-             + _odometry_noise(fit.cameras, of_frames, instants)
-             + _mount_noise(fit.cameras, of_frames, instants, mount_deviation))
+             + _odometry_noise(fit.cameras, of_frames, instants))
+    # mounts are relative to the last camera of each instant
+    mounts = np.repeat([mount_deviation[0], np.radians(mount_deviation[1])], 3)
+    noise += sum((_squared(_about(of_frames[row], fit.cameras, row) * mounts)
+                  for row in range(len(instants) - 1) if instants[row] in instants[row + 1:]),
+                 np.zeros((6, 6)))
     matched = _sandwich(information, noise)
     # errors common to all objects, which remain if an object is left out
-    common = _calibration_noise(fit.calibrations, instants, camera_deviations)
+    # cameras have the same order at each instant
+    cameras = np.array([list(instants[row + 1:]).count(number)
+                        for row, number in enumerate(instants)])
+    common = np.asarray(sum((_squared(fit.calibrations[cameras == number].sum(axis=0)
+                                      * camera_deviations)
+                             for number in set(cameras.tolist())), np.zeros((6, 6))))
     deviations = np.repeat(shared[fit.numbers], 3, axis=1)
     common += _squared((of_objects * deviations[:, None, :]).sum(axis=0))
     gradients = _sums(np.einsum('mei,me->mi', fit.jacobian, fit.weights * fit.residuals),
@@ -334,27 +343,6 @@ def _odometry_noise(cameras: NDArray[np.float64], information: NDArray[np.float6
         noise += _squared(_about(information[beyond].sum(axis=0), cameras,
                                  after if is_before else before) * deviations)
     return noise
-
-
-def _mount_noise(cameras: NDArray[np.float64], information: NDArray[np.float64],
-                 instants: NDArray[np.int64], mount_deviation: tuple[float, float]
-                 ) -> NDArray[np.float64]:
-    """Return the part of M (6, 6) that errors of the mounts of several cameras cause."""
-    deviations = np.repeat([mount_deviation[0], np.radians(mount_deviation[1])], 3)
-    # mounts are relative to the last camera of each instant
-    others = [row for row in range(len(cameras) - 1) if instants[row] in instants[row + 1:]]
-    return np.asarray(sum((_squared(_about(information[row], cameras, row) * deviations)
-                           for row in others), np.zeros((6, 6))))
-
-
-def _calibration_noise(calibrations: NDArray[np.float64], instants: NDArray[np.int64],
-                       deviations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the part of M (6, 6) that errors of the cameras' calibrations cause."""
-    # cameras have the same order at each instant
-    cameras = np.array([list(instants[row + 1:]).count(number)
-                        for row, number in enumerate(instants)])
-    return np.asarray(sum((_squared(calibrations[cameras == number].sum(axis=0) * deviations)
-                           for number in set(cameras.tolist())), np.zeros((6, 6))))
 
 
 def _about(information: NDArray[np.float64], cameras: NDArray[np.float64], row: int

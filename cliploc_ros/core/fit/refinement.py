@@ -138,13 +138,28 @@ def jacobian_of(pairs, vertical, rotation, translation):
     """
     jacobian = np.zeros((5 * len(pairs) + 3, 6))
     for row in range(len(pairs)):
-        _differentiate(pairs[row, 4:7], pairs[row, 7:13], rotation, translation, pairs[row, 13],
+        center, deviation, depth = pairs[row, 4:7], pairs[row, 15], jacobian[5 * row + 4]
+        _differentiate(center, pairs[row, 7:13], rotation, translation, pairs[row, 13],
                        jacobian[5 * row:5 * row + 4])
-        if pairs[row, 15] > 0.0:
-            _differentiate_depth(pairs[row, 4:7], rotation, translation, pairs[row, 15],
-                                 jacobian[5 * row + 4])
-    if vertical[6] > 0.0:
-        _differentiate_vertical(vertical, rotation, jacobian[5 * len(pairs):])
+        if deviation > 0.0:  # the residual of a depth is axis @ (center - camera)
+            for axis in range(3):
+                j, k = (axis + 1) % 3, (axis + 2) % 3
+                ray_j, ray_k = center[j], center[k]
+                for i in range(3):
+                    ray_j += rotation[i, j] * translation[i]
+                    ray_k += rotation[i, k] * translation[i]
+                depth[axis] = -rotation[2, axis] / deviation
+                depth[3 + axis] = (rotation[2, j] * ray_k - rotation[2, k] * ray_j) / deviation
+    if vertical[6] > 0.0:  # a rotation by a adds -a x up
+        up, own = np.empty(3), jacobian[5 * len(pairs):]
+        for i in range(3):
+            up[i] = (rotation[i, 0] * vertical[3] + rotation[i, 1] * vertical[4]
+                     + rotation[i, 2] * vertical[5])
+        for axis in range(3):
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                own[i, 3 + axis] = (rotation[k, axis] * up[j]
+                                    - rotation[j, axis] * up[k]) / vertical[6]
     return jacobian
 
 
@@ -191,33 +206,6 @@ def _edges(d_middle, d_diagonal, middle, half, deviation):
     """Return the derivatives of two opposite edges from those of N's column and diagonal."""
     d_half = (2.0 * middle * d_middle - d_diagonal) / (2.0 * half)
     return (d_middle - d_half) / deviation, (d_middle + d_half) / deviation
-
-
-@compiled
-def _differentiate_depth(center, rotation, translation, deviation, jacobian):
-    """Write the derivatives (6,) of the residual of a depth, axis @ (center - camera)."""
-    for axis in range(3):
-        j, k = (axis + 1) % 3, (axis + 2) % 3
-        ray_j, ray_k = center[j], center[k]
-        for row in range(3):
-            ray_j += rotation[row, j] * translation[row]
-            ray_k += rotation[row, k] * translation[row]
-        jacobian[axis] = -rotation[2, axis] / deviation
-        jacobian[3 + axis] = (rotation[2, j] * ray_k - rotation[2, k] * ray_j) / deviation
-
-
-@compiled
-def _differentiate_vertical(vertical, rotation, jacobian):
-    """Write the derivatives (3, 6) of the vertical's residuals. A rotation by a adds -a x up."""
-    up = np.empty(3)
-    for i in range(3):
-        up[i] = (rotation[i, 0] * vertical[3] + rotation[i, 1] * vertical[4]
-                 + rotation[i, 2] * vertical[5])
-    for axis in range(3):
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            jacobian[i, 3 + axis] = (rotation[k, axis] * up[j]
-                                     - rotation[j, axis] * up[k]) / vertical[6]
 
 
 @compiled
@@ -371,26 +359,20 @@ def linearize_rig(inliers, rotation, translation, residuals):
             for row in range(3):
                 lever[axis] += (rotation[row, axis] * translation[row]
                                 - own_rotation[row, axis] * own_translation[row])
-        _move_to_reference(lever, own_information, own_gradient)
+        for axis in range(3):  # the reference turns about this axis: w x l = -[l] w
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            own_gradient[3 + axis] += lever[i] * own_gradient[j] - lever[j] * own_gradient[i]
+            for row in range(6):
+                own_information[row, 3 + axis] += (lever[i] * own_information[row, j]
+                                                   - lever[j] * own_information[row, i])
+        for axis in range(3):
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            for column in range(6):
+                own_information[3 + axis, column] += (lever[i] * own_information[j, column]
+                                                      - lever[j] * own_information[i, column])
         gradient += own_gradient
         information += own_information
     return information, gradient
-
-
-@compiled
-def _move_to_reference(lever, information, gradient):
-    """Transform a camera's information and gradient to steps of the reference camera, in place."""
-    for axis in range(3):  # the reference turns about this axis: w x l = -[l] w
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        gradient[3 + axis] += lever[i] * gradient[j] - lever[j] * gradient[i]
-        for row in range(6):
-            information[row, 3 + axis] += (lever[i] * information[row, j]
-                                           - lever[j] * information[row, i])
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        for column in range(6):
-            information[3 + axis, column] += (lever[i] * information[j, column]
-                                              - lever[j] * information[i, column])
 
 
 @compiled

@@ -180,35 +180,29 @@ def verify_rig(rig, rotation, translation):
 @compiled
 def _verify(scene, rotation, translation, ious, landmarks):
     """Write the landmark and IoU of each detection; return the score of the frame."""
-    boxes, potential = scene.box_ellipses, scene.potential
+    boxes, potential, groups = scene.box_ellipses, scene.potential, scene.groups
     for u in range(potential.landmarks.shape[0]):
         landmark = potential.landmarks[u]
         outline = project_ellipsoid(rotation, translation, scene.centers[landmark],
                                     scene.shapes[landmark])
         _offer(boxes, potential.detections[potential.starts[u]:potential.starts[u + 1]],
                landmark, outline, ious, landmarks)
-    if scene.groups.members.shape[0] > 0:
-        _offer_groups(scene, rotation, translation, ious, landmarks)
+    if groups.members.shape[0] > 0:  # the landmarks of each class that may be in view
+        numbers = scene.sorted_landmarks.numbers
+        visible = np.empty((2, groups.members.shape[0]), dtype=np.int64)
+        pose = Poses(rotation.reshape(1, 3, 3), translation.reshape(1, 3))
+        for place in range(visible_members(groups, pose, ZERO, visible)):
+            row, group = groups.members[visible[0, place], 0], groups.members[visible[0, place], 1]
+            outline = project_ellipsoid(rotation, translation, scene.centers[numbers[row]],
+                                        scene.shapes[numbers[row]])
+            _offer(boxes, groups.detections[groups.starts[group]:groups.starts[group + 1]],
+                   numbers[row], outline, ious, landmarks)
     score = 0.0
     for detection in range(ious.shape[0]):
         if landmarks[detection] < 0:
             ious[detection] = 0.0
         score += ious[detection]
     return score
-
-
-@compiled
-def _offer_groups(scene, rotation, translation, ious, landmarks):
-    """Match detections with the landmarks of their class that may be in view."""
-    boxes, groups, numbers = scene.box_ellipses, scene.groups, scene.sorted_landmarks.numbers
-    visible = np.empty((2, groups.members.shape[0]), dtype=np.int64)
-    pose = Poses(rotation.reshape(1, 3, 3), translation.reshape(1, 3))
-    for place in range(visible_members(groups, pose, ZERO, visible)):
-        row, group = groups.members[visible[0, place], 0], groups.members[visible[0, place], 1]
-        outline = project_ellipsoid(rotation, translation, scene.centers[numbers[row]],
-                                    scene.shapes[numbers[row]])
-        _offer(boxes, groups.detections[groups.starts[group]:groups.starts[group + 1]],
-               numbers[row], outline, ious, landmarks)
 
 
 @compiled

@@ -104,7 +104,13 @@ class Camera:
             normalized *= np.tan(angle) / np.maximum(angle, 1e-12)
         with np.errstate(all='ignore'):
             for _ in range(_NEWTON_STEPS):
-                normalized -= self._newton_step(normalized, points_px)
+                projected = self._distorted(normalized)
+                (xx, xy), (yx, yy) = (
+                    ((self._distorted(normalized + step) - projected) / _NEWTON_DIFFERENCE).T
+                    for step in ((_NEWTON_DIFFERENCE, 0.0), (0.0, _NEWTON_DIFFERENCE)))
+                x, y = (projected - points_px).T
+                normalized -= (np.stack([x * yy - y * yx, xx * y - xy * x], axis=1)
+                               / (xx * yy - xy * yx)[:, None])
             missed = np.linalg.norm(self.project_normalized(normalized) - points_px, axis=1)
         normalized[~(missed <= _MAX_ROUND_TRIP_PX)] = np.nan
         return normalized
@@ -117,19 +123,6 @@ class Camera:
             columns = self._distorted(np.stack([distances, 0.0 * distances], axis=1))[:, 0]
             folds = np.nonzero(~(np.diff(columns) > 0.0))[0]
         return float(distances[folds[0]]) if len(folds) else np.inf
-
-    def _newton_step(self, normalized: NDArray[np.float64], points_px: NDArray[np.float64]
-                     ) -> NDArray[np.float64]:
-        """Return the Newton step (n, 2) to subtract from points that should project to pixels."""
-        projected = self._distorted(normalized)
-        along_x, along_y = (
-            (self._distorted(normalized + step) - projected) / _NEWTON_DIFFERENCE
-            for step in ((_NEWTON_DIFFERENCE, 0.0), (0.0, _NEWTON_DIFFERENCE)))
-        missed = projected - points_px
-        determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
-        step = np.stack([missed[:, 0] * along_y[:, 1] - missed[:, 1] * along_y[:, 0],
-                         along_x[:, 0] * missed[:, 1] - along_x[:, 1] * missed[:, 0]], axis=1)
-        return step / determinant[:, None]
 
     def project_normalized(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project points (n, 2) on the plane z = 1 to distorted pixels (n, 2).

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.minimal_solvers import MAX_SOLUTIONS
 from cliploc_ros.core.kernels.compiled import compiled
 
 _UPPER = np.triu_indices(3)
@@ -171,11 +170,6 @@ class Poses(NamedTuple):
     #: (p, 3, 3), (p, 3): rotations and translations [m]
     rotations: NDArray[np.float64]
     translations: NDArray[np.float64]
-
-    @staticmethod
-    def allocate() -> 'Poses':
-        """Allocate memory for the solutions of one minimal sample."""
-        return Poses(np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3)))
 
 
 @compiled

@@ -217,13 +217,20 @@ class KeyframeLocalizer:
                      ) -> tuple['_Place | None', _Matched]:
         """Find the best pose from a few similar keyframes; return it and all matches with them."""
         ranks = np.argsort(-self.layer.similarities(descriptors), kind='stable').tolist()
-        chosen = self._choose(ranks, guesses)
+        # similar keyframes, similar ones at other places, and keyframes near the guesses
+        poses, chosen = self.layer.map_from_camera, ranks[:_SIMILAR]
+        others = np.array(ranks[_SIMILAR:_MOST_RANKED], dtype=np.int64)
+        for _ in range(_ELSEWHERE):
+            others = others[~SAME_ANSWER.agreeing(poses[others], poses[chosen]).any(axis=1)]
+            chosen += others[:1].tolist()
+        for guess in guesses:
+            chosen += [keyframe for keyframe in keyframes_near(poses, guess)[:PROPOSED].tolist()
+                       if keyframe not in chosen]
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
         if first is None or first.agreed < _ENOUGH_INLIERS:
             # also match keyframes near the pose, and the next similar keyframes
-            near = keyframes_near(self.layer.map_from_camera, first.map_from_camera
-                                   )[:_MORE].tolist() if first else []
+            near = keyframes_near(poses, first.map_from_camera)[:_MORE].tolist() if first else []
             more = [rank for rank in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
                     if rank not in chosen]
             matched = matched.join(self._match(descriptors, more, deadline))
@@ -233,8 +240,7 @@ class KeyframeLocalizer:
             further = _place(self._match(descriptors[:_STRONGEST], ranks[_SIMILAR + _MORE:][
                 :_FURTHER], deadline), look, _RIVAL_ITERATIONS)
             if further is not None and further.agreed >= _CLEAR:
-                near = keyframes_near(self.layer.map_from_camera, further.map_from_camera
-                                      )[:_MORE].tolist()
+                near = keyframes_near(poses, further.map_from_camera)[:_MORE].tolist()
                 matched = matched.join(self._match(descriptors, near, deadline))
                 first = _place(matched, look)
         return first, matched
@@ -320,29 +326,29 @@ class KeyframeLocalizer:
     def _recognized(self, place: '_Place', look: '_Look', is_thorough: bool) -> RecognizedPlace:
         """Evaluate the evidence for and against a place."""
         used, counts = self._used(place)
-        pose, shared = place.map_from_camera, self._shared(place.map_from_camera, counts)
+        pose, shares = place.map_from_camera, counts[used] / counts.sum()
+        # Cells with inliers among the comparable cells. A cell without features, such as an
+        # occluded cell, is not comparable. The expected share assumes a geometric distribution of
+        # the inliers in a cell, because their density varies from cell to cell.
+        seen = _count(look.features.pixels, look.camera)
+        comparable = (seen >= _LEAST_SEEN) & self._expects(used, pose, look.camera)
+        cells = int(np.count_nonzero(place.cells[comparable])), int(comparable.sum())
+        confirmed, expected = (cells[0] / cells[1], place.agreed / (cells[1] + place.agreed)) \
+            if cells[1] else (0.0, 0.0)
+        among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
+        free = free_focal(among.points, look.bearings[among.features], invert_transform(pose))
+        ratio, aspect, deviation, of_aspect = 1.0, 1.0, np.inf, np.inf
+        if free is not None:
+            ratio, aspect = np.exp(free[0])
+            deviation, of_aspect = np.hypot(_MUCH_ALIKE * free[1], _STRETCHED)
+        shared = self._shared(pose, counts)
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
-        evidence = (*self._confirmed(place, look, used), *_focal(place, look, used))
         return RecognizedPlace(
-            pose, covariance, shared, place.agreed, *evidence,
-            look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
-            tuple((counts[used] / counts.sum()).tolist()),
-            look.features.pixels[place.inliers.features], place.inliers.rows, place.inliers.points,
-            is_thorough, float(_distances(self.layer.map_from_camera[used], pose).min()))
-
-    def _choose(self, ranks: Sequence[int], guesses: Sequence[NDArray[np.float64]]) -> list[int]:
-        """Choose the keyframes to match: similar keyframes, and keyframes near the guesses."""
-        poses = self.layer.map_from_camera
-        chosen = list(ranks[:_SIMILAR])
-        others = np.array(ranks[_SIMILAR:_MOST_RANKED], dtype=np.int64)
-        for _ in range(_ELSEWHERE):
-            others = others[~SAME_ANSWER.agreeing(poses[others], poses[chosen]).any(axis=1)]
-            chosen += others[:1].tolist()
-        for guess in guesses:
-            near = keyframes_near(poses, guess)
-            chosen += [keyframe for keyframe in near[:PROPOSED].tolist()
-                       if keyframe not in chosen]
-        return chosen
+            pose, covariance, shared, place.agreed, confirmed, expected, cells, ratio, deviation,
+            aspect, of_aspect, look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
+            tuple(shares.tolist()), look.features.pixels[place.inliers.features],
+            place.inliers.rows, place.inliers.points, is_thorough,
+            float(_distances(self.layer.map_from_camera[used], pose).min()))
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:
@@ -362,24 +368,6 @@ class KeyframeLocalizer:
         return _Matched(np.concatenate(features), np.concatenate(points),
                         np.array(keyframes, dtype=np.int64), np.concatenate(rows),
                         np.concatenate(shares))
-
-    def _confirmed(self, place: '_Place', look: '_Look', used: NDArray[np.int64]
-                   ) -> tuple[float, float, tuple[int, int]]:
-        """Count the cells with inliers among the comparable cells.
-
-        Return the share of confirmed cells, the share expected for this number of inliers, and the
-        numbers of confirmed and of comparable cells. A cell without features, such as an occluded
-        cell, is not comparable. The expected share assumes a geometric distribution of the inliers
-        in a cell, because their density varies from cell to cell.
-        """
-        seen = _count(look.features.pixels, look.camera)
-        comparable = (seen >= _LEAST_SEEN) & self._expects(used, place.map_from_camera,
-                                                              look.camera)
-        count = int(comparable.sum())
-        if not count:
-            return 0.0, 0.0, (0, 0)
-        confirmed = int(np.count_nonzero(place.cells[comparable]))
-        return confirmed / count, place.agreed / (count + place.agreed), (confirmed, count)
 
     def _expects(self, keyframes: NDArray[np.int64], pose: NDArray[np.float64], camera: Camera
                  ) -> NDArray[np.bool_]:
@@ -440,19 +428,6 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
                                  len(features), _count(look.features.pixels[features],
                                                        look.camera)))
     return max(places, key=lambda place: place.agreed, default=None)
-
-
-def _focal(place: _Place, look: _Look, used: NDArray[np.int64]
-           ) -> tuple[float, float, float, float]:
-    """Return focal ratio and aspect ratio, each followed by its deviation."""
-    among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
-    found = free_focal(among.points, look.bearings[among.features],
-                       invert_transform(place.map_from_camera))
-    if found is None:
-        return 1.0, np.inf, 1.0, np.inf
-    ratio, aspect = np.exp(found[0])
-    deviation, of_aspect = np.hypot(_MUCH_ALIKE * found[1], _STRETCHED)
-    return ratio, deviation, aspect, of_aspect
 
 
 def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:

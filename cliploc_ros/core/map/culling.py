@@ -109,37 +109,28 @@ def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],
     reaches = np.array([_reach(iou_threshold * float(boxes[of_group, 2:].prod(axis=1).min()),
                                float(np.arctan(tangents[of_group].max()))) for of_group in rows],
                        dtype=np.float64)
-    members = _members(sorted_landmarks.classes, shown)
+    # row and group of each landmark whose class is among the shown classes
+    most = int(np.append(sorted_landmarks.classes, shown).max(initial=0))
+    groups = np.full(1 + most, -1, dtype=np.int32)
+    groups[shown] = np.arange(len(shown))
+    groups = groups[sorted_landmarks.classes]
+    numbers = np.nonzero(groups >= 0)[0]
+    members = np.column_stack([numbers, groups[numbers]]).astype(np.int32)
+    # the tree over the members
     radii = sorted_landmarks.radii[members[:, 0]]
-    return Groups(np.cumsum([0, *map(len, rows)]).astype(np.int64),
-                  np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64),
-                  frusta, members, *_make_tree(sorted_landmarks.landmarks[members[:, 0], :3],
-                                               radii, radii * reaches[members[:, 1]]))
-
-
-def _members(classes: NDArray[np.int32], shown: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return row and group (w, 2) of each landmark whose class is among the shown classes."""
-    if not len(shown):
-        return np.empty((0, 2), dtype=np.int32)
-    of_classes = np.full(max(classes.max(initial=0), shown[-1]) + 1, -1, dtype=np.int32)
-    of_classes[shown] = np.arange(len(shown))
-    groups = of_classes[classes]
-    rows = np.nonzero(groups >= 0)[0]
-    return np.column_stack([rows, groups[rows]]).astype(np.int32)
-
-
-def _make_tree(centers: NDArray[np.float64], radii: NDArray[np.float64],
-               depths: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Build the tree over the members; return its levels and spheres, see Groups."""
+    depths = radii * reaches[members[:, 1]]
+    low = high = centers = sorted_landmarks.landmarks[members[:, 0], :3]
     spheres = [np.c_[centers, radii, depths]]
-    low = high = centers
     while len(low) > 1:
         cuts = np.arange(0, len(low), _BRANCHES)
         low, high = np.minimum.reduceat(low, cuts), np.maximum.reduceat(high, cuts)
         radii, depths = np.maximum.reduceat(radii, cuts), np.maximum.reduceat(depths, cuts)
         around = np.linalg.norm(high - low, axis=1) / 2
         spheres.append(np.c_[(low + high) / 2, around + radii, around + depths])
-    return np.cumsum([0, *map(len, spheres)]).astype(np.int64), np.concatenate(spheres)
+    return Groups(np.cumsum([0, *map(len, rows)]).astype(np.int64),
+                  np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64),
+                  frusta, members, np.cumsum([0, *map(len, spheres)]).astype(np.int64),
+                  np.concatenate(spheres))
 
 
 def morton_codes(centers: NDArray[np.float64]) -> NDArray[np.uint64]:

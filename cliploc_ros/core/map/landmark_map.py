@@ -98,11 +98,6 @@ class ClassIndex:
         """Return a mask (n,): the class is some landmark's own class, not only a confusion."""
         return np.asarray((classes >= 0) & (classes <= self.of_landmarks.max(initial=-1)))
 
-    def have(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
-             ) -> NDArray[np.bool_]:
-        """Return a mask (p,): the landmark is a member of the class; False for classes below 0."""
-        return self.shares(landmarks, classes) > 0.0
-
     def shares(self, landmarks: NDArray[np.int64], classes: NDArray[np.int64]
                ) -> NDArray[np.float64]:
         """Return the frequency (p,) of a class relative to the landmark's most frequent class.
@@ -363,8 +358,10 @@ class LandmarkMap:
         rows = [_landmark(landmark_id, fields, source)
                 for landmark_id, fields in landmarks.items()]
         labels, class_ids, centers, semi_axes, quats, details = zip(*rows, strict=True)
+        quats_xyzw = np.array(quats)
+        quats_xyzw /= np.linalg.norm(quats_xyzw, axis=1, keepdims=True)
         return LandmarkMap(frame_id, tuple(map(str, landmarks)), labels, class_ids,
-                           np.array(centers), np.array(semi_axes), _unit(np.array(quats)),
+                           np.array(centers), np.array(semi_axes), quats_xyzw,
                            details if any(detail != LandmarkDetails() for detail in details)
                            else ())
 
@@ -378,10 +375,6 @@ def find_map_node(tree: Mapping[str, Any], path: str | os.PathLike[str]) -> str:
         raise MapError(f"{path}: {'no' if not found else 'more than one'} map: expected one "
                        "'map' under '/**: ros__parameters:'")
     return found[0]
-
-
-def _unit(quats_xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(quats_xyzw / np.linalg.norm(quats_xyzw, axis=1, keepdims=True))
 
 
 def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:

@@ -92,18 +92,14 @@ def _key(first, second, length_bin, rise_bin):
             + rise_bin + _MIDDLE_BIN)
 
 
-def find_repeats(pairs: LandmarkPairs, landmarks: NDArray[np.int64]) -> Repeats:
-    """Find landmarks that landmarks (n,) may be mistaken for after a rotation and a shift.
+@compiled
+def find_repeats(pairs, landmarks):
+    """Return the Repeats of landmarks (n,): what they may be mistaken for, turned and shifted.
 
     A landmark with two agreeing neighbours is a repeat: three landmarks of equal classes then have
-    the same arrangement. The work is limited: with too many landmarks, the last are skipped.
+    the same arrangement. The votes of pairs for a repeat and a rotation are counted in an
+    open-addressing hash table. The work is limited: with too many landmarks, the last are skipped.
     """
-    return Repeats(*_find_repeats(pairs, landmarks))
-
-
-@compiled
-def _find_repeats(pairs, landmarks):
-    """Count the votes of pairs for a repeat and a rotation in an open-addressing hash table."""
     count, columns = pairs.neighbours.shape
     slots = np.full(_SLOTS, -1, dtype=np.int64)
     votes, turns = np.zeros(_SLOTS, dtype=np.int64), np.zeros(_SLOTS)
@@ -160,9 +156,9 @@ def _offset(centers, first, second):
 
 @compiled
 def _elected(slots, votes, turns, landmarks, count):
-    """Return the fields of Repeats for the bins with enough votes."""
+    """Return the Repeats of the bins with enough votes."""
     rows = np.nonzero(votes >= _LEAST_VOTES)[0]
     found = slots[rows] // _TURN_BINS
     middles = slots[rows] % _TURN_BINS * _TURN_STEP
-    return (landmarks[found // count], found % count, middles + turns[rows] / votes[rows],
-            votes[rows])
+    return Repeats(landmarks[found // count], found % count, middles + turns[rows] / votes[rows],
+                   votes[rows])

@@ -1,14 +1,13 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Similarities of crops and labels for maps of any size, computed in blocks of labels.
+"""Similarities of crops and labels for maps of any size.
 
 A label that several landmarks share is stored and compared once. The label embeddings of a loaded
 map take 4 U d + 8 L bytes, for U different labels of d dimensions and L landmarks. With ViT-L-14
 (d = 768), 1,000 labels take 3 MB, 100,000 take 310 MB, and 1,000,000 take 3.1 GB. A comparison
-with 12 crops takes another 0.6 MB, regardless of the map.
+with 12 crops takes another .1 MB for each 1,000 labels.
 """
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -16,13 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.errors import OptionsError
 
 # Number of labels that determines mean and deviation of a crop's similarities to within 2 %.
 _LABELS_SAMPLED = 4096
-# Labels in a block: it stays in the processor's cache from matrix product to selection.
-_BLOCK = 2048
 
 
 @dataclass(frozen=True)
@@ -33,8 +29,6 @@ class LabelEmbeddings:
     unique: NDArray[np.float32]
     #: (L,): row of each landmark's label. Every row belongs to at least one landmark.
     of_landmarks: NDArray[np.int64]
-    #: Embeddings of each of several maps, see in_parts; empty for a single map
-    parts: tuple['LabelEmbeddings', ...] = ()
 
     @staticmethod
     def of(embeddings: 'LabelEmbeddings | NDArray[np.float32]') -> 'LabelEmbeddings':
@@ -42,38 +36,6 @@ class LabelEmbeddings:
         if isinstance(embeddings, LabelEmbeddings):
             return embeddings
         return LabelEmbeddings(embeddings, np.arange(len(embeddings)))
-
-    def in_parts(self, sizes: Sequence[int]) -> 'LabelEmbeddings':
-        """Return the embeddings with separate rows for each of several maps.
-
-        A label that two maps share is stored twice.
-        """
-        pieces = [np.unique(of_part, return_inverse=True)
-                  for of_part in np.split(self.of_landmarks, np.cumsum(sizes)[:-1])]
-        ends = np.cumsum([len(rows) for rows, _ in pieces])
-        starts = [0, *ends[:-1].tolist()]
-        unique = self.unique[np.concatenate([rows for rows, _ in pieces])]
-        return LabelEmbeddings(
-            unique,
-            np.concatenate([own + start for start, (_, own) in zip(starts, pieces, strict=True)]),
-            tuple(LabelEmbeddings(unique[start:end], own) for start, end, (_, own)
-                  in zip(starts, ends, pieces, strict=True)))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Return the number of landmarks and the length of an embedding."""
-        return len(self.of_landmarks), self.unique.shape[1]
-
-    @cached_property
-    def landmarks(self) -> NDArray[np.int64]:
-        """Return the landmarks (L,) grouped by label, in the map's order within a label."""
-        return np.argsort(self.of_landmarks, kind='stable')
-
-    @cached_property
-    def starts(self) -> NDArray[np.int64]:
-        """Return the index (U + 1,) in `landmarks` of the first landmark of each label."""
-        counts = np.bincount(self.of_landmarks, minlength=len(self.unique))
-        return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Return the embedding of each landmark (L, d)."""
@@ -111,23 +73,7 @@ class CropSimilarities:
 Similarities = NDArray[np.float32] | CropSimilarities
 
 
-def split_similarities(similarities: Similarities, sizes: Sequence[int]) -> list[Similarities]:
-    """Split similarities into those to the landmarks of each map.
-
-    Parameters
-    ----------
-    similarities : ndarray (n, L) or CropSimilarities
-    sizes : sequence of M int
-        Number of landmarks of each map, in order; L in total.
-    """
-    if not isinstance(similarities, CropSimilarities):
-        return [*np.split(similarities, np.cumsum(sizes)[:-1], axis=1)]
-    labels = similarities.labels
-    parts = labels.parts or labels.in_parts(sizes).parts
-    return [CropSimilarities(similarities.crops, part) for part in parts]
-
-
-def nearest_landmarks(similarities: Similarities, k: int
+def nearest_landmarks(similarities: Similarities, k: int, rows: slice = slice(None)
                       ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return the k landmarks (n, k) most similar to each crop, best first, and their similarities.
 
@@ -136,83 +82,32 @@ def nearest_landmarks(similarities: Similarities, k: int
     Parameters
     ----------
     similarities : ndarray (n, L) or CropSimilarities
+    rows : slice
+        The landmarks of one of several maps: only they are compared, and counted from the first.
 
     Raises
     ------
     OptionsError
         A similarity is not finite.
     """
-    if not isinstance(similarities, CropSimilarities):
-        return _nearest_columns(((start, similarities[:, start:start + _BLOCK]) for start in
-                                 range(0, similarities.shape[1], _BLOCK)), len(similarities), k)
-    labels, crops = similarities.labels, similarities.crops
-    found, values = _nearest_columns(((start, crops @ labels.unique[start:start + _BLOCK].T)
-                                      for start in range(0, len(labels.unique), _BLOCK)),
-                                     len(crops), min(k, len(labels.unique)))
-    return _expanded(labels, found, values, k)
-
-
-def _nearest_columns(blocks: Iterator[tuple[int, NDArray[np.float32]]], count: int, k: int
-                     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return columns and values (count, k) of the k greatest values of each row, best first."""
-    columns = np.full((count, k), -1, dtype=np.int64)
-    values = np.full((count, k), -np.inf, dtype=np.float32)
-    for start, block in blocks:
-        if not keep_greatest(np.ascontiguousarray(block, dtype=np.float32), start, columns,
-                             values):
-            raise OptionsError('similarities contain values that are not finite')
-    return columns, values
-
-
-@compiled
-def keep_greatest(block, start, columns, values):
-    """Update the greatest values of each row with a block; ties keep the first value.
-
-    Parameters
-    ----------
-    block : ndarray (n, w)
-    start : int
-        Column number of the block's first column.
-    columns, values : ndarray (n, k)
-        Columns and values of the greatest values, best first; updated.
-
-    Returns
-    -------
-    bool
-        Whether all values are finite.
-    """
-    last = values.shape[1] - 1
-    for row in range(block.shape[0]):
-        least = values[row, last]
-        for column in range(block.shape[1]):
-            value = block[row, column]
-            if not np.isfinite(value):
-                return False
-            if value <= least:
-                continue
-            place = last
-            while place > 0 and value > values[row, place - 1]:
-                values[row, place] = values[row, place - 1]
-                columns[row, place] = columns[row, place - 1]
-                place -= 1
-            values[row, place], columns[row, place] = value, start + column
-            least = values[row, last]
-    return True
-
-
-def _expanded(labels: LabelEmbeddings, found: NDArray[np.int64], values: NDArray[np.float32],
-              k: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the k best landmarks (n, k) of the best labels (n, <= k) of each row."""
-    counts = np.minimum(np.diff(labels.starts)[found], k)
-    rows = np.repeat(np.arange(len(found)), counts.sum(axis=1))
-    counts = counts.ravel()
-    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    landmarks = labels.landmarks[np.repeat(labels.starts[found.ravel()], counts) + within]
-    alike = np.repeat(values.ravel(), counts)
-    order = np.lexsort((landmarks, -alike, rows))
-    ranks = np.arange(len(rows)) - np.searchsorted(rows, rows)
-    taken = order[ranks < k]  # k in each row: its k best labels have at least k landmarks
-    return landmarks[taken].reshape(-1, k), alike[taken].reshape(-1, k)
+    if isinstance(similarities, CropSimilarities):
+        alike = similarities.crops @ similarities.labels.unique.T
+        columns = similarities.labels.of_landmarks[rows]
+        if len(columns) < similarities.shape[1]:
+            own, columns = np.unique(columns, return_inverse=True)
+            alike = alike[:, own]
+    else:
+        alike = similarities[:, rows]
+        columns = np.arange(alike.shape[1])
+    if not np.isfinite(alike).all():
+        raise OptionsError('similarities contain values that are not finite')
+    # sort only the landmarks that are among the best of some crop
+    place = -min(k, alike.shape[1])
+    least = np.partition(alike, place, axis=1)[:, place, None]
+    landmarks = np.nonzero((alike >= least).any(axis=0)[columns])[0]
+    values = alike[:, columns[landmarks]]
+    order = np.argsort(-values, axis=1, kind='stable')[:, :k]
+    return landmarks[order], np.take_along_axis(values, order, axis=1)
 
 
 def pair_similarities(similarities: Similarities, crops: NDArray[np.int64],

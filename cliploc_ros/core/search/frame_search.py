@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.depth import depth_deviations
 from cliploc_ros.core.map.culling import FEW, SortedLandmarks
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
-from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks, split_similarities
+from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import Deadline, RelocalizerOptions
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Constraint, Scene, make_scene
@@ -104,13 +104,14 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int |
     return Candidates(pairs[:, 0], pairs[:, 1], zeros.astype(np.int64), zeros)
 
 
-def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
+def nearest_candidates(similarities: Similarities, k: int, rows: slice = slice(None)
+                       ) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
 
-    The map has at least k landmarks.
+    They are among `rows`, at least k landmarks; see nearest_landmarks.
     """
     detection_count, _ = similarities.shape
-    landmarks, values = nearest_landmarks(similarities, k)
+    landmarks, values = nearest_landmarks(similarities, k, rows)
     return Candidates(np.repeat(np.arange(detection_count), k), landmarks.ravel(),
                       np.tile(np.arange(k), detection_count), values.ravel().astype(np.float64))
 
@@ -176,19 +177,15 @@ def match_frame(landmark_map: LandmarkMap, observation: Observation, options: Re
 
 def _depths(observation: Observation, options: RelocalizerOptions) -> NDArray[np.float64] | None:
     """Return the depths of a scene (n, 2), or None: the paper's algorithms do not use depths."""
-    depths, deviations = observation.depths, observation.depth_deviations
+    depths = observation.depths
     if depths is None or options.algorithm != 'auto':
         return None
-    if deviations is None:
-        deviations = depth_deviations(depths)
-    for name, values in (('depths', depths), ('depth_deviations', deviations)):
-        if values.shape != (len(observation.detections),):
-            raise OptionsError(f'{name} has shape {values.shape}, but there are '
-                               f'{len(observation.detections)} detections')
+    if depths.shape != (len(observation.detections),):
+        raise OptionsError(f'depths has shape {depths.shape}, but there are '
+                           f'{len(observation.detections)} detections')
     with np.errstate(invalid='ignore'):
-        known = ((depths > 0.0) & (depths < _FARTHEST_M)
-                 & (deviations > 0.0) & (deviations < np.inf))
-    return np.where(known[:, None], np.column_stack([depths, deviations]), 0.0)
+        known = (depths > 0.0) & (depths < _FARTHEST_M)
+    return np.where(known[:, None], np.column_stack([depths, depth_deviations(depths)]), 0.0)
 
 
 def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: Candidates | None
@@ -203,8 +200,8 @@ def _potential(landmark_map: LandmarkMap, classes: NDArray[np.int64], nearest: C
                 joined(nearest, of_class, len(landmark_map))).pairs, None
     if nearest is None:
         return np.empty((0, 2), dtype=np.int64), landmark_map.sorted_landmarks
-    by_class = landmark_map.classes.have(nearest.landmarks, classes[nearest.detections])
-    return nearest.select(~by_class).pairs, landmark_map.sorted_landmarks
+    shares = landmark_map.classes.shares(nearest.landmarks, classes[nearest.detections])
+    return nearest.select(shares == 0.0).pairs, landmark_map.sorted_landmarks
 
 
 def _nearest(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions,
@@ -224,13 +221,11 @@ def _nearest(landmark_map: LandmarkMap, observation: Observation, options: Reloc
         found = 'none' if similarities is None else f'{similarities.shape}'
         raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
                            f'{shape}, found {found}')
-    parts = parts_of(landmark_map)
-    sizes = [len(part.landmark_map) for part in parts]
     # k landmarks from each map, so that the labels of one map do not hide rivals in other maps
     nearest = concatenated([
-        nearest_candidates(of_part, min(options.k, size)).moved(part.first)
-        for part, size, of_part in zip(parts, sizes, split_similarities(similarities, sizes),
-                                       strict=True)])
+        nearest_candidates(similarities, min(options.k, len(part.landmark_map)), slice(
+            part.first, part.first + len(part.landmark_map))).moved(part.first)
+        for part in parts_of(landmark_map)])
     nearest = nearest._replace(detections=compared[nearest.detections])
     return nearest.select(sound[nearest.detections])
 
@@ -311,7 +306,7 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
         none = np.empty(0, dtype=np.int64)
         observation = replace(
             observation, detections=observation.detections.select(none), compared=none,
-            similarities=np.empty((0, 0), dtype=np.float32), depths=None, depth_deviations=None)
+            similarities=np.empty((0, 0), dtype=np.float32), depths=None)
     scene, left_out = match_frame(landmark_map, observation, options)
     frame = SearchedFrame(
         observation, scene, vertical_of(observation, options),

@@ -98,7 +98,8 @@ def set_up(scene: Scene, constraint: Constraint | None = None) -> Bench:
     sample = Sample(np.empty((3, 3)), np.empty((3, 4)), np.empty((3, 9)),
                     np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS))
     return Bench(candidates, (constraint or Constraint()).as_array(), targets, sample,
-                 Poses.allocate(), _overlaps(targets))
+                 Poses(np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3))),
+                 _overlaps(targets))
 
 
 def _overlaps(targets: Targets) -> Overlaps:
@@ -164,7 +165,13 @@ def _choose_pose(constraint, sample, size, poses, count, least_iou):
         uppers[which] = -1.0
         if _agrees(constraint, poses, which):
             project(sample.landmarks, ZERO, size, poses, which, outlines, 3 * which)
-            uppers[which] = _sampled_bound(boxes, size, outlines, 3 * which)
+            upper = 0.0  # of the sum of IoUs
+            for row in range(size):
+                if not outlines[3 * which + row, 2] > 0.0:
+                    upper = -1.0
+                    break
+                upper += _outline_bound(boxes, row, outlines, 3 * which + row)
+            uppers[which] = upper
         if uppers[which] >= least_iou:
             visible += 1
             last = which
@@ -197,20 +204,6 @@ def _agrees(constraint, poses, which):
         cosine += up * constraint[axis]
         height -= up * translations[which, axis]
     return constraint[6] <= height <= constraint[7] and cosine >= constraint[8]
-
-
-@compiled
-def _sampled_bound(boxes, size, outlines, first):
-    """Return an upper bound of the sum of IoUs of the sampled pairs.
-
-    -1 if a sampled landmark is not entirely in front of the camera.
-    """
-    upper = 0.0
-    for row in range(size):
-        if not outlines[first + row, 2] > 0.0:
-            return -1.0
-        upper += _outline_bound(boxes, row, outlines, first + row)
-    return upper
 
 
 @compiled

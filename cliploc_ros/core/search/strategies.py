@@ -322,15 +322,6 @@ class Leaders(NamedTuple):
 
 
 @compiled
-def worst_score(leaders):
-    """Return the score that a hypothesis must exceed to become a leader."""
-    worst = leaders.scores[0]
-    for row in range(1, leaders.scores.shape[0]):
-        worst = min(worst, leaders.scores[row])
-    return worst
-
-
-@compiled
 def remember(leaders, score, iteration, sample, rotation, translation):
     """Add a hypothesis, unless its place has a better leader; drop worse leaders of that place."""
     scores = leaders.scores
@@ -338,42 +329,25 @@ def remember(leaders, score, iteration, sample, rotation, translation):
     for row in range(scores.shape[0]):
         if scores[row] < 0.0:
             continue
-        if not same_place(rotation, translation, leaders.rotations[row],
-                          leaders.translations[row]):
+        # the trace of the rotation between two poses is 1 + 2 cos(angle)
+        trace, square = 0.0, 0.0
+        for i in range(3):
+            center, other = 0.0, 0.0
+            for j in range(3):
+                trace += rotation[i, j] * leaders.rotations[row, i, j]
+                center -= rotation[j, i] * translation[j]
+                other -= leaders.rotations[row, j, i] * leaders.translations[row, j]
+            square += (center - other) ** 2
+        if not (trace >= _PLACE_TRACE and square <= _PLACE_M * _PLACE_M):
             continue
         if scores[row] >= score - _TIE:
             return
         scores[row] = -1.0
         free = row
     if free < 0:
-        free = 0
-        for row in range(1, scores.shape[0]):
-            if scores[row] < scores[free]:
-                free = row
-    scores[free] = score
-    leaders.iterations[free] = iteration
-    for i in range(3):
-        leaders.samples[free, i] = sample[i]
-        leaders.translations[free, i] = translation[i]
-        for j in range(3):
-            leaders.rotations[free, i, j] = rotation[i, j]
-
-
-@compiled
-def same_place(rotation_a, translation_a, rotation_b, translation_b):
-    """Check whether two camera_from_map poses are within SAME_PLACE of each other.
-
-    The trace of the rotation between them is 1 + 2 cos(angle).
-    """
-    trace, square = 0.0, 0.0
-    for i in range(3):
-        center_a, center_b = 0.0, 0.0
-        for j in range(3):
-            trace += rotation_a[i, j] * rotation_b[i, j]
-            center_a -= rotation_a[j, i] * translation_a[j]
-            center_b -= rotation_b[j, i] * translation_b[j]
-        square += (center_a - center_b) ** 2
-    return trace >= _PLACE_TRACE and square <= _PLACE_M * _PLACE_M
+        free = scores.argmin()
+    scores[free], leaders.iterations[free], leaders.samples[free] = score, iteration, sample
+    leaders.rotations[free], leaders.translations[free] = rotation, translation
 
 
 class Progress(NamedTuple):
@@ -477,7 +451,7 @@ def _blocks(scene: Scene, constraint: Constraint | None, leaders: Leaders,
 def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
     """Make the hypotheses of the first `count` samples, and add the best to the leaders."""
     candidates, constraint, targets, sample, poses, overlaps = bench
-    floor = worst_score(leaders)
+    floor = leaders.scores.min()  # the score that a hypothesis must exceed to become a leader
     for number in range(count):
         if samples[number, 0] < 0:
             continue
@@ -488,4 +462,4 @@ def _try_samples(bench, samples, count, tried_before, least_iou, leaders):
         if score > floor:
             remember(leaders, score, tried_before + number + 1, samples[number],
                      poses.rotations[which], poses.translations[which])
-            floor = worst_score(leaders)
+            floor = leaders.scores.min()

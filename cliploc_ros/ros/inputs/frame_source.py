@@ -25,7 +25,7 @@ from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 
 # Messages that may wait for their counterparts: ten seconds of 30 Hz VGA images for a slow
-# detector. Of larger images, every n-th is kept.
+# detector.
 _MAX_WAITING = 2000
 _MAX_IMAGE_BYTES = 256 * 2**20
 _MAX_DETECTIONS_BYTES = 16 * 2**20
@@ -110,8 +110,9 @@ class FrameSource:
                        'depth_camera_info': 'depth_camera_info'}
         #: The relative names of the topics
         self.topics = {name: of_camera(camera, topic) for name, topic in topics.items()}
-        #: The newest message of each topic and its arrival (monotonic clock) [s]
-        self.heard: dict[str, tuple[Any, float]] = {}
+        # Arrival of the newest message of each topic (monotonic clock) [s].
+        self._heard_at: dict[str, float] = {}
+        self._depth_camera: CameraInfo | None = None
         #: Delay of the newest image after its stamp, and the delay closest to 0 of all images [s]
         self.lag_s, self.nearest_lag_s = math.nan, math.inf
         self._depth_tolerance_ns = round(parameters.depth_tolerance_s * NS_PER_S)
@@ -206,7 +207,7 @@ class FrameSource:
         now = time.monotonic()
         with self._changed:
             for name in self.topics.keys() - {'depth_camera_info'}:
-                silent_s = now - max(self._heard_at(name), self._subscribed_at)
+                silent_s = now - max(self._heard_at.get(name, 0.0), self._subscribed_at)
                 nobody = not self._node.count_publishers(self._resolved(name))
                 if nobody or (self._subscriptions and silent_s > stale_after_s):
                     # Without camera_info no pose is possible; images and detections may pause.
@@ -258,8 +259,6 @@ class FrameSource:
         self._depths.clear()
         self._unsure = self._static_info = None
         self._arrived_at = (-math.inf, -math.inf)
-        self.heard |= {name: (None, self._heard_at(name))  # images are large
-                       for name in self.heard.keys() & {'image', 'depth'}}
 
     def _receive(self, name: str, msg: Any) -> None:
         """Store a message, and call on_frame with the frame that it completes."""
@@ -268,27 +267,24 @@ class FrameSource:
                 return
             if name == 'detections':
                 msg = self._converted(msg)
-            self.heard[name] = msg, time.monotonic()
-            frame = None
-            if name == 'depth':
-                self._keep_depth(msg)
-            elif name != 'depth_camera_info':
-                frame = self._completed(name, *self.heard[name])
+            self._heard_at[name], frame = time.monotonic(), None
+            if name == 'depth':  # kept as long as images wait; if memory is short, every n-th
+                self._depths.append(msg)
+                oldest = self._pairing.oldest('image')
+                # if no image waits, the next image will have about the stamp of this depth image
+                useful_ns = stamp_ns((msg if oldest is None else oldest[0]).header.stamp) \
+                    - self._depth_tolerance_ns
+                while len(self._depths) > 1 and sum(
+                        len(depth.data) for depth in self._depths) > _MAX_DEPTH_BYTES:
+                    stamps = [stamp_ns(depth.header.stamp) for depth in self._depths]
+                    del self._depths[0 if stamps[0] < useful_ns or len(stamps) < 3 else 1 + min(
+                        range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
+            elif name == 'depth_camera_info':
+                self._depth_camera = msg
+            else:
+                frame = self._completed(name, msg, self._heard_at[name])
         if frame is not None:
             self._on_frame(frame)
-
-    def _keep_depth(self, msg: Image | CompressedImage) -> None:
-        """Keep depth images as long as images wait; if memory is short, every n-th."""
-        self._depths.append(msg)
-        oldest = self._pairing.oldest('image')
-        # if no image waits, the next image will have about the stamp of this depth image
-        useful_ns = (stamp_ns(msg.header.stamp) if oldest is None
-                     else stamp_ns(oldest[0].header.stamp)) - self._depth_tolerance_ns
-        while len(self._depths) > 1 and sum(
-                len(depth.data) for depth in self._depths) > _MAX_DEPTH_BYTES:
-            stamps = [stamp_ns(depth.header.stamp) for depth in self._depths]
-            del self._depths[0 if stamps[0] < useful_ns or len(stamps) < 3 else 1 + min(
-                range(len(stamps) - 2), key=lambda row: stamps[row + 2] - stamps[row])]
 
     def _completed(self, name: str, msg: Any, received_at: float) -> Frame | None:
         """Return the frame that a message completes, once its stamps are reliable; else None."""
@@ -315,8 +311,7 @@ class FrameSource:
                     (depth for depth in self._depths
                      if abs(stamp_ns(depth.header.stamp) - at_ns) <= self._depth_tolerance_ns),
                     key=lambda depth: abs(stamp_ns(depth.header.stamp) - at_ns), default=None),
-                self.heard.get('depth_camera_info', (None, 0.0))[0], self._camera,
-                image_topic=self._resolved('image'))
+                self._depth_camera, self._camera, image_topic=self._resolved('image'))
         frame = self._unsure
         # the next images may have the same stamp; wait until stamps are known to differ
         if frame is None or not (self._stamps['image'].are_own or all(
@@ -348,15 +343,14 @@ class FrameSource:
     def why_none(self, since: float) -> str:
         """Return why no frame was completed since a time (monotonic clock)."""
         if problems := [self._silence(name) for name in self.topics if name not in _OF_DEPTH
-                        and self._heard_at(name) < since] or self._stamp_problems():
+                        and self._heard_at.get(name, -math.inf) < since] or self._stamp_problems():
             return '; '.join(problems)
         if self._unsure is not None:
             return (f'too few images on {self._resolved("image")} to check that their stamps '
                     'differ: raise its rate, or timeout_s')
-        if self._pairing.outrun:
-            return (f'detections arrive {self._pairing.outrun} images late, more than fit in '
-                    f'{_MAX_IMAGE_BYTES // 2**20} MiB of memory: use smaller images, '
-                    'image_transport compressed, or a faster detector')
+        if self._pairing.is_outrun:
+            return (f'detections arrive later than {_MAX_IMAGE_BYTES // 2**20} MiB of images: use '
+                    'smaller images, image_transport compressed, or a faster detector')
         received_at, detected_at = self._arrived_at
         if detected_at >= since:
             return (f'detections arrive {detected_at - received_at:.1f} s after their image: '
@@ -370,9 +364,8 @@ class FrameSource:
         topic = self._resolved(name)
         publishers = self._node.count_publishers(topic)
         if publishers and name == 'detections':
-            return (f'no detections on {topic} from its {publishers} publisher(s): the detector '
-                    'is too slow or has stopped; choose a faster profile or a smaller detector, '
-                    'raise timeout_s, or see its log')
+            return (f'no detections on {topic} from its {publishers} publisher(s): see its log, '
+                    'choose a faster profile or a smaller detector, or raise timeout_s')
         if publishers:
             return (f'no {name} on {topic} from its {publishers} publisher(s): check that it '
                     'publishes, and that its QoS is compatible')
@@ -380,6 +373,3 @@ class FrameSource:
 
     def _resolved(self, name: str) -> str:
         return str(self._node.resolve_topic_name(self.topics[name]))
-
-    def _heard_at(self, name: str) -> float:
-        return self.heard.get(name, (None, -math.inf))[1]

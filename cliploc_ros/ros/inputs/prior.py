@@ -29,10 +29,9 @@ from cliploc_ros.files.storage import parse_json, read_file, write_text
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import pose_from_msg, pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
-from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
-_LOG_PERIOD_S = 5.0
 # Least time between two stored poses of a localizer [s].
 _WRITE_PERIOD_S = 1.0
 _PLANAR = np.array([0, 1, 5])  # x, y and yaw in a covariance of ROS
@@ -45,8 +44,7 @@ class PriorSource:
     def __init__(self, node: ManagedNode[RelocalizerParameters], transforms: CoordinateFrames
                  ) -> None:
         self._node, self._transforms = node, transforms
-        # The last message, and the same if it is valid.
-        self._heard: PoseWithCovarianceStamped | None = None
+        # The last message.
         self._told: PoseWithCovarianceStamped | None = None
         # The last pose of the previous run and the hash of its map, until a pose is accepted.
         self._last: tuple[PoseWithCovarianceStamped, str] | None = None
@@ -75,16 +73,7 @@ class PriorSource:
 
     def hear(self, msg: PoseWithCovarianceStamped) -> None:
         """Use a message as prior. An empty frame_id withdraws the prior."""
-        if msg == self._heard:  # the other subscription delivered it already
-            return
-        self._heard, self._told = msg, None
-        if not msg.header.frame_id:
-            return
-        try:
-            planar_of(msg)
-            self._told = msg
-        except CliplocError as error:
-            self._node.get_logger().warning(f'localizing without a prior: ~/prior: {error}')
+        self._told = msg if msg.header.frame_id else None
 
     def region(self, stamp: Time, parameters: RelocalizerParameters,
                camera_from_base: NDArray[np.float64], frame_ids: Sequence[str], map_hash: str
@@ -181,7 +170,7 @@ class PriorSource:
         return Region(frame_id, mean, covariance, probability, camera_from_body)
 
     def _warn(self, text: str) -> None:
-        self._node.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_S)
+        self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)
 
 
 def planar_of(msg: PoseWithCovarianceStamped

@@ -30,7 +30,7 @@ from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometryPlace, Odom
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.stamps import StampOrder, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health
-from cliploc_ros.ros.node.lifecycle import ManagedNode
+from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -49,7 +49,6 @@ WINDOW_NS = 100_000_000
 _MAX_SAMPLES = 1000
 # sensor_msgs/Imu: the first element of the covariance of a field that is not measured.
 _NOT_MEASURED = -1.0
-_LOG_PERIOD_S = 5.0
 _RETRY_S = 0.02
 # Longest wait for the first message of a publisher of odometry that was just discovered.
 _DISCOVERY_S = 1.0
@@ -157,7 +156,16 @@ class VerticalSource(qos.Listener):
             return None
         if parameters.gravity == 'base_frame':
             return np.asarray(camera_from_base[:3, :3] @ _UP)
-        up_in_imu, imu_frame = self._up_in_imu(stamp_ns(stamp))
+        with self._lock:
+            imu_frame, samples = self._imu_frame, list(self._samples)
+        at_ns, topic = stamp_ns(stamp), self._node.resolve_topic_name('imu')
+        near = [sample for sample in samples if abs(sample.stamp_ns - at_ns) <= WINDOW_NS]
+        if not near:
+            raise NoVerticalError(self.problem or f'no message on {topic} within '
+                                  f'{WINDOW_NS // 1_000_000} ms of the image')
+        if not imu_frame:
+            raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: set it')
+        up_in_imu = mean_up(near, samples, topic)
         if imu_frame == camera_frame:
             return up_in_imu
         camera_from_imu = camera_from_base if imu_frame == parameters.base_frame else \
@@ -165,18 +173,6 @@ class VerticalSource(qos.Listener):
                                               parameters.tf_timeout_s)
         return np.asarray(camera_from_imu[:3, :3] @ up_in_imu)
 
-    def _up_in_imu(self, at_ns: int) -> tuple[NDArray[np.float64], str]:
-        """Return the mean vertical around an instant, and its coordinate frame."""
-        with self._lock:
-            frame, samples = self._imu_frame, list(self._samples)
-        near = [sample for sample in samples if abs(sample.stamp_ns - at_ns) <= WINDOW_NS]
-        topic = self._node.resolve_topic_name('imu')
-        if not near:
-            raise NoVerticalError(self.problem or f'no message on {topic} within '
-                                  f'{WINDOW_NS // 1_000_000} ms of the image')
-        if not frame:
-            raise NoVerticalError(f'{topic} has no frame_id, so its mount is unknown: set it')
-        return mean_up(near, samples, topic), frame
 
 
 def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
@@ -204,9 +200,8 @@ def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
     contradiction_deg = float(np.degrees(np.median(np.arccos(np.clip(cosines, -1.0, 1.0)))))
     if contradiction_deg > _MAX_CONTRADICTION_DEG:
         raise NoVerticalError(
-            f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity '
-            f'(limit {_MAX_CONTRADICTION_DEG:g}): correct it, or set '
-            'orientation_covariance[0] to -1')
+            f'the orientation of {topic} is {contradiction_deg:.0f} degrees off gravity (limit '
+            f'{_MAX_CONTRADICTION_DEG:g}): correct it, or set orientation_covariance[0] to -1')
     mean = np.mean(ups, axis=0)
     length = float(np.linalg.norm(mean))
     if not length > _MIN_MEAN_LENGTH:
@@ -326,7 +321,18 @@ class RobotStateSource:
 
         NoTransformError: the mount is unknown.
         """
-        camera_from_base = self._mount(image, parameters, deadline)
+        begun_s, wait_s, camera_from_base = time.monotonic(), parameters.tf_timeout_s, None
+        until = begun_s + wait_s if math.isinf(deadline) else 0.5 * (begun_s + deadline)
+        while camera_from_base is None:
+            try:
+                camera_from_base = self.transforms.camera_from_base(
+                    parameters.base_frame, parameters.base_from_camera, image.frame_id,
+                    image.stamp, min(wait_s, max(0.0, until - time.monotonic())))
+            except NoTransformError:
+                if time.monotonic() + _RETRY_S > until:
+                    raise
+                self._node.check_active()
+                time.sleep(_RETRY_S)
         up_in_camera = None
         try:
             up_in_camera = self.vertical.up_in_camera(parameters, camera_from_base,
@@ -340,23 +346,6 @@ class RobotStateSource:
                 camera_from_depth = self._lookup(image, depth_frame, parameters)
         return RobotState(camera_from_base, up_in_camera,
                           self._place(image, parameters, camera_from_base), camera_from_depth)
-
-    def _mount(self, image: Header, parameters: RelocalizerParameters, deadline: float
-               ) -> NDArray[np.float64]:
-        now = time.monotonic()
-        slice_s = parameters.tf_timeout_s
-        until = now + slice_s if math.isinf(deadline) else 0.5 * (now + deadline)
-        while True:
-            wait_s = min(slice_s, max(0.0, until - time.monotonic()))
-            try:
-                return self.transforms.camera_from_base(
-                    parameters.base_frame, parameters.base_from_camera, image.frame_id,
-                    image.stamp, wait_s)
-            except NoTransformError:
-                if time.monotonic() + _RETRY_S > until:
-                    raise
-                self._node.check_active()
-                time.sleep(_RETRY_S)
 
     def _place(self, image: Header, parameters: RelocalizerParameters,
                camera_from_base: NDArray[np.float64]) -> OdometryPlace | None:
@@ -391,4 +380,4 @@ class RobotStateSource:
 
     def _warn(self, what: str, text: str) -> None:
         self.problems[what] = text
-        self._node.get_logger().warning(text, throttle_duration_sec=_LOG_PERIOD_S)
+        self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)

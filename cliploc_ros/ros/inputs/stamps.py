@@ -24,8 +24,6 @@ _MAX_AHEAD_NS = NS_PER_S // 5
 _MAX_DISORDER_NS = NS_PER_S
 # Number of images that are expected by the detector: two for each of the last two detections.
 _EXPECTED = 4
-# Greatest delay of detections, relative to the delay of the previous detections.
-_SPARE = 1.5
 # After this many successive messages with different stamps, stamps are taken to be unique; fewer
 # do not suffice, because stamps in whole seconds also differ at times. A relay that repeats
 # messages sends each at least this often.
@@ -121,9 +119,9 @@ class ExactPairing:
 
     Stamps are compared for equality, not for order: frames may arrive out of order.
 
-    Images wait for their detections. If large images fill the memory, every n-th is kept, and the
-    two newest images when detections arrive: a detector that has finished an image usually takes
-    the newest one next.
+    Images wait for their detections. If large images fill the memory, the oldest are dropped, but
+    not the two newest images when detections arrive: a detector that has finished an image usually
+    takes the newest one next.
 
     Parameters
     ----------
@@ -140,13 +138,14 @@ class ExactPairing:
                  late: str = '') -> None:
         self._max_bytes = dict(max_bytes)
         self._max_count = max_count
-        self._waiting: dict[str, OrderedDict[int, tuple[Any, int]]] = {
+        # Item, size, and number in the order of arrival, by topic and stamp.
+        self._waiting: dict[str, OrderedDict[int, tuple[Any, int, int]]] = {
             topic: OrderedDict() for topic in max_bytes}
         self._early, self._late = early, late
         self.last_stamp_ns: dict[str, int] = {}
-        # Number of each image by its stamp, and the numbers of images that are always kept.
-        self._numbers: dict[int, int] = {}
+        # Numbers of the images that are dropped last, and stamps of images without room.
         self._expected: deque[int] = deque(maxlen=_EXPECTED)
+        self._without_room: deque[int] = deque(maxlen=max_count)
         self.clear()
 
     def add(self, topic: str, stamp_ns: int, item: Any, size: int) -> dict[str, Any] | None:
@@ -163,22 +162,20 @@ class ExactPairing:
         self.last_stamp_ns[topic] = stamp_ns
         waiting = self._waiting[topic]
         if topic == self._late:
-            self._learn(stamp_ns)
+            newest = self.received[self._early]
+            self._expected.extend([newest, newest + 1])
+            self.is_outrun = stamp_ns in self._without_room
         if stamp_ns in waiting:
             self._forget(topic, stamp_ns)
-        if topic == self._early:
-            if waiting and not self._stays(newest := next(reversed(waiting))):
-                self._forget(topic, newest)
-            self._numbers[stamp_ns] = self.received[topic]
-            if len(self._numbers) > self._max_count:
-                del self._numbers[next(iter(self._numbers))]
-        waiting[stamp_ns] = (item, size)
+        waiting[stamp_ns] = (item, size, self.received[topic])
         self._bytes[topic] += size
         while len(waiting) > self._max_count or (
                 self._bytes[topic] > self._max_bytes[topic] and len(waiting) > 1):
-            self._forget(topic, next(iter(waiting)) if topic != self._early else min(
-                waiting, key=lambda stamp: (stamp == stamp_ns, self._stays(stamp),
-                                            self._numbers.get(stamp) in self._expected)))
+            dropped = min(waiting, key=lambda stamp: (
+                stamp == stamp_ns, topic == self._early and waiting[stamp][2] in self._expected))
+            self._forget(topic, dropped)
+            if topic == self._early:
+                self._without_room.append(dropped)
         if any(stamp_ns not in other for other in self._waiting.values()):
             return None
         complete = {name: other[stamp_ns][0] for name, other in self._waiting.items()}
@@ -195,7 +192,7 @@ class ExactPairing:
 
     def oldest(self, topic: str) -> Any:
         """Return the oldest waiting item of a topic; None without any."""
-        return next((item for item, _ in self._waiting[topic].values()), None)
+        return next((item for item, *_ in self._waiting[topic].values()), None)
 
     def clear(self) -> None:
         """Forget all waiting messages and all counts."""
@@ -205,29 +202,13 @@ class ExactPairing:
         self.received = dict.fromkeys(self._waiting, 0)
         self.dropped = dict.fromkeys(self.received, 0)
         self.last_stamp_ns.clear()
-        self._numbers.clear()
         self._expected.extend([1, 2, 1, 2])  # a starting detector takes one of the first images
-        self.every, self.outrun = 1, 0
-
-    def _stays(self, stamp_ns: int) -> bool:
-        """Return whether an image is kept when memory is short."""
-        number = self._numbers.get(stamp_ns, 0)
-        return number % self.every == 0 or number in self._expected
-
-    def _learn(self, stamp_ns: int) -> None:
-        """Update the delay of detections, in images, and the images that are expected next."""
-        newest, waiting = self.received[self._early], self._waiting[self._early]
-        self._expected.extend([newest, newest + 1])
-        if stamp_ns not in self._numbers or not waiting:
-            return
-        behind = newest - self._numbers[stamp_ns] + 1
-        fitting = self._max_bytes[self._early] * len(waiting) // max(1, self._bytes[self._early])
-        self.every = 1 if _SPARE * behind <= fitting else math.ceil(
-            _SPARE * behind / max(1, fitting - _EXPECTED - 1))
-        self.outrun = behind if behind > fitting and stamp_ns not in waiting else 0
+        self._without_room.clear()
+        #: Whether the newest detections arrived after their image was dropped for lack of memory
+        self.is_outrun = False
 
     def _forget(self, topic: str, stamp_ns: int) -> None:
-        _, size = self._waiting[topic].pop(stamp_ns)
+        _, size, _ = self._waiting[topic].pop(stamp_ns)
         self._bytes[topic] -= size
         self.dropped[topic] += 1
 

@@ -43,6 +43,8 @@ from cliploc_ros.ros.node.threads import (
 )
 from cliploc_ros.units import NS_PER_S
 
+#: Least time between two log lines of one cause that recurs with each frame [s].
+LOG_PERIOD_S = 5.0
 # Nav2's defaults (nav2_util::LifecycleNode and its parameter bond_heartbeat_period).
 _HEARTBEAT_PERIOD_S = 0.1
 _HEARTBEAT_TIMEOUT_S = 4.0
