@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import (
@@ -13,12 +14,16 @@ from cliploc_ros.core.geometry.ellipsoid import (
     ellipses_in_pixels,
     project_ellipsoids,
 )
-from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    transform_from_pose,
+)
 from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, nearest_words, save_layer
 from cliploc_ros.core.map import map_file
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.offline.recording.keyframe_layer import learn_words
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -30,6 +35,21 @@ MAP_FROM_CAMERA = transform_from_pose(np.array([0.3, -0.2, -0.5]),
 def unit_rows(rows):
     """Return the rows (n, d), each divided by its length."""
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def rigid(position=(0.0, 0.0, 0.0), axis='z', degrees=0.0):
+    """Return a transform (4, 4): a turn about an axis, then a shift [m]."""
+    return make_transform(Rotation.from_euler(axis, degrees, degrees=True).as_matrix(),
+                          np.array(position, dtype=float))
+
+
+def map_of(class_ids, centers, semi_axes=0.2) -> LandmarkMap:
+    """Return a map of upright objects; ids are thing_0, thing_1, ..., labels the classes."""
+    count = len(centers)
+    return LandmarkMap(
+        'map', tuple(f'thing_{row}' for row in range(count)), tuple(class_ids), tuple(class_ids),
+        np.array(centers, dtype=float), np.array(np.broadcast_to(semi_axes, (count, 3))),
+        np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
 
 
 def make_room() -> LandmarkMap:
@@ -65,6 +85,14 @@ def boxes_of(landmarks: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, camera=CAM
 def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:
     """Return a perfect observation of the room, one box for each landmark in order."""
     return Detections(boxes_of(room, map_from_camera), room.class_ids, np.full(len(room), 0.9))
+
+
+def observe(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, rows=None, **known
+            ) -> Observation:
+    """Return a perfect observation of some landmarks, in the order of their rows."""
+    seen = see_room(room, map_from_camera)
+    rows = np.arange(len(room)) if rows is None else np.array(rows, dtype=np.int64)
+    return Observation(CAMERA, seen.select(rows), **known)
 
 
 def depth_image(room: LandmarkMap, map_from_camera, bboxes_xyxy):
