@@ -75,6 +75,14 @@ def doubled_room(offset) -> LandmarkMap:
                    quats_xyzw=np.tile(room.quats_xyzw, (2, 1)))
 
 
+def with_others(landmark_map: LandmarkMap, count: int) -> LandmarkMap:
+    """Return the map with landmarks of another class far away, count in all."""
+    count -= len(landmark_map)
+    others = map_of(['far'] * count, np.random.default_rng(5).uniform(60, 90, (count, 3)))
+    return landmark_map.with_more(replace(others, landmark_ids=tuple(
+        f'far_{row}' for row in range(count))))
+
+
 def boxes_of(landmarks: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, camera=CAMERA):
     """Return the boxes (n, 4) of landmarks from a perfect detector; NaN behind the camera."""
     outlines = project_ellipsoids(invert_transform(map_from_camera), landmarks.centers,

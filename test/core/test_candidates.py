@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from reference import candidate_mask, same_class, verify
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, unit_rows
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, map_of, see_room, unit_rows, with_others
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
-from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
+from cliploc_ros.core.geometry.ellipsoid import Poses, ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.localizer import Localizer
-from cliploc_ros.core.map.culling import FEW
+from cliploc_ros.core.map.culling import FEW, make_groups, sort_landmarks, visible_members
 from cliploc_ros.core.map.landmark_details import LEAST_CLASS_SHARE, LandmarkDetails
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, with_images
 from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
@@ -36,6 +36,7 @@ from cliploc_ros.core.search.frame_search import (
     nearest_candidates,
 )
 from cliploc_ros.core.search.scene import make_scene
+from cliploc_ros.core.search.strategies import Leaders, draw_ransac, search_samples
 from cliploc_ros.errors import OptionsError
 
 
@@ -111,23 +112,25 @@ def make_world(count, seed=0, classes=12):
     """Return a map around a camera at its origin, and the camera's observation of it."""
     rng = np.random.default_rng(seed)
     centers = np.c_[rng.uniform(-4, 4, (count, 2)), rng.uniform(-8, 8, count)]
-    names = tuple(f'class {number}' for number in rng.integers(0, classes, count))
-    landmark_map = LandmarkMap('map', tuple(map(str, range(count))), names, names, centers,
-                               rng.uniform(0.1, 0.4, (count, 3)),
-                               unit_rows(np.random.default_rng(seed).normal(size=(count, 4))))
+    landmark_map = map_of([f'class {number}' for number in rng.integers(0, classes, count)],
+                          centers, rng.uniform(0.1, 0.4, (count, 3)))
+    landmark_map = replace(landmark_map, quats_xyzw=unit_rows(
+        np.random.default_rng(seed).normal(size=(count, 4))))
     boxes = ellipse_bboxes(project_ellipsoids(np.eye(4), centers, landmark_map.shapes))
     seen = np.nonzero((np.abs(boxes) < 0.6).all(axis=1))[0][:10]
     pixels = 500 * (boxes[seen] + rng.normal(0, 0.004, (len(seen), 4))) + [320, 240, 320, 240]
     similarities = rng.normal(0.2, 0.02, (len(seen), count)).astype(np.float32)
     similarities[np.arange(len(seen)), seen] += 0.05
-    detections = Detections(pixels, tuple(names[row] for row in seen), np.ones(len(seen)))
+    detections = Detections(pixels, tuple(landmark_map.class_ids[row] for row in seen),
+                            np.ones(len(seen)))
     return landmark_map, Observation(CAMERA, detections, similarities)
 
 
 @pytest.mark.parametrize('kind', ['class', 'clip', 'hybrid'])
-@pytest.mark.parametrize('count', [50, 400])
+@pytest.mark.parametrize('count', [50, 2000])
 def test_verification_is_that_of_masks(count, kind, rng):
-    landmark_map, observation = make_world(count)
+    """In a large map, landmarks out of sight are culled."""
+    landmark_map, observation = make_world(count, classes=max(12, count // 50))
     options = RelocalizerOptions(matching=kind)
     scene, left_out = match_frame(landmark_map, observation, options)
     assert left_out == 0
@@ -151,6 +154,41 @@ def test_verification_is_that_of_masks(count, kind, rng):
         assert (found.landmarks == expected.landmarks).all()
         scored += expected.score > 0
     assert scored > 20
+    leaders = Leaders.none_yet(300)
+    assert [*search_samples(scene, draw_ransac(scene.pairs, 300, rng), leaders)]
+    ranked = leaders.ranked()
+    assert len(ranked) > 10
+    for row in ranked:
+        assert leaders.scores[row] == pytest.approx(verify(
+            plain, leaders.rotations[row], leaders.translations[row]).score, abs=1e-9)
+
+
+@pytest.mark.parametrize('classes', [1, 7, 1_000])
+def test_a_frame_sees_what_its_boxes_can_show_and_little_more(rng, classes):
+    centers = rng.uniform(-50, 50, (1_000, 3))
+    shapes = np.zeros((1_000, 6))
+    shapes[:, [0, 3, 5]] = 4.0
+    class_ids = rng.permutation(np.arange(1_000) % classes)
+    landmarks = sort_landmarks(centers, shapes, np.column_stack([np.arange(1_000), class_ids]))
+    assert (np.sort(landmarks.numbers) == np.arange(1_000)).all()
+    assert (landmarks.landmarks[:, :3] == centers[landmarks.numbers]).all()
+    assert landmarks.radii == pytest.approx(2.0)
+    steps = np.linalg.norm(np.diff(landmarks.landmarks[:, :3], axis=0), axis=1)
+    assert np.median(steps) < 20  # neighbours have near rows
+    groups = make_groups(landmarks, np.array([-1, 0]),
+                         np.array([[5.0, 5, 1, 1], [0, 0, 0.3, 0.2]]), 0.02)
+    assert groups.detections.tolist() == [1]
+    members = landmarks.numbers[groups.members[:, 0]]
+    assert set(members) == set(np.nonzero(class_ids == 0)[0])
+    seen = np.empty((2, len(members)), dtype=np.int64)
+    count = visible_members(groups, Poses(np.eye(3)[None], np.zeros((1, 3))), 0, seen)
+    visible = {int(members[member]) for member in seen[0, :count]}
+    outlines = project_ellipsoids(np.eye(4), centers, shapes)
+    overlap = ((np.abs(outlines[:, 0]) < 0.3) & (np.abs(outlines[:, 1]) < 0.2)
+               & (class_ids == 0) & (centers[:, 2] < groups.spheres[0, 4]))
+    assert overlap.any() or classes > 7
+    assert set(np.nonzero(overlap)[0]) <= visible
+    assert len(visible) <= 3 * overlap.sum() + 3
 
 
 @pytest.mark.filterwarnings('error')
@@ -242,8 +280,7 @@ BY_CLASS = RelocalizerOptions(matching='class')
 
 def see(classes) -> Observation:
     """Return a perfect view of the room by a detector with these classes."""
-    seen = see_room(ROOM)
-    return Observation(CAMERA, Detections(seen.bboxes_xyxy, tuple(classes), seen.scores))
+    return Observation(CAMERA, replace(see_room(ROOM), class_ids=tuple(classes)))
 
 
 def weighted(landmark_map: LandmarkMap, share: float) -> LandmarkMap:
@@ -253,18 +290,10 @@ def weighted(landmark_map: LandmarkMap, share: float) -> LandmarkMap:
         for name in landmark_map.class_ids))
 
 
-def with_others(landmark_map: LandmarkMap, count: int) -> LandmarkMap:
-    """Return the map with additional landmarks far away."""
-    centers = np.random.default_rng(5).uniform(60, 90, (count, 3))
-    return landmark_map.with_more(LandmarkMap(
-        'map', tuple(f'far_{i}' for i in range(count)), ('far',) * count, ('far',) * count,
-        centers, np.full((count, 3), 0.2), np.tile([0.0, 0, 0, 1], (count, 1))))
-
-
 @pytest.mark.parametrize('landmarks', [len(ROOM), FEW + 20])
 def test_a_detection_of_a_second_class_finds_its_landmark(landmarks):
     """A small map uses pairs, a large map the culling tree."""
-    landmark_map = with_others(ROOM, landmarks - len(ROOM))
+    landmark_map = with_others(ROOM, landmarks)
     mistaken = see('zz' + ''.join(ROOM.class_ids[2:-2]) + 'zz')
     plain = Relocalizer(landmark_map, BY_CLASS).relocalize([mistaken])
     both = Relocalizer(weighted(landmark_map, 0.3), BY_CLASS).relocalize([mistaken])

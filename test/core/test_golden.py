@@ -12,7 +12,7 @@ from cliploc_ros.core.search.strategies import Leaders, search_exhaustively
 
 
 @pytest.fixture(scope='module')
-def golden_scenes(office, office_map, queries, observe):
+def golden_scenes(office, office_map, queries, observed):
     """Return scene, B-PROSAC pairs and golden values of each query that has them."""
     golden = np.load(office / 'golden.npz')
     scenes = []
@@ -21,7 +21,7 @@ def golden_scenes(office, office_map, queries, observe):
                   if name.startswith(f'q{number}_')}
         if 'H' not in values:  # fewer than three boxes
             continue
-        observation = observe(frame)
+        observation = observed(frame)
         nearest = nearest_candidates(observation.similarities, 3)
         potential = same_class(observation.detections.class_ids, office_map.class_ids)
         potential |= candidate_mask(nearest, potential.shape)

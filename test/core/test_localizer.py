@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, observe, rigid, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, observe, rigid, see_room, with_others
 
 from cliploc_ros.core.acceptance.confidence import Setting, none_right
 from cliploc_ros.core.acceptance.contenders import join_frames
@@ -24,6 +24,7 @@ from cliploc_ros.core.keyframes.features import SIFT
 from cliploc_ros.core.keyframes.localization import LEAST_S
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.localizer import KeptInstant, Localizer, instants_to_fuse
+from cliploc_ros.core.map.culling import FEW
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
@@ -274,9 +275,10 @@ def walk():
     return [moved(MAP_FROM_CAMERA, 0.05 * step, 2.0 * step) for step in range(4)]
 
 
-def test_objects_seen_one_after_the_other_are_as_good_as_at_once(room, walk):
-    """No single frame shows three distinguishable objects."""
-    shares = [[0, 4, 8], [3, 7], [2, 11, 9], [1, 5]]
+@pytest.mark.parametrize('landmarks', [len(ROOM), FEW + 20])
+def test_objects_seen_one_after_the_other_are_as_good_as_at_once(landmarks, walk):
+    """No single frame shows three distinguishable objects. A large map is culled."""
+    room, shares = with_others(ROOM, landmarks), [[0, 4, 8], [3, 7], [2, 11, 9], [1, 5]]
     frames = [see(room, pose, rows) for pose, rows in zip(walk, shares, strict=True)]
     relocalizer = Relocalizer(room, OPTIONS)
     assert not any(relocalizer.relocalize([frame]).accepted for frame in frames)

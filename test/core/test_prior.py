@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, see_room
+from scene import MAP_FROM_CAMERA, doubled_room, make_room, observe, rigid
 from scipy.spatial.transform import Rotation
 from test_map_file import floor, join
 
 from cliploc_ros.core.acceptance.confidence import confidences, region_odds
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Observation, Region
+from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
@@ -35,16 +35,13 @@ def region(x=0.0, y=0.0, sigma_m=0.5, probability=0.95, frame_id='map', yaw=0.0,
 
 
 def ask(landmark_map=TWINS, objects=12, options=OPTIONS, **known):
-    seen = Observation(CAMERA, see_room(make_room()).select(np.arange(objects)), **known)
-    return Relocalizer(landmark_map, options).relocalize([seen])
+    return Relocalizer(landmark_map, options).relocalize(
+        [observe(make_room(), rows=range(objects), **known)])
 
 
 def looking(yaw, x=0.0, y=0.0):
     """Return a level camera pose."""
-    body = np.eye(4)
-    body[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    body[:2, 3] = x, y
-    return (body @ np.linalg.inv(OPTICAL_FROM_BODY))[None]
+    return (rigid((x, y, 0.0), degrees=math.degrees(yaw)) @ np.linalg.inv(OPTICAL_FROM_BODY))[None]
 
 
 AREA = np.prod(np.ptp(TWINS.centers[:, :2], axis=0) + 2.0)
@@ -100,7 +97,7 @@ def test_no_region_decides_alone_between_identical_rooms():
 
 def test_a_region_of_another_floor_decides_between_equal_floors():
     floors = join(floor('floor_1'), floor('floor_2'))
-    seen = Observation(CAMERA, see_room(floor('')))
+    seen = observe(floor(''))
     for row, name in enumerate(('floor_1', 'floor_2')):
         found = Relocalizer(floors, OPTIONS).relocalize(
             [replace(seen, region=region(frame_id=name))])
@@ -131,12 +128,12 @@ def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
 UP_IN_CAMERA = MAP_FROM_CAMERA[2, :3]
 
 
-def with_vertical(room, up=UP_IN_CAMERA):
-    return Observation(CAMERA, see_room(room), None, up_in_camera=up)
+def with_vertical(room, up=UP_IN_CAMERA, rows=None):
+    return observe(room, rows=rows, up_in_camera=up)
 
 
 @pytest.mark.parametrize('tilt_deg', [90.0, 180.0])
-def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observe):
+def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observed):
     """As with a wrong mount: the pose from boxes without the vertical is among the rivals."""
     relocalizer, rng = Relocalizer(office_map, RelocalizerOptions()), np.random.default_rng(0)
     accepted, wrong = 0, 0
@@ -144,7 +141,7 @@ def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries,
         up = frame.map_from_camera[2, :3]
         axis = np.cross(up, rng.normal(size=3))
         up = Rotation.from_rotvec(np.radians(tilt_deg) * axis / np.linalg.norm(axis)).apply(up)
-        found = relocalizer.relocalize([replace(observe(frame), up_in_camera=up)])
+        found = relocalizer.relocalize([replace(observed(frame), up_in_camera=up)])
         if found.accepted:
             accepted += 1
             wrong += pose_error(found.map_from_camera, frame.map_from_camera)[0] > 1.0
@@ -161,15 +158,12 @@ def test_the_right_pose_is_the_rival_of_one_by_a_wrong_vertical(room):
 
 def test_two_objects_and_the_vertical_fix_a_pose(room):
     """The pose is refused, since four objects are required; without a vertical there is none."""
-    options = RelocalizerOptions(matching='class')
-    pair = np.array([0, 1])
-    observation = with_vertical(room)
-    observation = replace(observation, detections=observation.detections.select(pair))
-    found = Relocalizer(room, options).relocalize([observation])
+    relocalizer = Relocalizer(room, OPTIONS)
+    found = relocalizer.relocalize([with_vertical(room, rows=[0, 1])])
     assert found.solved and not found.accepted
     assert len(found.matches) == 2
     assert np.linalg.eigvalsh(found.covariance).min() > 0.0
-    blind = Relocalizer(room, options).relocalize([replace(observation, up_in_camera=None)])
+    blind = relocalizer.relocalize([with_vertical(room, None, [0, 1])])
     assert not blind.solved
     assert 'fewer than 3' in blind.reason
 
@@ -197,7 +191,5 @@ def test_the_papers_algorithms_ask_for_no_vertical(room):
                                 np.array([1.0, 0.0])])
 def test_a_vertical_is_a_unit_vector(room, up):
     with pytest.raises(OptionsError, match='up_in_camera'):
-        Relocalizer(room, RelocalizerOptions(matching='class')).relocalize(
-            [with_vertical(room, up)])
-
+        Relocalizer(room, OPTIONS).relocalize([with_vertical(room, up)])
 

@@ -28,11 +28,10 @@ from cliploc_ros.core.geometry.transforms import (
     pose_error,
 )
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
+from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.frame_search import match_frame
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 
@@ -151,32 +150,6 @@ def test_the_score_is_the_sum_of_the_frames_scores(room, walk, rng):
     np.testing.assert_array_equal(found.landmarks,
                                   np.concatenate([result.landmarks for result in alone]))
     np.testing.assert_allclose(found.ious, np.concatenate([one.ious for one in alone]), atol=1e-9)
-
-
-def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
-    count = 20
-    shifts = np.repeat(np.c_[30.0 * np.arange(count), np.zeros((count, 2))], len(room), axis=0)
-    many = LandmarkMap(
-        'map', tuple(f'{i}' for i in range(count * len(room))), room.labels * count,
-        room.class_ids * count, np.tile(room.centers, (count, 1)) + shifts,
-        np.tile(room.semi_axes, (count, 1)), np.tile(room.quats_xyzw, (count, 1)))
-    scenes = []
-    for rows in ([0, 1, 2, 3, 5], [], [4, 7], [6]):  # no two frames show the same classes
-        boxes = boxes_of(room, walk[len(scenes)])[rows]
-        seen = Detections(boxes, tuple(room.class_ids[row] for row in rows), np.ones(len(rows)))
-        scenes.append(match_frame(many, Observation(CAMERA, seen),
-                                  RelocalizerOptions(matching='class'))[0])
-    assert [len(scene.groups.starts) - 1 for scene in scenes] == [3, 0, 1, 1]
-    cameras = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
-    rig = make_rig(scenes, cameras, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)),
-                   many.position_sigmas)
-    place = 3
-    reference = walk[-1].copy()
-    reference[0, 3] += 30.0 * place
-    found = verify_rig(rig, *split(reference))
-    np.testing.assert_array_equal(
-        found.landmarks, place * len(room) + np.array([0, 1, 2, 3, 5, 4, 7, 6]))
-    assert found.ious.min() > 0.6
 
 
 ROOM = make_room()

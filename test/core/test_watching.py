@@ -7,13 +7,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scene import boxes_of
+from scene import boxes_of, map_of, rigid
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.visibility import Expected, Missing, expect
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -106,11 +105,8 @@ def room():
     along, wall = rng.uniform(0.3, SIDE_M - 0.3, COUNT), np.arange(COUNT) % 4
     x = np.choose(wall, [along, along, 0.0 * along, 0.0 * along + SIDE_M])
     y = np.choose(wall, [0.0 * along, 0.0 * along + SIDE_M, along, along])
-    return LandmarkMap(
-        'map', tuple(f'thing_{row}' for row in range(COUNT)), ('thing',) * COUNT,
-        tuple('abcdefgh'[row] for row in rng.integers(8, size=COUNT)),
-        np.c_[x, y, rng.uniform(0.3, 1.8, COUNT)], rng.uniform(0.1, 0.25, (COUNT, 3)),
-        np.tile([0.0, 0.0, 0.0, 1.0], (COUNT, 1)))
+    return map_of(['abcdefgh'[row] for row in rng.integers(8, size=COUNT)],
+                  np.c_[x, y, rng.uniform(0.3, 1.8, COUNT)], rng.uniform(0.1, 0.25, (COUNT, 3)))
 
 
 def pose_at(x, y, yaw_deg):
@@ -144,8 +140,8 @@ def see(landmark_map, pose, number=0, odom=True, rng=None, rows=None):
 
 
 def moved(pose, x, y, yaw_deg=0.0):
-    turn = Rotation.from_euler('z', yaw_deg, degrees=True).as_matrix()
-    return make_transform(turn @ pose[:3, :3], pose[:3, 3] + [x, y, 0.0])
+    return make_transform(rigid(degrees=yaw_deg)[:3, :3] @ pose[:3, :3],
+                          pose[:3, 3] + [x, y, 0.0])
 
 
 @pytest.fixture
@@ -219,17 +215,17 @@ def test_a_place_that_the_map_does_not_show_is_uncertain(watch, room):
     assert WatchState.UNCERTAIN in states
 
 
+NOTHING = Detections(np.empty((0, 4)), (), np.empty(0))
+
+
 def test_a_standing_robot_learns_little_from_more_of_the_same():
     belief = Belief()
     for number in range(50):
-        seen = Observation(CAMERA, Detections(np.empty((0, 4)), (), np.empty(0)),
-                           stamp_ns=2 * number * NS_PER_S, odom_from_camera=np.eye(4))
+        seen = Observation(CAMERA, NOTHING, stamp_ns=2 * number * NS_PER_S,
+                           odom_from_camera=np.eye(4))
         belief.wait(seen, np.eye(4))
         belief.add(seen, -1.0, is_full=True)
     assert 0.05 < belief.probability < 0.5
-
-
-NOTHING = Detections(np.empty((0, 4)), (), np.empty(0))
 
 
 def test_looks_that_say_the_opposite_are_no_repetitions():
@@ -240,13 +236,6 @@ def test_looks_that_say_the_opposite_are_no_repetitions():
         weights.append(belief.add(seen, odds, is_full=True))
     assert weights == pytest.approx([1.0 - TERMS.correlated * np.exp(-6.0 / TERMS.most),
                                      1.0 - TERMS.correlated])
-
-
-def test_without_odometry_looks_share_errors_for_some_seconds():
-    belief, seen = Belief(), Observation(CAMERA, NOTHING)
-    belief.add(seen, 3.0, is_full=True)
-    assert belief.add(replace(seen, stamp_ns=5 * NS_PER_S), 3.0, is_full=True) == pytest.approx(
-        1.0 - TERMS.correlated * np.exp(-5.0 / TERMS.correlated_s))
 
 
 @pytest.mark.parametrize(('way_m', 'time_s'), [(100.0, 0), (0.0, 100), (50.0, 200)])
@@ -341,8 +330,7 @@ def test_invalid_inputs_are_named(watch, room):
 
 def test_a_pose_against_the_vertical_is_less_likely():
     level = pose_at(0.0, 0.0, 0.0)
-    tilted = level @ make_transform(Rotation.from_euler('x', 15, degrees=True).as_matrix(),
-                                    np.zeros(3))
+    tilted = level @ rigid(axis='x', degrees=15.0)
     up = np.array([0.0, -1.0, 0.0])
     assert by_vertical(level, None, 1.0) == by_vertical(level, up, 1.0) == 0.0
     assert by_vertical(tilted, up, 1.0) < -3.0
@@ -351,10 +339,7 @@ def test_a_pose_against_the_vertical_is_less_likely():
 
 
 def things(*centers):
-    count = len(centers)
-    return LandmarkMap('map', tuple(map(str, range(count))), ('thing',) * count, ('a',) * count,
-                       np.array(centers, dtype=np.float64), np.full((count, 3), 0.2),
-                       np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+    return map_of('a' * len(centers), centers)
 
 
 def test_what_an_image_should_show():
