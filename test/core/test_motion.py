@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from scene import rigid
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -14,23 +15,18 @@ from cliploc_ros.core.keyframes.layer import FROM_DEPTH
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
 
-#: Least score of a pose from keyframes.
 SHARED = np.diag([0.012**2] * 3 + [np.radians(0.45)**2] * 3)
 SURE = chi2.isf(1e-3, 6)
 
 
 def turned(degrees, behind_m=0.0):
     """Return the motion of a camera that turns to the right about an axis behind it."""
-    turn = Rotation.from_rotvec([0.0, np.radians(degrees), 0.0]).as_matrix()
+    turn = rigid(axis='y', degrees=degrees)[:3, :3]
     return make_transform(turn, (turn - np.eye(3)) @ np.array([0.0, 0.0, behind_m]))
 
 
-def driven(x=0.0, z=0.0):
-    return make_transform(np.eye(3), np.array([x, 0.0, z]))
-
-
-MOTIONS = {'side': driven(x=0.2), 'oblique': driven(0.15, 0.15),
-           'turn': turned(10.0, 0.5), 'back and turn': driven(-0.2, -0.1) @ turned(10.0)}
+MOTIONS = {'side': rigid((0.2, 0, 0)), 'oblique': rigid((0.15, 0, 0.15)),
+           'turn': turned(10.0, 0.5), 'back and turn': rigid((-0.2, 0, -0.1)) @ turned(10.0)}
 
 
 @pytest.fixture
@@ -88,7 +84,7 @@ def test_a_room_moves_as_odometry_says_and_a_picture_does_not(room, name):
     assert np.mean(squares) < 8.0
 
 
-@pytest.mark.parametrize('motion', [np.eye(4), turned(10.0), driven(x=0.01)],
+@pytest.mark.parametrize('motion', [np.eye(4), turned(10.0), rigid((0.01, 0, 0))],
                          ids=['none', 'about the camera itself', '1 cm'])
 def test_where_a_picture_moves_like_the_room_nothing_is_claimed(room, motion):
     pose, points = room
@@ -103,7 +99,7 @@ def test_where_a_picture_moves_like_the_room_nothing_is_claimed(room, motion):
 
 def test_a_picture_that_the_camera_passes_is_not_seen_again(room):
     pose, points = room
-    rng, motion = np.random.default_rng(5), driven(z=5.0)
+    rng, motion = np.random.default_rng(5), rigid((0, 0, 5.0))
     first = look(points, seen_from(points, pose), rng)
     found = compare_motion(FROM_DEPTH, first, first._replace(map_from_camera=pose @ motion),
                            motion)
@@ -114,9 +110,8 @@ def test_a_picture_that_the_camera_passes_is_not_seen_again(room):
 def test_what_looks_at_the_same_keyframes_share_does_not_count(room):
     """A wrong keyframe pose moves both poses alike; errors of two keyframes differ."""
     pose, points = room
-    rng, motion = np.random.default_rng(4), driven(x=0.2)
-    wrong = make_transform(Rotation.from_rotvec([0.0, 0.0, np.radians(1.2)]).as_matrix(),
-                           np.array([0.04, 0.0, 0.0]))
+    rng, motion = np.random.default_rng(4), rigid((0.2, 0, 0))
+    wrong = rigid((0.04, 0.0, 0.0), degrees=1.2)
     bearings, moved = seen_from(points, pose), seen_from(points, pose @ motion)
     first = look(points, bearings, rng)
     same, other = (compare_motion(FROM_DEPTH, first,

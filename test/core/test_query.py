@@ -138,10 +138,9 @@ def test_all_that_is_known_comes_back(tmp_path):
     ('about', lambda about: about[:-3]), ('about', lambda about: about[:0]),
     ('images', lambda images: images[:-9]), ('images', lambda images: 0 * images),
     ('image_offsets', lambda offsets: offsets[:1]), ('crop_offsets', lambda offsets: offsets[1:]),
-    ('odom_from_camera', [[0.0] * 4] * 4), ('odom_from_camera', [[1e308]]), ('class_ids', [[]]),
-    ('scores', 'x'), ('bboxes_xyxy', [[1e308] * 4]), ('depths', [1.0]), ('compared', [99]),
-    ('compared', [1, 1]), ('stamp_ns', -1), ('stamp_ns', 2**70), ('width', 10), ('rooms', [1]),
-    ('length_s', 1e300), ('frames', []), ('parameters', []), ('cameras', [1])])
+    ('odom_from_camera', [[0.0] * 4] * 4), ('class_ids', [[]]), ('scores', 'x'),
+    ('bboxes_xyxy', [[1e308] * 4]), ('depths', [1.0]), ('compared', [99]), ('compared', [1, 1]),
+    ('stamp_ns', 2**70), ('width', 10), ('rooms', [1]), ('frames', []), ('cameras', [1])])
 def test_a_case_with_a_wrong_value_is_named(name, value, tmp_path):
     arrays = dict(case_arrays(Case((replace(query(), run=1),), {'parameters': {}})))
 
@@ -163,8 +162,7 @@ def test_a_case_with_a_wrong_value_is_named(name, value, tmp_path):
 
 
 @pytest.mark.parametrize('wrong', [
-    {'mount_deviation': []}, {'mount_deviation': [None, 1]}, {'height_range_m': [10**400, 1]},
-    {'k': 'x'}, {'min_confidence': {}}, 'options'])
+    {'mount_deviation': [None, 1]}, {'height_range_m': [10**400, 1]}, {'k': 'x'}, 'options'])
 def test_options_of_a_case_are_checked(wrong):
     with pytest.raises(DatasetError, match='options'):
         _ = Case((query(),), {'options': wrong}).options

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reference import scene_of, verify
-from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room
+from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room, observe, rigid
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -29,7 +29,6 @@ from cliploc_ros.core.geometry.transforms import (
 )
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M
-from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
@@ -41,6 +40,11 @@ def refine(scene, rotation, translation, vertical):
     return refine_rig(rig, rotation, translation)
 
 
+def split(map_from_camera):
+    inverse = invert_transform(map_from_camera)
+    return inverse[:3, :3].copy(), inverse[:3, 3].copy()
+
+
 def shaken(rng, metres, degrees):
     """Return the true camera_from_map, randomly moved and turned."""
     pose = MAP_FROM_CAMERA.copy()
@@ -49,15 +53,12 @@ def shaken(rng, metres, degrees):
     shift = rng.normal(size=3)
     pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ pose[:3, :3]
     pose[:3, 3] += shift * metres / np.linalg.norm(shift)
-    camera_from_map = invert_transform(pose)
-    return (np.ascontiguousarray(camera_from_map[:3, :3]),
-            np.ascontiguousarray(camera_from_map[:3, 3]))
+    return split(pose)
 
 
-def error_of(rotation, translation):
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, translation
-    return pose_error(invert_transform(pose), MAP_FROM_CAMERA)
+def error_m(found):
+    return pose_error(invert_transform(make_transform(found.rotation, found.translation)),
+                      MAP_FROM_CAMERA)[0]
 
 
 def test_a_perfect_view_leads_to_the_truth_and_a_noisy_one_near_it(room, rng):
@@ -68,9 +69,9 @@ def test_a_perfect_view_leads_to_the_truth_and_a_noisy_one_near_it(room, rng):
         found = refine(noisy, *start, VERTICAL_UNKNOWN)
         assert found.score >= LEAST_SHARE * verify(noisy, *start).score
         assert found.score == verify(noisy, found.rotation, found.translation).score
-        errors_m.append(error_of(found.rotation, found.translation)[0])
+        errors_m.append(error_m(found))
         found = refine(scene, *shaken(rng, 0.08, 1.5), VERTICAL_UNKNOWN)
-        assert error_of(found.rotation, found.translation)[0] < 1e-4
+        assert error_m(found) < 1e-4
         assert found.score == pytest.approx(perfect, abs=1e-2)
         assert (np.linalg.eigvalsh(found.information) > 0).all()
         np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
@@ -126,11 +127,6 @@ def rig_of(room, poses):
                     np.tile(VERTICAL_UNKNOWN, (len(poses), 1)), np.zeros(len(room)))
 
 
-def split(map_from_camera):
-    inverse = invert_transform(map_from_camera)
-    return inverse[:3, :3].copy(), inverse[:3, 3].copy()
-
-
 def nearby(pose, rng, metres, degrees):
     turn = Rotation.from_rotvec(np.radians(degrees) * rng.normal(size=3))
     return make_transform(turn.as_matrix() @ pose[:3, :3], pose[:3, 3] + metres * rng.normal(
@@ -156,24 +152,20 @@ ROOM = make_room()
 BY_CLASS = RelocalizerOptions(matching='class')
 
 
-def boxes_at(map_from_camera, noise_px=0.0, rng=None):
-    boxes = boxes_of(ROOM, map_from_camera)
-    return boxes if rng is None else boxes + rng.normal(0, noise_px, boxes.shape)
-
-
 UNSHARED, EXACT = np.zeros((len(ROOM), 2)), np.zeros(ERRORS)
 
 
 def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=UNSHARED,
            wrong_share=0.0, camera=CAMERA, deviations=EXACT):
     """Return the pose of the last camera in a map with these centres, and its covariance."""
-    scenes = [make_scene(camera.normalize_bboxes(boxes_at(pose, noise_px, rng)), centers,
-                         ROOM.shapes, np.eye(len(ROOM), dtype=bool), np.empty((0, 2), int), 0.05)
-              for pose in poses]
+    noise = 0.0 if rng is None else rng.normal(0, noise_px, (len(poses), len(ROOM), 4))
+    boxes = np.array([boxes_of(ROOM, pose) for pose in poses]) + noise
+    scenes = [make_scene(camera.normalize_bboxes(shown), centers, ROOM.shapes,
+                         np.eye(len(ROOM), dtype=bool), np.empty((0, 2), int), 0.05)
+              for shown in boxes]
     rig = make_rig(scenes, np.array([invert_transform(pose) @ poses[-1] for pose in poses]),
                    np.tile(VERTICAL_UNKNOWN, (len(poses), 1)), np.full(len(ROOM), sigma))
-    start = invert_transform(poses[-1])
-    found = refine_rig(rig, start[:3, :3].copy(), start[:3, 3].copy())
+    found = refine_rig(rig, *split(poses[-1]))
     stamps = np.arange(len(poses)) if stamps is None else np.array(stamps)
     return (invert_transform(make_transform(found.rotation, found.translation)),
             refined_covariance(rig, found.rotation, found.translation, stamps, shared,
@@ -181,8 +173,7 @@ def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=UN
 
 
 def turning(count):
-    return [MAP_FROM_CAMERA @ make_transform(Rotation.from_euler(
-        'y', 2.0 * step, degrees=True).as_matrix(), np.zeros(3)) for step in range(count)]
+    return [MAP_FROM_CAMERA @ rigid(axis='y', degrees=2.0 * step) for step in range(count)]
 
 
 def test_odometry_errs_as_much_to_later_frames_as_to_earlier_ones():
@@ -260,10 +251,8 @@ def test_a_map_states_what_its_landmarks_share():
                                     *[LandmarkDetails()] * (len(ROOM) - 1)))
     assert stated.shared_sigmas[0] == pytest.approx([0.1, np.radians(3.0)])
     assert not stated.shared_sigmas[1:].any()
-    frame = Observation(CAMERA, Detections(boxes_at(MAP_FROM_CAMERA), ROOM.class_ids,
-                                           np.ones(len(ROOM))))
-    plain, shared = (Relocalizer(each, BY_CLASS).relocalize([frame]).covariance for each in (
-        ROOM, replace(ROOM, details=(stated.details[0],) * len(ROOM))))
+    plain, shared = (Relocalizer(each, BY_CLASS).relocalize([observe(ROOM)]).covariance
+                     for each in (ROOM, replace(ROOM, details=(stated.details[0],) * len(ROOM))))
     # the covariance does not shrink with the number of landmarks
     np.testing.assert_allclose(np.diag(shared - plain), [0.01] * 3 + [np.radians(3.0) ** 2] * 3,
                                rtol=0.1)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from disturbed_poses import disturb, draw_errors, offsets_m
+from walk import disturb, draw_errors, nearest_errors
 
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.building import build_map
@@ -70,12 +70,11 @@ def test_other_frames_are_explained(observations, splits, even_map, required, na
 @pytest.mark.full
 def test_joint_refinement_makes_up_for_slow_pose_errors(even, even_map, required):
     given = PoseErrors(0.05, 1.0, 3.0)
-    noisy = disturb(even, draw_errors('correlated', even.stamps_s, given,
-                                      np.random.default_rng(0)))
+    noisy = disturb(even, draw_errors(even.stamps_s, given, seed=0))
 
     def median_offset(built):
         """Return the distances of landmarks to those of true poses [m]."""
-        return float(np.median(offsets_m(built.landmark_map, even_map)))
+        return float(np.median(nearest_errors(built.landmark_map, even_map)))
 
     plain = build_map(noisy)
     joint = build_map(noisy, MappingOptions(pose_errors=given))

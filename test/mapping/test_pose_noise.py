@@ -4,12 +4,21 @@
 
 import re
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from disturbed_poses import aligned_offsets_m, disturb, draw_errors, offsets_m, with_odometry
 from scipy.spatial.transform import Rotation
-from walk import look_at, make_table, nearest_errors, see, walk_around
+from walk import (
+    disturb,
+    draw_errors,
+    look_at,
+    make_table,
+    nearest_errors,
+    see,
+    shape_error_m,
+    walk_around,
+)
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.offline.mapping.building import build_map
@@ -51,17 +60,15 @@ def test_true_poses_are_found_to_be_true(seen):
     assert (built.landmark_map.centers == plain.landmark_map.centers).all()
 
 
-@pytest.mark.parametrize(('kind', 'given'), [('independent', PoseErrors(0.02, 0.5)),
-                                             ('correlated', PoseErrors(0.04, 0.8, 3.0))])
-def test_errors_are_estimated(seen, kind, given):
-    errors = draw_errors(kind, seen.stamps_s, given, np.random.default_rng(2))
-    disturbed = disturb(seen, errors)
+@pytest.mark.parametrize('given', [PoseErrors(0.02, 0.5), PoseErrors(0.04, 0.8, 3.0)])
+def test_errors_are_estimated(seen, given):
+    disturbed = disturb(seen, draw_errors(seen.stamps_s, given, seed=2))
     views, landmarks, shown = draft_of(disturbed)
     found = estimate_pose_errors(views, landmarks, shown, views)
     # a walk of 24 s has eight independent errors of 3 s
     assert given.sigma_m / 2 < found.sigma_m < 2 * given.sigma_m
     assert given.sigma_deg / 2.5 < found.sigma_deg < 2 * given.sigma_deg
-    assert (found.correlation_s < 0.3) == (kind == 'independent')
+    assert (found.correlation_s < 0.3) == (given.correlation_s == 0.0)
 
 
 def test_a_wrong_mount_is_corrected():
@@ -81,7 +88,7 @@ def test_a_wrong_mount_is_corrected():
     assert np.degrees(turn.magnitude()) < 0.2
     assert np.abs(built.map_from_camera - seen.map_from_camera).max() < 0.01
     assert np.median(nearest_errors(built.landmark_map, table)) < 0.006
-    assert np.median(offsets_m(plain.landmark_map, table)) > 0.02
+    assert np.median(nearest_errors(plain.landmark_map, table)) > 0.02
     assert any('mount corrected' in note for note in built.report.notes)
 
 
@@ -115,8 +122,7 @@ def views_of(stamps_s, frames):
 @pytest.mark.parametrize('correlation_s', [0.0, 3.0, 200.0])
 def test_the_mean_error_of_the_poses_stays(correlation_s):
     errors, stamps = PoseErrors(0.05, 1.0, correlation_s), np.arange(0.0, 60.0, 0.7)
-    kind, rng = 'correlated' if correlation_s else 'independent', np.random.default_rng(0)
-    means = [draw_errors(kind, stamps, errors, rng).mean(axis=0) for _ in range(300)]
+    means = [draw_errors(stamps, errors, seed).mean(axis=0) for seed in range(300)]
     frames = np.arange(len(stamps))
     shared = shared_by_neighbours(views_of(stamps, frames), np.zeros(len(frames), int), 1, errors)
     measured = np.std(means, axis=0).reshape(2, 3).mean(axis=1) * [1.0, np.degrees(1.0)]
@@ -149,8 +155,7 @@ def truth():
 
 @pytest.fixture(scope='module')
 def disturbed(truth):
-    return disturb(truth, draw_errors('correlated', truth.stamps_s, POSE_ERRORS,
-                                      np.random.default_rng(1)))
+    return disturb(truth, draw_errors(truth.stamps_s, POSE_ERRORS))
 
 
 @pytest.fixture(scope='module')
@@ -160,7 +165,18 @@ def without(disturbed):
 
 @pytest.fixture(scope='module')
 def linked(truth, disturbed):
-    return with_odometry(disturbed, truth, np.random.default_rng(2), NOISE)
+    """With odometry: true motions with a random error of each step."""
+    poses, rng = [np.eye(4)], np.random.default_rng(2)
+    for before, after in pairwise(truth.map_from_camera):
+        step = np.linalg.inv(before) @ after
+        sigma_m, sigma_rad = NOISE.sigmas(
+            np.linalg.norm(step[None, :3, 3], axis=1),
+            Rotation.from_matrix(step[None, :3, :3]).magnitude())[0]
+        turn = Rotation.from_rotvec(rng.normal(0.0, sigma_rad, 3)).as_matrix()
+        step[:3, :3] = turn @ step[:3, :3]
+        step[:3, 3] += rng.normal(0.0, sigma_m, 3)
+        poses.append(poses[-1] @ step)
+    return replace(disturbed, odom_from_camera=np.array(poses))
 
 
 def moved_odometry(detections, change):
@@ -219,8 +235,8 @@ def test_odometry_betters_poses_and_map(truth, linked, without):
     built = build_map(linked, OPTIONS)
     assert joined(built) == 119
     assert pose_error_m(built, truth) < 0.6 * pose_error_m(without, truth)
-    assert (np.median(aligned_offsets_m(built.landmark_map, make_table(4)))
-            < 0.8 * np.median(aligned_offsets_m(without.landmark_map, make_table(4))))
+    assert shape_error_m(built.landmark_map, make_table(4)) < 0.8 * shape_error_m(
+        without.landmark_map, make_table(4))
 
 
 @pytest.mark.parametrize(('way_m', 'pairs', 'share'), [
