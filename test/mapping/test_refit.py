@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scene import map_of
 from scipy.spatial.transform import Rotation
 from walk import CLASSES, join_maps, make_table, see, see_rows, walk_around
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.building import build_map, refit_map
@@ -144,15 +144,12 @@ CUP_ON_TABLE = CUP, (0.1, 0.0, 0.85), (0.06, 0.06, 0.08)
 
 def make_map(*things):
     """Return the map of some objects: class, centre and semi-axes of each."""
-    classes, centers, axes = zip(*things, strict=True)
-    return LandmarkMap('map', tuple(f'thing_{row}' for row in range(len(things))), classes,
-                       classes, np.array(centers), np.array(axes),
-                       np.tile([0.0, 0.0, 0.0, 1.0], (len(things), 1)))
+    return map_of(*zip(*things, strict=True))
 
 
-def watch(*things, noise_px=1.0):
+def watch(*things):
     """Return simulated detections of some objects: class, centre, axes, frames with a box."""
-    parts = [see(make_map(thing[:3]), POSES, noise_px, seed=row)
+    parts = [see(make_map(thing[:3]), POSES, noise_px=1.0, seed=row)
              for row, thing in enumerate(things)]
     parts = [part.select_boxes(frames[part.frames])
              for part, (*_, frames) in zip(parts, things, strict=True)]
