@@ -55,9 +55,9 @@ def write_again_and_again(path, first, begun, after):
 
 
 def test_a_kill_leaves_one_whole_set(path):
-    """The writes of build_map are killed at 60 random times."""
+    """The writes of build_map are killed at 30 random times."""
     draw, seen, fork = random.Random(0), set(), multiprocessing.get_context('fork')
-    for kill in range(60):
+    for kill in range(30):
         begun = fork.Event()
         writer = fork.Process(target=write_again_and_again,
                               args=(path, 1000 * kill + 1, begun, draw.randrange(3)), daemon=True)
@@ -69,7 +69,7 @@ def test_a_kill_leaves_one_whole_set(path):
         number, agree = read(path)
         assert agree == {True}
         seen.add(number)
-    print(f'60 kills, {len(seen)} sets')
+    print(f'30 kills, {len(seen)} sets')
     assert len(seen) > 10, 'the kills happen during writes'
 
 
@@ -132,7 +132,7 @@ def test_a_set_that_cannot_be_written_changes_nothing(path):
 def test_two_writers_at_once_leave_one_whole_set(path):
     """As with build_map in two terminals: the last one wins with all of its files."""
     fork = multiprocessing.get_context('fork')
-    for turn in range(8):
+    for turn in range(3):
         writers = [fork.Process(target=lambda numbers: [write_set(path, tag) for tag in numbers],
                                 args=(range(first, first + 10),))
                    for first in (100 * turn, 100 * turn + 10)]

@@ -78,16 +78,16 @@ def infos():
         binning_x=uint32, binning_y=uint32, **numbers)
 
 
-def boxes(coordinate=number):
-    center = st.builds(Pose2D, position=st.builds(Point2D, x=coordinate, y=coordinate),
-                       theta=or_sound(0.0, coordinate))
-    return st.builds(BoundingBox2D, center=center, size_x=coordinate, size_y=coordinate)
+def boxes():
+    center = st.builds(Pose2D, position=st.builds(Point2D, x=number, y=number),
+                       theta=or_sound(0.0, number))
+    return st.builds(BoundingBox2D, center=center, size_x=number, size_y=number)
 
 
-def detections(box=None, most=40):
+def detections(most=40):
     hypothesis = st.builds(ObjectHypothesis, class_id=name, score=number)
     result = st.builds(ObjectHypothesisWithPose, hypothesis=hypothesis)
-    detection = st.builds(Detection2D, bbox=boxes() if box is None else box,
+    detection = st.builds(Detection2D, bbox=boxes(),
                           results=st.lists(result, max_size=3), id=name)
     return st.builds(Detection2DArray, detections=st.lists(detection, max_size=most))
 

@@ -48,16 +48,9 @@ def localize(localizer, values, image, info, found):
         return None
 
 
-@given(images(), infos(), detections())
+@given(images() | compressed_images(), infos(), detections())
 @CASES
-def test_raw_images(localizer, values, image, info, found):
-    result = localize(localizer, values, image, info, found)
-    assert result is None or not result.accepted
-
-
-@given(compressed_images(), infos(), detections(most=5))
-@CASES
-def test_compressed_images(localizer, values, image, info, found):
+def test_images_raw_and_compressed(localizer, values, image, info, found):
     result = localize(localizer, values, image, info, found)
     assert result is None or not result.accepted
 

@@ -157,9 +157,9 @@ def test_an_offset_of_the_coordinate_frame_is_corrected_and_noted():
 def test_noisy_poses_with_gaps_are_refined_against_the_map():
     """The verticals are as from the relocalizer: independent, and missing in some frames."""
     later = without(moved(THINGS, {12: (1.6, 0.1, 0.8)}), 6)
-    seen, errors = see(later, POSES, noise_px=2.0), PoseErrors(0.05, 1.0, 0.0)
+    seen, errors = see(later, POSES, noise_px=2.0), PoseErrors(0.05, 1.5, 0.0)
     kept = np.sort(np.random.default_rng(2).choice(len(POSES), 40, replace=False))
-    detections = disturb(seen, draw_errors(seen.stamps_s, errors)).select_frames(kept)
+    detections = disturb(seen, draw_errors(seen.stamps_s, errors, 4)).select_frames(kept)
     with pytest.raises(MappingError, match='`pose_noise`'):
         update_map(THINGS, detections)
     joint = update_map(THINGS, detections,

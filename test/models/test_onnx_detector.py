@@ -104,20 +104,19 @@ def write_probe(file, kind=TensorProto.FLOAT, layout='classes'):
                       numpy_helper.from_array(place + 1, f'{name}_to')]
         nodes.append(helper.make_node('Slice', ['float', f'{name}_from', f'{name}_to'], [name]))
     constants.append(numpy_helper.from_array(np.array([1, 2, 1], np.int64), 'column'))
+    nodes += [helper.make_node('Concat', names, ['pair'], axis=1),
+              helper.make_node('Reshape', ['pair', 'column'], ['scores'])]
     if layout == 'classes':  # (1, 4 + classes, boxes): each box has one class
         constants.append(numpy_helper.from_array(rows.T[None], 'boxes'))
-        nodes += [helper.make_node('Concat', names, ['pair'], axis=1),
-                  helper.make_node('Reshape', ['pair', 'column'], ['scores']),
-                  helper.make_node('Mul', ['scores', 'eye'], ['each']),
+        nodes += [helper.make_node('Mul', ['scores', 'eye'], ['each']),
                   helper.make_node('Concat', ['boxes', 'each'], ['output0'], axis=1)]
         shape = (1, 6, 2)
     else:  # (1, boxes, 6): corners, score, class
         edges = np.array([[[22, 27, 42, 37], [22, 27, 42, 37]]], np.float32)
         constants += [numpy_helper.from_array(edges, 'boxes'), numpy_helper.from_array(
             np.array([[[0], [1]]], np.float32), 'numbers')]
-        nodes += [helper.make_node('Concat', names, ['pair'], axis=1),
-                  helper.make_node('Reshape', ['pair', 'column'], ['scores']),
-                  helper.make_node('Concat', ['boxes', 'scores', 'numbers'], ['output0'], axis=2)]
+        nodes.append(helper.make_node('Concat', ['boxes', 'scores', 'numbers'], ['output0'],
+                                      axis=2))
         shape = (1, 2, 6)
     save(file, nodes, constants, [helper.make_tensor_value_info('output0', TensorProto.FLOAT,
                                                                 shape)], TWO, kind)
@@ -196,11 +195,9 @@ def refusal(load, model) -> str:
     ({'logits': np.zeros((1, 1000), np.float32)}, TWO, {}, 'is not a detector: its outputs are'),
     (YOLO, {**TWO, 'task': 'classify'}, {}, "for the task 'classify'"),
     (YOLO, {}, {}, 'config.json is missing; .* has no class names'),
-    (YOLO, {'names': 'what('}, {}, 'class names in its metadata cannot be read'),
     (YOLO, {'names': "{0: 'mug', 2: 'box'}"}, {}, 'with the keys 0, 1'),
     ({'output0': np.zeros((1, 9, 84), np.float32)}, TWO, {}, r'of 2 classes: .*\(9, 84\)'),
     (YOLO, TWO, {'kind': TensorProto.UINT8}, 'not floating-point numbers'),
-    (YOLO, TWO, {'shape': (4, 3, 64, 64)}, 'takes no single colour image'),
     (YOLO, TWO, {'shape': (1, 1, 64, 64)}, 'takes no single colour image'),
     (DETR, {}, {}, 'config.json is missing')])
 def test_files_that_are_no_detector(load, tmp_path, outputs, metadata, changes, message):
@@ -217,10 +214,6 @@ def test_configurations_that_do_not_fit(load, tmp_path):
     assert 'not from the same network' in refusal(load, tmp_path)
     write_configs(tmp_path, ('mug', 'box'), size=64)
     assert "'size' has neither" in refusal(load, tmp_path)
-    write_configs(tmp_path, ('mug', 'box'), do_normalize=True)
-    assert "'image_mean'" in refusal(load, tmp_path)
-    (tmp_path / 'preprocessor_config.json').unlink()
-    assert 'preprocessor_config.json is missing' in refusal(load, tmp_path)
     (tmp_path / 'preprocessor_config.json').write_text('[1')
     assert 'cannot be read' in refusal(load, tmp_path)
 
@@ -229,13 +222,11 @@ YOLO_FILE = ASSETS / 'yolo.onnx'
 
 
 def test_damaged_files(load, tmp_path):
-    content = YOLO_FILE.read_bytes()
-    (tmp_path / 'cut.onnx').write_bytes(content[:len(content) // 2])
-    assert 'truncated or corrupt' in refusal(load, tmp_path / 'cut.onnx')
-    (tmp_path / 'text.onnx').write_text('hello')
-    assert 'does not begin like an ONNX file' in refusal(load, tmp_path / 'text.onnx')
-    (tmp_path / 'empty.onnx').touch()
-    assert 'is empty' in refusal(load, tmp_path / 'empty.onnx')
+    content, file = YOLO_FILE.read_bytes(), tmp_path / 'file.onnx'
+    for damaged, named in ((content[:len(content) // 2], 'truncated or corrupt'),
+                           (b'', 'is empty'), (b'hello', 'does not begin like an ONNX file')):
+        file.write_bytes(damaged)
+        assert named in refusal(load, file)
     assert 'does not exist' in refusal(load, tmp_path / 'gone.onnx')
     network = onnx.load(YOLO_FILE)
     onnx.save(network, tmp_path / 'apart.onnx', save_as_external_data=True,
@@ -281,8 +272,7 @@ def test_a_vocabulary_is_refused(load):
 
 
 @pytest.mark.parametrize(('model', 'expected'), [
-    ('someone/d-fine.s-coco', True), ('someone/d-fine@v1.0', True), ('yolov8n.pt', False),
-    ('someone/d-fine@main:onnx/model_fp16.onnx', True), ('weights/mine.pt', False),
-    ('/weights/mine', False), ('some/where/mine', False), ('../mine', False), ('', False)])
+    ('someone/d-fine@main:onnx/model_fp16.onnx', True), ('someone/d-fine.s-coco', True),
+    ('yolov8n.pt', False), ('weights/mine.pt', False), ('some/where/mine', False), ('', False)])
 def test_names_of_the_hub(model, expected):
     assert is_hub_name(model) == expected
