@@ -11,15 +11,9 @@ from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room, observe, rigid
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from cliploc_ros.core.fit import refinement
 from cliploc_ros.core.fit.camera_fit import ERRORS
 from cliploc_ros.core.fit.covariance import normalized_square, refined_covariance
-from cliploc_ros.core.fit.refinement import (
-    LEAST_SHARE,
-    jacobian_of,
-    move,
-    refine_rig,
-    residuals_of,
-)
 from cliploc_ros.core.fit.verification import make_rig, verify_rig
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
@@ -37,7 +31,7 @@ from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 def refine(scene, rotation, translation, vertical):
     """A single frame is a rig of one camera."""
     rig = make_rig([scene], np.eye(4)[None], vertical[None], np.zeros(len(scene.centers)))
-    return refine_rig(rig, rotation, translation)
+    return refinement.refine_rig(rig, rotation, translation)
 
 
 def split(map_from_camera):
@@ -67,7 +61,7 @@ def test_a_perfect_view_leads_to_the_truth_and_a_noisy_one_near_it(room, rng):
     for _ in range(50):
         noisy, start = scene_of(room, noise_px=3.0, rng=rng), shaken(rng, 0.15, 3.0)
         found = refine(noisy, *start, VERTICAL_UNKNOWN)
-        assert found.score >= LEAST_SHARE * verify(noisy, *start).score
+        assert found.score >= refinement.LEAST_SHARE * verify(noisy, *start).score
         assert found.score == verify(noisy, found.rotation, found.translation).score
         errors_m.append(error_m(found))
         found = refine(scene, *shaken(rng, 0.08, 1.5), VERTICAL_UNKNOWN)
@@ -96,12 +90,12 @@ def test_derivatives_are_those_of_differences(room, rng):
     for _ in range(20):
         rotation, translation = shaken(rng, 0.3, 5.0)
         vertical = np.r_[rotation @ [0.1, 0.2, 0.97], 0.0, 0.0, 1.0, 0.05]
-        jacobian = jacobian_of(pairs, vertical, rotation, translation)
+        jacobian = refinement.jacobian_of(pairs, vertical, rotation, translation)
         there, back = np.empty(len(jacobian)), np.empty(len(jacobian))
         for axis, step in enumerate(np.eye(6) * 1e-6):
             for sign, values in ((1, there), (-1, back)):
-                moved = move(rotation, translation, sign * step)
-                assert residuals_of(pairs, vertical, *moved, values)
+                moved = refinement.move(rotation, translation, sign * step)
+                assert refinement.residuals_of(pairs, vertical, *moved, values)
             np.testing.assert_allclose(jacobian[:, axis], (there - back) / 2e-6, rtol=1e-4,
                                        atol=1e-4)
 
@@ -165,7 +159,7 @@ def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=UN
               for shown in boxes]
     rig = make_rig(scenes, np.array([invert_transform(pose) @ poses[-1] for pose in poses]),
                    np.tile(VERTICAL_UNKNOWN, (len(poses), 1)), np.full(len(ROOM), sigma))
-    found = refine_rig(rig, *split(poses[-1]))
+    found = refinement.refine_rig(rig, *split(poses[-1]))
     stamps = np.arange(len(poses)) if stamps is None else np.array(stamps)
     return (invert_transform(make_transform(found.rotation, found.translation)),
             refined_covariance(rig, found.rotation, found.translation, stamps, shared,

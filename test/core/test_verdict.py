@@ -58,6 +58,7 @@ def looks(*confidences, doubted=0.0, same_view=0.0):
     return tuple(EarlierLook(confidence, doubted, same_view) for confidence in confidences)
 
 
+LACKING = {'inliers': 0, 'coverage': 0.1, 'tried': 3, 'meetings': 0.0}
 # What the evidence lacks, and the kind of refusal that names it; None: the pose is accepted.
 WEAK = {
     'rival': ({'likely': 0.5, 'rival': Rival(0.49, (9.0, 9.0, 9.0))}, RefusalKind.AMBIGUOUS),
@@ -81,7 +82,10 @@ WEAK = {
                   RefusalKind.FRAMES_DISAGREE),
     'linked': ({'linked': 0.5}, RefusalKind.FRAMES_DISAGREE),
     'crops': ({'likely': 0.95, 'crops_left': 12}, RefusalKind.NOT_ALL_CROPS),
-    'inliers': ({'inliers': 2}, RefusalKind.TOO_FEW_OBJECTS)}
+    'inliers': ({'inliers': 2}, RefusalKind.TOO_FEW_OBJECTS),
+    # keyframes that are sure replace what objects lack
+    'points': (LACKING | {'by_points': 0.99, 'camera_fault': 'boxes'}, None),
+    'few points': (LACKING | {'by_points': 0.89}, RefusalKind.SEARCH_CUT_SHORT)}
 
 
 def test_sure_evidence_is_accepted():
@@ -106,13 +110,6 @@ def test_a_refusal_names_the_evidence_that_decided(what):
 def test_options_decide_what_a_pose_needs(fields, options, kind):
     refused = refusal(replace(SURE, **fields), RelocalizerOptions(**options))
     assert (refused and refused.kind) == kind
-
-
-def test_keyframes_that_are_sure_replace_what_objects_lack():
-    lacking = replace(SURE, inliers=0, coverage=0.1, tried=3, meetings=0.0)
-    assert refusal(replace(lacking, by_points=0.99), OPTIONS) is None
-    assert refusal(replace(lacking, by_points=0.99, camera_fault='boxes'), OPTIONS) is None
-    assert refusal(replace(lacking, by_points=0.89), OPTIONS).kind == RefusalKind.SEARCH_CUT_SHORT
 
 
 def test_a_picture_needs_motion_to_be_told_from_the_place_and_motion_tells():

@@ -228,16 +228,6 @@ def test_a_standing_robot_learns_little_from_more_of_the_same():
     assert 0.05 < belief.probability < 0.5
 
 
-def test_looks_that_say_the_opposite_are_no_repetitions():
-    weights = []
-    for odds in (-3.0, 3.0):
-        belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
-        assert belief.add(seen, 3.0, is_full=True) == 1.0
-        weights.append(belief.add(seen, odds, is_full=True))
-    assert weights == pytest.approx([1.0 - TERMS.correlated * np.exp(-6.0 / TERMS.most),
-                                     1.0 - TERMS.correlated])
-
-
 @pytest.mark.parametrize(('way_m', 'time_s'), [(100.0, 0), (0.0, 100), (50.0, 200)])
 def test_the_way_and_the_time_make_a_sure_watch_unsure(way_m, time_s):
     belief, after = Belief(), moved(np.eye(4), way_m, 0.0)

@@ -2,19 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Garbage in every field of every message gives a clear error, and no pose."""
 
+import garbage
 import numpy as np
 import pytest
-from garbage import (
-    CASES,
-    compressed_images,
-    detections,
-    images,
-    infos,
-    likely_detections,
-    sound_image,
-    sound_info,
-    stamped,
-)
 from hypothesis import given
 from scene import make_room, write_map
 
@@ -39,7 +29,7 @@ def localizer(values):
 
 
 def localize(localizer, values, image, info, found):
-    frame = Frame(*(stamped(msg, 100) for msg in (image, info, found)), 0.0, 0.0)
+    frame = Frame(*(garbage.stamped(msg, 100) for msg in (image, info, found)), 0.0, 0.0)
     try:
         return localizer.localize(frame, values, KnownBefore(RobotState(np.eye(4))),
                                   StageTimes('waiting', 0.0)).found
@@ -48,15 +38,15 @@ def localize(localizer, values, image, info, found):
         return None
 
 
-@given(images() | compressed_images(), infos(), detections())
-@CASES
+@given(garbage.images() | garbage.compressed_images(), garbage.infos(), garbage.detections())
+@garbage.CASES
 def test_images_raw_and_compressed(localizer, values, image, info, found):
     result = localize(localizer, values, image, info, found)
     assert result is None or not result.accepted
 
 
-@given(likely_detections())
-@CASES
+@given(garbage.likely_detections())
+@garbage.CASES
 def test_likely_boxes(localizer, values, found):
-    result = localize(localizer, values, sound_image(), sound_info(), found)
+    result = localize(localizer, values, garbage.sound_image(), garbage.sound_info(), found)
     assert result is not None and not result.accepted

@@ -7,23 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import walk
 from scene import rigid
 from scipy.spatial.transform import Rotation
-from walk import (
-    CAMERA,
-    CLASSES,
-    disturb,
-    draw_errors,
-    join_maps,
-    look_at,
-    make_table,
-    measure_depth,
-    nearest_errors,
-    see,
-    shape_error_m,
-    walk_around,
-    without,
-)
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -43,13 +29,13 @@ from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.views import make_views
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
-TABLE = make_table()
+TABLE = walk.make_table()
 
 
 def test_every_landmark_is_found_where_it_is():
-    built = build_map(see(TABLE, walk_around()))
+    built = build_map(walk.see(TABLE, walk.walk_around()))
     assert len(built.landmark_map) == len(TABLE)
-    assert nearest_errors(built.landmark_map, TABLE).max() < 0.003
+    assert walk.nearest_errors(built.landmark_map, TABLE).max() < 0.003
     assert built.report.explained == 1.0
     assert built.report.median_iou > 0.97
     assert built.report.left_out == ()
@@ -60,14 +46,14 @@ def test_every_landmark_is_found_where_it_is():
 
 
 def test_many_views_leave_an_uncertainty_that_all_share():
-    few, many = (build_map(see(TABLE, walk_around(frames), noise_px=3.0)).landmark_map
+    few, many = (build_map(walk.see(TABLE, walk.walk_around(frames), noise_px=3.0)).landmark_map
                  for frames in (20, 180))
     # with independent errors in each view, it would be a third of that
     assert 0.6 < np.median(many.position_sigmas) / np.median(few.position_sigmas) < 1.0
 
 
 def test_equal_seed_and_input_give_an_equal_map():
-    detections = see(TABLE, walk_around(), noise_px=3.0)
+    detections = walk.see(TABLE, walk.walk_around(), noise_px=3.0)
     first, second = build_map(detections), build_map(detections)
     assert (first.landmark_map.centers == second.landmark_map.centers).all()
     assert (first.shown == second.shown).all()
@@ -75,19 +61,19 @@ def test_equal_seed_and_input_give_an_equal_map():
 
 
 def test_what_a_short_walk_shows_from_one_side_is_left_out_with_the_reason():
-    poses = walk_around(frames=12, turn_deg=12.0)
+    poses = walk.walk_around(frames=12, turn_deg=12.0)
     for options in (None, MappingOptions(refine_mount=True)):
         with pytest.raises(MappingError, match='one side only'):
-            build_map(see(TABLE, poses), options)
+            build_map(walk.see(TABLE, poses), options)
     eager = MappingOptions(min_baseline_deg=8.0, max_position_sigma_m=1.0)
-    built = build_map(see(TABLE, poses), eager)
-    assert nearest_errors(built.landmark_map, TABLE).max() < 0.05
+    built = build_map(walk.see(TABLE, poses), eager)
+    assert walk.nearest_errors(built.landmark_map, TABLE).max() < 0.05
 
 
 def test_an_object_that_was_taken_away_is_left_out_with_the_reason():
-    table, poses, taken = TABLE, walk_around(frames=120), 2
-    seen = see(table, poses)
-    later = see(without(table, taken), poses)
+    table, poses, taken = TABLE, walk.walk_around(frames=120), 2
+    seen = walk.see(table, poses)
+    later = walk.see(walk.without(table, taken), poses)
     first, rest = seen.select_boxes(seen.frames < 30), later.select_boxes(later.frames >= 30)
     both = replace(
         seen, frame_offsets=first.frame_offsets + rest.frame_offsets,
@@ -103,15 +89,15 @@ def test_an_object_that_was_taken_away_is_left_out_with_the_reason():
 
 
 def test_joint_refinement_corrects_poses_and_landmarks():
-    poses = walk_around(frames=150)
-    seen = see(TABLE, poses, noise_px=2.0)
-    errors = draw_errors(seen.stamps_s, PoseErrors(0.05, 1.0, 3.0))
-    detections = disturb(seen, errors)
+    poses = walk.walk_around(frames=150)
+    seen = walk.see(TABLE, poses, noise_px=2.0)
+    errors = walk.draw_errors(seen.stamps_s, PoseErrors(0.05, 1.0, 3.0))
+    detections = walk.disturb(seen, errors)
     plain = build_map(detections)
     joint = build_map(detections, MappingOptions(pose_errors=PoseErrors(0.05, 1.0, 3.0)))
     assert len(joint.landmark_map) == len(TABLE)
-    left_m = shape_error_m(joint.landmark_map, TABLE)
-    assert left_m < 0.4 * shape_error_m(plain.landmark_map, TABLE) and left_m < 0.01
+    left_m = walk.shape_error_m(joint.landmark_map, TABLE)
+    assert left_m < 0.4 * walk.shape_error_m(plain.landmark_map, TABLE) and left_m < 0.01
     left = joint.map_from_camera[:, :3, 3] - poses[:, :3, 3]
     assert left.std(axis=0).mean() < 0.6 * errors[:, :3].std(axis=0).mean()
     assert joint.report.pose_change_m > 0.03
@@ -129,11 +115,11 @@ def test_joint_refinement_corrects_poses_and_landmarks():
 ])
 def test_input_without_a_map_says_what_to_correct(change, message):
     with pytest.raises(MappingError, match=message):
-        build_map(change(see(TABLE, walk_around())))
+        build_map(change(walk.see(TABLE, walk.walk_around())))
 
 
 def test_doubtful_input_is_noted():
-    detections = see(TABLE, walk_around())
+    detections = walk.see(TABLE, walk.walk_around())
     poses = detections.map_from_camera.copy()
     poses[20, :3, 3] += (50.0, 0.0, 0.0)
     built = build_map(detections.with_poses(poses))
@@ -143,27 +129,28 @@ def test_doubtful_input_is_noted():
 
 
 def test_boxes_cut_by_the_image_border_do_not_shrink_a_landmark():
-    table = make_table(count=1)
+    table = walk.make_table(count=1)
     table = replace(table, semi_axes=np.array([[0.3, 0.3, 0.3]]))
     # the object lies half outside the image in most frames
-    poses = np.array([look_at(np.array([1.6 * np.cos(a), 1.6 * np.sin(a), 1.2]),
-                              (0.45 * np.sin(7 * a), -0.45 * np.sin(5 * a), 0.8))
+    poses = np.array([walk.look_at(np.array([1.6 * np.cos(a), 1.6 * np.sin(a), 1.2]),
+                                   (0.45 * np.sin(7 * a), -0.45 * np.sin(5 * a), 0.8))
                       for a in np.linspace(0.0, 5.0, 60)])
-    detections = see(table, poses)
+    detections = walk.see(table, poses)
     cut = ((detections.bboxes_xyxy <= 0.0)
-           | (detections.bboxes_xyxy >= [CAMERA.width, CAMERA.height] * 2)).any(axis=1)
+           | (detections.bboxes_xyxy >= [walk.CAMERA.width, walk.CAMERA.height] * 2)).any(axis=1)
     assert cut.mean() > 0.3
     built = build_map(detections).landmark_map
     assert len(built) == 1
     assert built.semi_axes[0] == pytest.approx(np.full(3, 0.3), abs=0.01)
-    assert CLASSES[detections.classes[0]] == built.class_ids[0]
+    assert walk.CLASSES[detections.classes[0]] == built.class_ids[0]
 
 
 def test_a_long_recording_gives_one_landmark_for_each_object():
-    detections = see(TABLE, walk_around(frames=240, turn_deg=1100.0), noise_px=2.0, missed=0.3)
+    poses = walk.walk_around(frames=240, turn_deg=1100.0)
+    detections = walk.see(TABLE, poses, noise_px=2.0, missed=0.3)
     built = build_map(replace(detections, stamps_s=2.0 * np.arange(240))).landmark_map
     assert len(built) == len(TABLE)
-    assert nearest_errors(built, TABLE).max() < 0.01
+    assert walk.nearest_errors(built, TABLE).max() < 0.01
     for details in built.details:
         assert 0.3 < details.seen_ratio < 0.9
         assert details.baseline_deg > 90.0 and details.position_sigma < 0.02
@@ -171,12 +158,12 @@ def test_a_long_recording_gives_one_landmark_for_each_object():
 
 def test_a_map_is_made_written_and_updated(tmp_path):
     file = tmp_path / 'map.yaml'
-    detections = see(TABLE, walk_around())
+    detections = walk.see(TABLE, walk.walk_around())
     stages, labeller = [], find_labeller(detections, None)
     made = make_map(detections, labeller,
                     progress=lambda stage, share: stages.append(stage))
     write_map(file, made.landmark_map, made.report.lines()[:1], made.embeddings)
-    assert nearest_errors(LandmarkMap.from_file(file), TABLE).max() < 0.003
+    assert walk.nearest_errors(LandmarkMap.from_file(file), TABLE).max() < 0.003
     assert made.layer is None and stages[-1] == 'done'
     blind = Frames(tmp_path / 'walk', 0, lambda wanted: iter(()))
     assert 'of 0 images, none' in make_map(detections, labeller, None, blind, LayerOptions()).note
@@ -189,7 +176,7 @@ def test_a_map_is_made_written_and_updated(tmp_path):
 
 
 def test_labels_are_class_names_where_clip_is_missing(tmp_path):
-    detections = see(TABLE, walk_around())
+    detections = walk.see(TABLE, walk.walk_around())
     assert 'class names' in find_labeller(detections, None).note
     words = Path(tmp_path / 'our.yaml')
     words.write_text('cup: [our cup]')
@@ -198,38 +185,38 @@ def test_labels_are_class_names_where_clip_is_missing(tmp_path):
 
 
 def test_depth_replaces_parallax():
-    poses = walk_around(frames=12, turn_deg=12.0)
-    boxes = see(TABLE, poses, noise_px=1.0)
+    poses = walk.walk_around(frames=12, turn_deg=12.0)
+    boxes = walk.see(TABLE, poses, noise_px=1.0)
     with pytest.raises(MappingError, match='good enough'):
         build_map(boxes)
-    built = build_map(measure_depth(boxes, TABLE, holes=0.2)).landmark_map
-    errors = nearest_errors(built, TABLE)
+    built = build_map(walk.measure_depth(boxes, TABLE, holes=0.2)).landmark_map
+    errors = walk.nearest_errors(built, TABLE)
     assert np.sum(errors < 0.12) >= 7
     assert np.median(errors) < 0.06
 
 
 def test_with_parallax_boxes_decide_and_an_error_of_scale_is_corrected():
-    boxes = see(TABLE, walk_around(), noise_px=1.0)
-    built = build_map(measure_depth(boxes, TABLE, scale=1.15))
+    boxes = walk.see(TABLE, walk.walk_around(), noise_px=1.0)
+    built = build_map(walk.measure_depth(boxes, TABLE, scale=1.15))
     note, = (note for note in built.report.notes if 'depth' in note)
     assert ' is 1.1' in note and 'corrected' in note
     assert len(built.landmark_map) == len(TABLE)
-    assert nearest_errors(built.landmark_map, TABLE).max() < 0.01
+    assert walk.nearest_errors(built.landmark_map, TABLE).max() < 0.01
 
 
 def test_depth_in_another_unit_is_refused():
-    boxes = see(TABLE, walk_around(frames=30))
+    boxes = walk.see(TABLE, walk.walk_around(frames=30))
     with pytest.raises(MappingError, match=r'depth is 0\.2.* `depth_unit`'):
-        build_map(measure_depth(boxes, TABLE, scale=0.2))
+        build_map(walk.measure_depth(boxes, TABLE, scale=0.2))
 
 
 def test_far_landmarks_are_passed_over_without_a_loss():
     """A walk around one table, then around another table 12 m away."""
-    away_m, there = np.array([12.0, 0.0, 0.0]), walk_around()
-    floor = join_maps(TABLE, replace(TABLE, centers=TABLE.centers + away_m))
+    away_m, there = np.array([12.0, 0.0, 0.0]), walk.walk_around()
+    floor = walk.join_maps(TABLE, replace(TABLE, centers=TABLE.centers + away_m))
     there[:, :3, 3] += away_m
-    views = make_views(see(floor, np.concatenate([walk_around(), there]), noise_px=2.0))
-    landmarks = landmarks_of_map(floor, CLASSES)
+    views = make_views(walk.see(floor, np.concatenate([walk.walk_around(), there]), noise_px=2.0))
+    landmarks = landmarks_of_map(floor, walk.CLASSES)
     landmarks.classes[7] = -1  # with a class that the recording does not have
     found = find_overlaps(views, landmarks, 0.2)
     expected = [

@@ -21,18 +21,8 @@ from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.evaluation.check_page import CHECK, CHECK_DATA, write_check
+from cliploc_ros.offline.mapping.check import findings, relocalization
 from cliploc_ros.offline.mapping.check.checking import check_map, give_advice
-from cliploc_ros.offline.mapping.check.findings import (
-    check_landmarks,
-    find_look_alikes,
-    hear_witness,
-    make_grid,
-)
-from cliploc_ros.offline.mapping.check.relocalization import (
-    make_folds,
-    measure_detector,
-    try_recording,
-)
 from cliploc_ros.offline.mapping.check.report import check_keyframes, in_reach
 from cliploc_ros.offline.mapping.landmarks import Landmarks
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
@@ -48,7 +38,7 @@ QUICK = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=12, 
 
 def witness_of(table, detections):
     views = make_views(detections)
-    return views, hear_witness(views, table, detections.class_names)
+    return views, findings.hear_witness(views, table, detections.class_names)
 
 
 @pytest.fixture(scope='module')
@@ -114,7 +104,7 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
     right = TABLE.class_ids[4]
     wrong = replace(TABLE, class_ids=(*TABLE.class_ids[:4], f'{right}k', *TABLE.class_ids[5:]))
     _, witness = witness_of(wrong, detections) if is_recorded else (None, None)
-    worst, *others = check_landmarks(wrong, witness, [])
+    worst, *others = findings.check_landmarks(wrong, witness, [])
     assert worst.landmark_id == 'thing_4'
     (fault,) = worst.faults
     assert f"'{right}k'" in fault and f"mean '{right}'?" in fault
@@ -129,7 +119,7 @@ def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detectio
     boxes = detections.bboxes_xyxy.copy()
     boxes[own, 0], boxes[own, 1], boxes[own, 2] = 0.0, 0.0, 640.0
     _, witness = witness_of(TABLE, replace(detections, bboxes_xyxy=boxes))
-    (one,) = [checked for checked in check_landmarks(TABLE, witness, [])
+    (one,) = [checked for checked in findings.check_landmarks(TABLE, witness, [])
               if checked.landmark_id == 'thing_4']
     assert not any(' cm away' in fault for fault in one.faults)
 
@@ -138,20 +128,21 @@ def test_a_shifted_landmark_is_told_its_offset(detections):
     shifted = moved(TABLE, {4: TABLE.centers[4] + (0.12, 0.0, 0.0)})
     _, witness = witness_of(shifted, detections)
     assert np.linalg.norm(witness.fitted.centers[4] - TABLE.centers[4]) < 0.01
-    worst, *_ = check_landmarks(shifted, witness, [])
+    worst, *_ = findings.check_landmarks(shifted, witness, [])
     assert worst.landmark_id == 'thing_4'
     assert worst.offset_m == pytest.approx(0.12, abs=0.01)
     assert any('is 12 cm away' in fault for fault in worst.faults)
     # a map states how uncertain it is
     sure = replace(shifted, details=(LandmarkDetails(position_sigma=0.07),) * len(TABLE))
-    assert {check.position_sigma_m for check in check_landmarks(sure, witness, [])} == {0.07}
+    checked = findings.check_landmarks(sure, witness, [])
+    assert {check.position_sigma_m for check in checked} == {0.07}
 
 
 @pytest.mark.parametrize('turn_deg', [0.0, -120.0])
 def test_identical_rooms_look_alike(turn_deg):
     turn = Rotation.from_euler('z', turn_deg, degrees=True)
     other = replace(TABLE, centers=turn.apply(TABLE.centers) + np.array([10.0, -3.0, 0.0]))
-    (found,) = find_look_alikes(join_maps(TABLE, other))
+    (found,) = findings.find_look_alikes(join_maps(TABLE, other))
     assert found.share == 1.0
     assert {(first.removesuffix('_b'), second.removesuffix('_b'))
             for first, second in found.matched} == {(name, name) for name in TABLE.landmark_ids}
@@ -162,7 +153,7 @@ def test_identical_rooms_look_alike(turn_deg):
 def test_rooms_of_other_objects_do_not_look_alike():
     rng = np.random.default_rng(5)
     other = replace(TABLE, centers=rng.uniform(-1, 1, (9, 3)) + np.array([10.0, 0.0, 0.8]))
-    assert find_look_alikes(join_maps(TABLE, other)) == []
+    assert findings.find_look_alikes(join_maps(TABLE, other)) == []
 
 
 def test_identical_rooms_fail_the_check(rooms_report):
@@ -229,10 +220,10 @@ def test_systematic_errors_are_measured(spoil, name, value, tolerance):
 
 def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
     views, witness = witness_of(TABLE, detections)
-    first, *others = make_folds(views, witness, QUICK)
+    first, *others = relocalization.make_folds(views, witness, QUICK)
     bare = first._replace(rows=first.rows[:0], landmarks=Landmarks.none())
-    trials = try_recording(TABLE, detections, witness.shown, [bare, *others], QUICK,
-                           lambda share: None)
+    trials = relocalization.try_recording(TABLE, detections, witness.shown, [bare, *others], QUICK,
+                                          lambda share: None)
     assert len(trials) == 12
     bare_stamps = detections.stamps_s[bare.frames]
     of_bare = [trial for trial in trials if trial.stamp_s in bare_stamps]
@@ -278,7 +269,7 @@ def test_too_few_views_are_named_as_the_cause(detections):
 def test_detector_has_the_misses_and_noise_of_the_recording():
     detections = see(TABLE, walk_around(frames=200), noise_px=4.0, missed=0.4)
     views, witness = witness_of(TABLE, detections)
-    model = measure_detector(TABLE, detections, views, witness)
+    model = relocalization.measure_detector(TABLE, detections, views, witness)
     rng, poses = np.random.default_rng(0), detections.map_from_camera
     counts = [len(model.detect(pose, rng)[1]) for pose in poses]
     assert np.mean(counts) == pytest.approx(len(detections.classes) / 200, rel=0.1)
@@ -291,13 +282,13 @@ def test_detector_has_the_misses_and_noise_of_the_recording():
 def test_what_was_never_detected_is_never_simulated(detections):
     false = moved(TABLE, {4: TABLE.centers[4] + (0.0, 0.0, 1.0)})
     views, witness = witness_of(false, detections)
-    model = measure_detector(false, detections, views, witness)
+    model = relocalization.measure_detector(false, detections, views, witness)
     assert all(4 not in model.in_view(pose)[0] for pose in detections.map_from_camera)
 
 
 def test_grid_is_bounded_and_looks_around():
     wide = moved(TABLE, {0: (300.0, 0.0, 0.8)})
-    grid = make_grid(join_maps(wide, wide), None, replace(QUICK, max_positions=20, headings=4))
+    grid = findings.make_grid(join_maps(wide, wide), None, replace(QUICK, max_positions=20))
     assert len(grid.positions) <= 20
     rotations = grid.poses[:, :3, :3]
     assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3))

@@ -362,8 +362,8 @@ def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, no
     old = replace(THINGS, details=tuple(replace(detail, position_sigma=sigma_m)
                                         for detail in THINGS.details))
     seen = see(THINGS, POSES, noise_px=2.0, missed=0.3)
-    updated = update_map(old, disturb(seen, draw_errors(seen.stamps_s, PoseErrors(*noise, 0.0))),
-                         MappingOptions(estimate_pose_errors=True))
+    seen = disturb(seen, draw_errors(seen.stamps_s, PoseErrors(*noise, 0.0), seed=2))
+    updated = update_map(old, seen, MappingOptions(estimate_pose_errors=True))
     assert updated.landmark_map.landmark_ids == THINGS.landmark_ids
     assert len(updated.report.confirmed) == len(THINGS) and not updated.report.moved
     assert updated.report.lines()[0].startswith('20 confirmed')

@@ -20,13 +20,7 @@ from cliploc_ros.core.map.landmark_embeddings import (
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_encoder import (
-    ClipEncoder,
-    LabelCache,
-    embed_map,
-    encode_labels,
-    load_encoder_for_map,
-)
+from cliploc_ros.models import clip_encoder
 from cliploc_ros.models.files import fingerprint_file
 from cliploc_ros.models.images import crop_bounds
 from cliploc_ros.models.observer import Observer
@@ -50,7 +44,7 @@ def rows_of(count: int, size: int = 16) -> np.ndarray:
     lambda file: np.savez(file, other=np.zeros(3)),
     lambda file: np.savez(file, identity=np.zeros(3, np.uint8), embeddings=rows_of(3))])
 def test_the_cache_finds_what_it_stored_and_nothing_else(tmp_path, damage, caplog):
-    cache = LabelCache(tmp_path / 'deep' / 'labels')
+    cache = clip_encoder.LabelCache(tmp_path / 'deep' / 'labels')
     for _ in range(2):
         cache.store(KEY, LABELS, rows_of(3))
         assert np.array_equal(cache.load(KEY, LABELS, 16), rows_of(3))
@@ -83,7 +77,8 @@ def test_each_class_is_encoded_once(clip, caplog):
     assert list(found) == [MUG, BOX]
     for texts, (own, rows) in found.items():
         assert own == texts
-        np.testing.assert_allclose(rows, encode_labels(weights, texts, clip), atol=1e-6)
+        encoded = clip_encoder.encode_labels(weights, texts, clip)
+        np.testing.assert_allclose(rows, encoded, atol=1e-6)
     assert '3 phrases in 2 groups' in caplog.text
     caplog.clear()
     more = embed_phrases(weights, clip, [MUG, BOX, CAN])
@@ -119,10 +114,10 @@ def test_labels_with_weights_are_mixed(clip):
     described = replace(ROOM, details=(
         LandmarkDetails(labels=((ROOM.labels[0], 3.0), ('a red cup', 1.0))),
         *[LandmarkDetails()] * (len(ROOM) - 1)))
-    rows = np.asarray(embed_map(clip, described, [], 'both'))
-    plain = np.asarray(embed_map(clip, ROOM, [], 'both'))
+    rows = np.asarray(clip_encoder.embed_map(clip, described, [], 'both'))
+    plain = np.asarray(clip_encoder.embed_map(clip, ROOM, [], 'both'))
     assert np.array_equal(rows[1:], plain[1:])
-    expected = np.array([3.0, 1.0]) @ encode_labels(
+    expected = np.array([3.0, 1.0]) @ clip_encoder.encode_labels(
         resolve_clip_weights(clip), [ROOM.labels[0], 'a red cup'], clip)
     assert rows[0] == pytest.approx(expected / np.linalg.norm(expected), abs=1e-5)
 
@@ -131,16 +126,16 @@ def test_labels_with_weights_are_mixed(clip):
 def test_images_of_this_encoder_are_compared(clip, map_file, compare):
     images = images_of(clip)
     save_landmark_embeddings(embeddings_path(map_file), images)
-    plain = np.asarray(embed_map(clip, ROOM, [str(map_file)], 'text'))
-    rows = np.asarray(load_encoder_for_map(clip, ROOM, [str(map_file)], compare)[1])
-    assert np.array_equal(plain, np.asarray(embed_map(clip, ROOM, [], compare)))
+    plain = np.asarray(clip_encoder.embed_map(clip, ROOM, [str(map_file)], 'text'))
+    rows = np.asarray(clip_encoder.load_encoder_for_map(clip, ROOM, [str(map_file)], compare)[1])
+    assert np.array_equal(plain, np.asarray(clip_encoder.embed_map(clip, ROOM, [], compare)))
     similar = np.sum(rows * images.means, axis=1)
     assert (similar > np.sum(plain * images.means, axis=1) + 0.2).all()
     if compare == 'image':
         assert np.array_equal(rows, images.means)
     # rows follow the map's order; added landmarks use their label
     save_landmark_embeddings(embeddings_path(map_file), images.in_order(ROOM.landmark_ids[:0:-1]))
-    again = np.asarray(embed_map(clip, ROOM, [str(map_file)], compare))
+    again = np.asarray(clip_encoder.embed_map(clip, ROOM, [str(map_file)], compare))
     assert np.isfinite(again).all()
     assert np.argmax(again[1:] @ images.means[1:].T, axis=1).tolist() == list(range(len(ROOM) - 1))
 
@@ -154,14 +149,14 @@ def test_images_of_several_maps_are_compared_together_or_not_at_all(clip, tmp_pa
     for one, file, images in zip(maps, files, expected, strict=True):
         write_map(file, one)
         save_landmark_embeddings(embeddings_path(file), images)
-    rows = embed_map(clip, both, files, 'image')
+    rows = clip_encoder.embed_map(clip, both, files, 'image')
     assert np.array_equal(np.asarray(rows), np.concatenate([each.means for each in expected]))
     for part, own in zip(rows.parts, expected, strict=True):
         assert np.array_equal(np.asarray(part), own.means)
     caplog.clear()
     embeddings_path(files[1]).unlink()
-    plain = np.asarray(embed_map(clip, ROOM, [], 'text'))
-    rows = embed_map(clip, both, files, 'image')
+    plain = np.asarray(clip_encoder.embed_map(clip, ROOM, [], 'text'))
+    rows = clip_encoder.embed_map(clip, both, files, 'image')
     assert np.array_equal(np.asarray(rows), plain[[*range(len(ROOM)), 2, 0, 1]])
     warning, = (record for record in caplog.records if record.levelname == 'WARNING')
     assert f'{files[1]} has no image embeddings' in warning.getMessage()
@@ -215,7 +210,7 @@ def noisy(seed, deviation=3.0):
 
 @pytest.fixture(scope='module')
 def encoder(clip):
-    return ClipEncoder(resolve_clip_weights(clip), clip)
+    return clip_encoder.ClipEncoder(resolve_clip_weights(clip), clip)
 
 
 @pytest.fixture

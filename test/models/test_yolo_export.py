@@ -21,18 +21,9 @@ from scene import make_room
 from torchvision.ops import box_iou
 
 from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models import protocols
 from cliploc_ros.models.files import is_hub_name
 from cliploc_ros.models.onnx_detector import load_detector
-from cliploc_ros.models.protocols import (
-    PROFILES,
-    ClipOptions,
-    DetectorOptions,
-    ObjectDetector,
-    prompts_of_map,
-    prompts_of_names,
-    with_detector,
-    with_encoder,
-)
 from cliploc_ros.models.yolo_weights import import_ultralytics, load_yolo
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, describe
@@ -58,8 +49,8 @@ def office_rgb(shared_data) -> list[np.ndarray]:
             for file in sorted((shared_data / 'tum_fr3_office/rgb').iterdir())[::4]]
 
 
-def detector(model: object, cache: Path, **changes) -> ObjectDetector:
-    return load_detector(DetectorOptions(str(model), cache_dir=str(cache), **changes))
+def detector(model: object, cache: Path, **changes) -> protocols.ObjectDetector:
+    return load_detector(protocols.DetectorOptions(str(model), cache_dir=str(cache), **changes))
 
 
 def by_ultralytics(model, image_rgb, **changes):
@@ -200,7 +191,7 @@ def test_ultralytics_stays_off_network_home_and_pip(weights, tmp_path):
     assert [*temporary.glob('cliploc_ros*')] == []
 
 
-THREE = prompts_of_names('mug, office chair, potted plant')
+THREE = protocols.prompts_of_names('mug, office chair, potted plant')
 
 
 @pytest.fixture(scope='session')
@@ -217,8 +208,8 @@ def noise_rgb():
     return np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
 
 
-def options_of(folder, model='world.pt', prompts=THREE, **changes) -> DetectorOptions:
-    return DetectorOptions(**{
+def options_of(folder, model='world.pt', prompts=THREE, **changes) -> protocols.DetectorOptions:
+    return protocols.DetectorOptions(**{
         'model': str(folder / model), 'conf': 0.0, 'imgsz': 320, 'prompts': prompts,
         'cache_dir': str(folder / 'cache'), 'text_model': str(folder / 'tower.ts'), **changes})
 
@@ -268,7 +259,7 @@ def test_a_vocabulary_needs_a_network_that_takes_texts_and_its_tower(weights, fo
 
 def test_the_texts_of_a_map():
     room = replace(make_room(), labels=(*['red mug'] * 4, *['white mug'] * 7, 'a'))
-    prompts = prompts_of_map(room, 'map.yaml')
+    prompts = protocols.prompts_of_map(room, 'map.yaml')
     assert prompts[:3] == (('a', 'a'), ('b', 'b'), ('c', 'c'))
     # two of four red mugs are of class a; 'a' is a class, and no other text
     assert prompts[3] == ('red mug', 'a') and prompts[4][0] == 'white mug' and len(prompts) == 5
@@ -290,16 +281,17 @@ def test_profiles_name_published_networks():
     import_ultralytics()
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES
 
-    unnamed = ClipOptions(model='', pretrained='')
-    for name, profile in PROFILES.items():
+    unnamed = protocols.ClipOptions(model='', pretrained='')
+    for name, profile in protocols.PROFILES.items():
         assert profile.detector in GITHUB_ASSETS_NAMES or is_hub_name(profile.detector)
         # an entry of the model hub can be stored for a start without a network
         assert is_hub_name(profile.clip_pretrained) or open_clip.get_pretrained_cfg(
             profile.clip_model, profile.clip_pretrained)['hf_hub']
-        assert with_encoder(unnamed, name).pretrained == profile.clip_pretrained
-        assert with_detector(DetectorOptions(''), name).model == profile.detector
+        assert protocols.with_encoder(unnamed, name).pretrained == profile.clip_pretrained
+        unset = protocols.DetectorOptions('')
+        assert protocols.with_detector(unset, name).model == profile.detector
     with pytest.raises(OptionsError, match="profile 'auto' is not one of accurate, balanced"):
-        with_encoder(unnamed, 'auto')
+        protocols.with_encoder(unnamed, 'auto')
 
 
 @pytest.mark.parametrize(('model', 'pretrained', 'path', 'named'), [
@@ -308,6 +300,6 @@ def test_profiles_name_published_networks():
     ('', '', 'weights.pt', ('ViT-L-14', 'openai')),
     ('RN50', 'cc12m', '', ('RN50', 'cc12m'))])
 def test_names_override_a_profile(model, pretrained, path, named):
-    encoder = with_encoder(ClipOptions(model, pretrained, path), 'fast')
+    encoder = protocols.with_encoder(protocols.ClipOptions(model, pretrained, path), 'fast')
     assert (encoder.model, encoder.pretrained) == named
     assert encoder.checkpoint_path == path

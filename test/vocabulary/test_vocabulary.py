@@ -7,16 +7,11 @@ import re
 import pytest
 
 from cliploc_ros.errors import OptionsError, misspelt_classes
-from cliploc_ros.offline.vocabulary.vocabulary import (
-    expand_phrases,
-    load_vocabulary,
-    shipped_classes,
-    shipped_phrases,
-)
+from cliploc_ros.offline.vocabulary import vocabulary
 
 
 def test_a_small_grammar_written_out():
-    assert expand_phrases({
+    assert vocabulary.expand_phrases({
         'phrases': ['a {kind}', 'a {colour} {name} {pattern}'],
         'kind': ['mug', 'tea cup'], 'colour': ['red', 'orange'],
         'pattern': ['with {second} dots', 'with a {second} label'],
@@ -26,8 +21,8 @@ def test_a_small_grammar_written_out():
 
 
 def test_a_symbol_has_one_value_in_a_phrase_and_phrases_are_told_once():
-    assert expand_phrases({'phrases': ['{size} or {size}', 'big or big'],
-                           'size': ['big', 'tiny']}) == ('big or big', 'tiny or tiny')
+    assert vocabulary.expand_phrases({'phrases': ['{size} or {size}', 'big or big'],
+                                      'size': ['big', 'tiny']}) == ('big or big', 'tiny or tiny')
 
 
 @pytest.mark.parametrize(('rules', 'message'), [
@@ -39,15 +34,15 @@ def test_a_symbol_has_one_value_in_a_phrase_and_phrases_are_told_once():
                                          for name in 'abcd'}}, '2000 phrases')])
 def test_rules_that_cannot_be_used(rules, message):
     if message is None:
-        assert expand_phrases(rules) == ('red',)
+        assert vocabulary.expand_phrases(rules) == ('red',)
         return
     with pytest.raises(OptionsError, match=message):
-        expand_phrases(rules)
+        vocabulary.expand_phrases(rules)
 
 
 def test_shipped_phrases_are_english():
-    for name in (*shipped_classes(), 'unheard-of thing'):
-        phrases = shipped_phrases(name)
+    for name in (*vocabulary.shipped_classes(), 'unheard-of thing'):
+        phrases = vocabulary.shipped_phrases(name)
         assert 40 <= len(phrases) <= 1000
         assert len(set(phrases)) == len(phrases)
         for phrase in phrases:
@@ -57,11 +52,11 @@ def test_shipped_phrases_are_english():
 
 
 def test_any_class_name_is_described():
-    assert 'a red tv monitor with blue stripes' in shipped_phrases('tv_monitor')
-    assert 'a red colour' in shipped_phrases('{colour}')
-    assert 'an object' in shipped_phrases('_')
+    assert 'a red tv monitor with blue stripes' in vocabulary.shipped_phrases('tv_monitor')
+    assert 'a red colour' in vocabulary.shipped_phrases('{colour}')
+    assert 'an object' in vocabulary.shipped_phrases('_')
     with pytest.raises(OptionsError, match='200 characters'):
-        shipped_phrases('x' * 500)
+        vocabulary.shipped_phrases('x' * 500)
 
 
 def test_a_users_file_adds_phrases(tmp_path):
@@ -69,14 +64,14 @@ def test_a_users_file_adds_phrases(tmp_path):
     file.write_text("cup:\n  - our {colour} team mug\n  - the chief's cup\n"
                     'robot:\n  grammar: device\n  kind: [robot, cleaning robot]\n'
                     "  brand: [Alpha]\n  phrases: ['a {colour} {brand} {kind}']\n")
-    ours = load_vocabulary(file)
+    ours = vocabulary.load_vocabulary(file)
     assert ours['cup'][0] == 'our red team mug' and ours['cup'][-1] == "the chief's cup"
     assert 'a silver Alpha cleaning robot' in ours['robot']
 
 
 def test_classes_that_look_misspelt_have_a_hint():
-    assert misspelt_classes(['bokk', 'book', 'zebu', 'zebu'], shipped_classes()) == {
+    assert misspelt_classes(['bokk', 'book', 'zebu', 'zebu'], vocabulary.shipped_classes()) == {
         'bokk': " (did you mean 'book'?)"}
     assert misspelt_classes(['forklft', 'cart'], ['forklift', 'cart'], all_known=True) == {
         'forklft': " (did you mean 'forklift'?)"}
-    assert misspelt_classes([], shipped_classes()) == {}
+    assert misspelt_classes([], vocabulary.shipped_classes()) == {}
