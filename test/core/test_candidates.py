@@ -344,11 +344,3 @@ def test_a_landmark_without_images_keeps_its_label(world, compare):
     own = np.arange(10)
     assert (np.argmax(unknown[own], axis=1) == own).mean() > 0.8
     assert top_1(rows, crops) > 0.7
-
-
-def test_landmarks_that_share_a_label_differ_by_their_images(world):
-    labels, images, crops = world
-    shared = LabelEmbeddings(labels.unique[:1], np.zeros(COUNT, dtype=np.int64))
-    assert top_1(shared, crops) <= 2 / COUNT
-    for compare in ('image', 'both'):
-        assert top_1(with_images(shared, images, compare), crops) > 0.9

@@ -15,7 +15,7 @@ from cliploc_ros.core.acceptance.confidence import Setting, none_right
 from cliploc_ros.core.acceptance.contenders import join_frames
 from cliploc_ros.core.acceptance.depth_check import DepthCheck
 from cliploc_ros.core.acceptance.links import weakest_link
-from cliploc_ros.core.acceptance.looks import EarlierLook, Look, Looks
+from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.verification import MAX_FRAMES
@@ -496,19 +496,6 @@ def test_frames_before_a_carry_are_dropped(room, walk):
         given = session.covariance_for_filter(found)
     assert found.frames == 1
     np.testing.assert_array_equal(given, found.covariance, 'a filter starts again')
-
-
-def test_the_same_view_again_is_judged_by_its_mean_evidence():
-    def view(confidence, *earlier):
-        return Evidence(5, confidence, earlier=tuple(
-            EarlierLook(1.0, look, same_view) for look, same_view in earlier)).confidence_of_view
-    odds = np.log(19.0)  # of .95
-    assert view(0.95) == pytest.approx(0.95)
-    assert view(0.95, (0.95, 1.0)) == pytest.approx(0.95)
-    for unsure in (0.0, 0.3, 0.5):
-        assert view(0.95, (unsure, 1.0)) == pytest.approx(1 / (1 + np.exp(-odds / 2)))
-    assert view(0.95, (0.0, 0.25)) == pytest.approx(1 / (1 + np.exp(-odds / 1.25)))
-    assert view(0.95, (0.0, 0.0)) == pytest.approx(0.95), 'another view'
 
 
 @pytest.mark.parametrize(('degrees', 'metres', 'same'), [

@@ -108,12 +108,6 @@ def write_sources(server, tmp_path):
 
 
 @pytest.fixture
-def cache(tmp_path, monkeypatch):
-    """Set an empty cache of the user, except for the demo's converted networks."""
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
-
-
-@pytest.fixture
 def refused(run_here):
     """Run in this process, and return the single line of the error."""
     def run(*arguments):
