@@ -13,14 +13,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scene import CAMERA
 
-from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
-from cliploc_ros.offline.evaluation import trials
+from cliploc_ros.offline.posed_query import PosedQuery
 from demo import ASSETS
 from studies import results, wrong_sensors
 from studies.acceptance.__main__ import run as run_acceptance
-from studies.acceptance.places import Simulated
 from studies.sensors import angle_table, read_robot, restarts_table, vertical_rows
 from studies.watch.__main__ import run as run_watch
 from studies.watch.judge import KIDNAPPED, alarm_table, judge, right_table, simulated_drive
@@ -29,23 +29,19 @@ from studies.watch.recordings import WatchedLook, alarms_of, summarize_watch
 pytestmark = pytest.mark.full
 
 
-def test_a_result_has_its_command_and_its_sections(tmp_path, monkeypatch):
+def test_a_result_has_its_command_and_its_sections_and_an_edit_by_hand_is_noticed(
+        tmp_path, monkeypatch):
     monkeypatch.setattr(results, 'FOLDER', tmp_path)
+    path = tmp_path / 'small.md'
     results.measure('small', 'studies.acceptance judge --worlds 1 --kinds room', tmp_path)
-    text = (tmp_path / 'small.md').read_text()
+    text = path.read_text()
     assert '| command | `python -m studies.acceptance judge --worlds 1 --kinds room` |' in text
     assert results.section('small', 'At a glance').startswith('| place | one image |')
     with pytest.raises(ValueError, match='no section In short, but At a glance'):
         results.section('small', 'In short')
-
-
-def test_an_edit_by_hand_is_noticed(tmp_path, monkeypatch):
-    monkeypatch.setattr(results, 'FOLDER', tmp_path)
-    path = tmp_path / 'small.md'
-    results.measure('small', 'studies.acceptance judge --worlds 1 --kinds room', tmp_path)
     with pytest.raises(ValueError, match=r'gone\.md is missing'):
         results.section('gone', 'At a glance')
-    for edited in (path.read_text().replace(' of ', ' out of ', 1), 'no digest\n'):
+    for edited in (text.replace(' of ', ' out of ', 1), 'no digest\n'):
         path.write_text(edited)
         with pytest.raises(ValueError, match=r'small\.md is missing or was edited: run python -m'):
             results.section('small', 'At a glance')
@@ -97,17 +93,6 @@ def test_no_restart_is_seen_in_a_drive_without_any(shared_data, bag, rate_hz):
     assert numbers(row)[-2:] == [0, 0]
 
 
-@pytest.fixture(scope='module')
-def place():
-    return Simulated('room', 1000).load()
-
-
-@pytest.fixture(scope='module')
-def queries(place):
-    """Queries with true verticals and odometry."""
-    return trials.with_neighbours(trials.with_vertical(place.frames), place.groups)
-
-
 @pytest.mark.parametrize(('change', 'level', 'expected'), [
     (wrong_sensors.middle_crop, 300.0, (12.5, 125.0, 137.5, 150.0)),
     (wrong_sensors.scaled_boxes, 0.5, (50.0, 100.0, 150.0, 120.0)),
@@ -118,10 +103,9 @@ def queries(place):
     (wrong_sensors.of_convention, 0.0, (200.0, 220.0, 200.0, 40.0)),
     (wrong_sensors.of_convention, 2.0, (0.15625, 5 / 12, 0.46875, 0.5)),
     (wrong_sensors.of_convention, 5.0, (100.0, 200.0, 400.0, 440.0))])
-def test_boxes_are_of_another_image_or_convention(queries, change, level, expected):
+def test_boxes_are_of_another_image_or_convention(change, level, expected):
     box = Detections(np.array([[100.0, 200.0, 300.0, 240.0]]), ('cup',), np.ones(1))
-    asked = replace(queries[0], neighbours=(), observation=replace(
-        queries[0].observation, detections=box))
+    asked = PosedQuery(0, Observation(CAMERA, box), np.eye(4))
     found, = change([asked], level)[0].observation.detections.bboxes_xyxy
     assert tuple(found) == pytest.approx(expected)
 
