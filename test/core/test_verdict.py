@@ -217,22 +217,6 @@ def test_the_share_within_a_distance_is_that_of_drawn_positions(deviations_m, rn
     assert share_within(1.0, covariance) == pytest.approx(share, abs=0.04)
 
 
-def test_the_likeliest_hypothesis_leads_and_without_refinement_the_greatest_score(
-        office_map, queries, observed):
-    likeliest = Relocalizer(office_map, RelocalizerOptions(tilt_deviation_deg=0.0))
-    greatest = Relocalizer(office_map, RelocalizerOptions(refine=False))
-    differ = 0
-    for frame in [frame for frame in queries if frame.is_main][:20:4]:
-        found = likeliest.relocalize([observed(frame)]).hypotheses
-        worth = utilities([pose.support for pose in found])
-        assert (np.diff(worth) <= 0.0).all()
-        scores = [pose.score for pose in found]
-        differ += scores != sorted(scores, reverse=True)
-        scores = [one.score for one in greatest.relocalize([observed(frame)]).hypotheses]
-        assert scores == sorted(scores, reverse=True)
-    assert differ > 0
-
-
 @pytest.mark.parametrize('matching', ['hybrid', 'class'])
 def test_another_place_is_hardly_ever_accepted(matching, office_map, queries, thresholds):
     """Queries in the map with all objects exchanged: every pose is wrong."""

@@ -74,11 +74,8 @@ def test_an_object_that_was_taken_away_is_left_out_with_the_reason():
     table, poses, taken = TABLE, walk.walk_around(frames=120), 2
     seen = walk.see(table, poses)
     later = walk.see(walk.without(table, taken), poses)
-    first, rest = seen.select_boxes(seen.frames < 30), later.select_boxes(later.frames >= 30)
-    both = replace(
-        seen, frame_offsets=first.frame_offsets + rest.frame_offsets,
-        **{name: np.concatenate([getattr(first, name), getattr(rest, name)])
-           for name in ('bboxes_xyxy', 'classes', 'scores')})
+    both = walk.merged(seen.select_boxes(seen.frames < 30),
+                       later.select_boxes(later.frames >= 30))
     built = build_map(both, MappingOptions(min_seen_ratio=0.4))
     assert len(built.landmark_map) == len(table) - 1
     (left_out,) = built.report.left_out

@@ -9,7 +9,6 @@ import pytest
 from walk import make_table, see, walk_around
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.labelling import embed_landmarks, label_landmarks
 from cliploc_ros.offline.vocabulary.vocabulary import Phrases
 
@@ -18,11 +17,6 @@ SIZE = 32
 
 def unit(rows):
     return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float32)
-
-
-def make_phrases(name, count, rng):
-    return Phrases(tuple(f'{name} {number}' for number in range(count)),
-                   unit(rng.normal(size=(count, SIZE))))
 
 
 def with_crops(detections, crops):
@@ -38,36 +32,6 @@ def static():
     seen = see(make_table(1), walk_around(12, 90.0))
     assert len(seen.classes) == 12
     return replace(seen, map_from_camera=poses)
-
-
-def test_crops_of_a_built_map_name_their_phrase():
-    """The crops of each object mix its true phrase, another object's phrase, and noise."""
-    rng = np.random.default_rng(1)
-    table = make_table()
-    seen = see(table, walk_around(40))
-    phrases = {name: [make_phrases(name, 300, rng)] for name in set(table.class_ids)}
-    built = build_map(seen)
-    true_rows = np.argmin(np.linalg.norm(
-        built.landmark_map.centers[:, None] - table.centers, axis=2), axis=1)
-    meant = np.array([phrases[name][0].embeddings[7 * row]
-                      for row, name in enumerate(table.class_ids)])
-    crops = unit(rng.normal(size=(len(seen.classes), SIZE)))
-    known = built.shown >= 0
-    crops[known] = unit(0.4 * meant[true_rows[built.shown[known]]] + crops[known])
-    seen = with_crops(seen, crops)
-    ids = built.landmark_map.landmark_ids
-    embeddings = embed_landmarks(ids, seen, built.shown)
-    labelled = label_landmarks(built.landmark_map, embeddings, phrases)
-    assert len(labelled) == len(table)
-    for row, true_row in enumerate(true_rows):
-        assert labelled.labels[row] == f'{table.class_ids[true_row]} {7 * true_row}'
-        texts, weights = zip(*labelled.details[row].labels, strict=True)
-        assert texts[0] == labelled.labels[row]
-        assert len(set(texts)) == 6
-        assert list(weights) == sorted(weights, reverse=True)
-        assert sum(weights) == pytest.approx(1.0, abs=1e-3)
-        assert labelled.details[row].support == built.landmark_map.details[row].support
-    np.testing.assert_array_equal(labelled.centers, built.landmark_map.centers)
 
 
 def test_weights_are_those_of_clip():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scene import map_of
 from scipy.spatial.transform import Rotation
-from walk import CLASSES, join_maps, make_table, see, see_rows, walk_around
+from walk import CLASSES, join_maps, make_table, merged, see, see_rows, walk_around
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.options import RelocalizerOptions
@@ -151,14 +151,8 @@ def watch(*things):
     """Return simulated detections of some objects: class, centre, axes, frames with a box."""
     parts = [see(make_map(thing[:3]), POSES, noise_px=1.0, seed=row)
              for row, thing in enumerate(things)]
-    parts = [part.select_boxes(frames[part.frames])
-             for part, (*_, frames) in zip(parts, things, strict=True)]
-    frames = np.concatenate([part.frames for part in parts])
-    order = np.argsort(frames, kind='stable')
-    columns = {name: np.concatenate([getattr(part, name) for part in parts])[order]
-               for name in ('bboxes_xyxy', 'classes', 'scores')}
-    return replace(parts[0], frame_offsets=np.searchsorted(frames[order], np.arange(
-        len(POSES) + 1)), **columns)
+    return merged(*(part.select_boxes(frames[part.frames])
+                    for part, (*_, frames) in zip(parts, things, strict=True)))
 
 
 def under(name, thing):

@@ -92,6 +92,16 @@ def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0, camera
         CLASSES, classes[shown], np.full(len(bboxes), 0.9)), shown
 
 
+def merged(*parts: PosedDetections) -> PosedDetections:
+    """Return the boxes of several recordings of the same frames."""
+    frames = np.concatenate([part.frames for part in parts])
+    order = np.argsort(frames, kind='stable')
+    return replace(
+        parts[0], frame_offsets=np.searchsorted(frames[order], np.arange(len(parts[0]) + 1)),
+        **{name: np.concatenate([getattr(part, name) for part in parts])[order]
+           for name in ('bboxes_xyxy', 'classes', 'scores')})
+
+
 def measure_depth(detections, table, scale=1.0, holes=0.0):
     """Add the depth of the ellipsoid's surface in each box, with errors."""
     rng = np.random.default_rng(0)

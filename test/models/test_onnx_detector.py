@@ -3,7 +3,6 @@
 """Detectors in ONNX files: small ones with constant outputs, invalid and damaged files."""
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -249,7 +248,6 @@ def test_a_damaged_compiled_network_is_compiled_again(tmp_path, caplog):
 
     before = boxes()
     blob, = tmp_path.rglob('*.blob')
-    moved = Path(shutil.copytree(tmp_path, tmp_path.with_name('moved')))
     whole = blob.read_bytes()
     half = len(whole) // 2
     for damaged in (whole[:half] + bytes(3000) + whole[half + 3000:], whole[:1000], b''):
@@ -260,10 +258,6 @@ def test_a_damaged_compiled_network_is_compiled_again(tmp_path, caplog):
         caplog.clear()
         assert np.array_equal(boxes(), before) and not caplog.records
         assert [*blob.parent.iterdir()] == [blob]
-    # on a robot, file and cache are in other places
-    copied = shutil.copy(YOLO_FILE, moved / YOLO_FILE.name)
-    load_detector(DetectorOptions(str(copied), cache_dir=str(moved)))
-    assert len(list(moved.rglob('*.blob'))) == 1
 
 
 def test_a_vocabulary_is_refused(load):
