@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from garbage import CASES, number
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scene import CAMERA
 from whole_sets import ROOM, write_set
@@ -37,6 +36,10 @@ from cliploc_ros.offline.datasets.observations import load_observations, save_ob
 from cliploc_ros.offline.datasets.parsing import Fields
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
+#: Default number of cases per property; CLIPLOC_FUZZ_CASES=10000 requests more.
+CASES = settings(max_examples=int(os.environ.get('CLIPLOC_FUZZ_CASES', '200')), deadline=None,
+                 derandomize=True)
+number = st.one_of(st.floats(), st.floats(-1000.0, 1000.0), st.integers(-10, 10).map(float))
 LABELS = ['a mug', 'a book']
 TABLE = 'id,class_id,x,y,z,a,b,c\n' + ''.join(
     f'cup_{row},cup,{row}.5,1,2,.1,.1,.2\n' for row in range(8))

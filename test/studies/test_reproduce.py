@@ -29,8 +29,7 @@ pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
 SHIPPED = yaml.safe_load((PROJECT / 'studies/reproduce.yaml').read_text())
-NETWORKS = {'yolo.onnx': '--model', 'clip.json': '--clip-model',
-            'clip.safetensors': '--clip-pretrained'}
+NETWORKS = ('yolo.onnx', 'clip.json', 'clip.safetensors')
 ARCHIVE = 'rgbd_dataset_freiburg3_demo.tgz'
 
 
@@ -76,22 +75,13 @@ def server():
 
 @pytest.fixture
 def write_sources(server, tmp_path):
-    """Write sources on the server with changes of the sequence; return the file.
-
-    Few classes are mapped to keep the test short.
-    """
+    """Write sources on the server with changes of the sequence; return the file."""
     def write(**changes):
-        file, address = tmp_path / 'sources.yaml', f'http://127.0.0.1:{server.server_port}'
-        sequence = {'name': 'the demo', 'url': f'{address}/{ARCHIVE}', 'megabytes': 4.3,
-                    'licence': 'Apache-2.0', 'unpacked': 9, 'queries': 4,
-                    'paper': SHIPPED['sequences']['fr3']['paper']}
-        networks = [{'name': name, 'url': f'{address}/{name}', 'megabytes': 2, 'option': option,
-                     'licence': 'Apache-2.0'} for name, option in NETWORKS.items()]
-        file.write_text(yaml.safe_dump({
-            'networks': networks, 'options': [], 'remarks': ['No frame of this is real.'],
-            'asking': ['--sweep', '50', '--workers', '1'],
-            'mapping': ['--no-joint', '--moving', 'book, bowl, mug, bottle, can, clock'],
-            'sequences': {'fr3': sequence | changes}}, allow_unicode=True))
+        sources = yaml.safe_load(Path(__file__).with_name('sources.yaml').read_text().replace(
+            'ADDRESS', f'http://127.0.0.1:{server.server_port}'))
+        sources['sequences']['fr3'] |= {'paper': SHIPPED['sequences']['fr3']['paper'], **changes}
+        file = tmp_path / 'sources.yaml'
+        file.write_text(yaml.safe_dump(sources, allow_unicode=True))
         return file
     return write
 
