@@ -22,6 +22,7 @@ from cliploc_ros.core.geometry.transforms import (
 from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, nearest_words, save_layer
 from cliploc_ros.core.map import map_file
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.offline.recording.keyframe_layer import learn_words
@@ -41,6 +42,12 @@ def rigid(position=(0.0, 0.0, 0.0), axis='z', degrees=0.0):
     """Return a transform (4, 4): a turn about an axis, then a shift [m]."""
     return make_transform(Rotation.from_euler(axis, degrees, degrees=True).as_matrix(),
                           np.array(position, dtype=float))
+
+
+def level(x=0.0, y=0.0, yaw_deg=0.0, z=1.0):
+    """Return the pose of a level camera; with yaw 0 it looks along the x axis."""
+    axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    return rigid((x, y, z), degrees=yaw_deg) @ make_transform(axes, np.zeros(3))
 
 
 def map_of(class_ids, centers, semi_axes=0.2) -> LandmarkMap:
@@ -67,12 +74,8 @@ def make_room() -> LandmarkMap:
 def doubled_room(offset) -> LandmarkMap:
     """Return the room and a copy of it at an offset (3,) [m]."""
     room = make_room()
-    return replace(room, landmark_ids=(*room.landmark_ids, *(f'{landmark_id}_2' for landmark_id in
-                                                            room.landmark_ids)),
-                   labels=room.labels * 2, class_ids=room.class_ids * 2,
-                   centers=np.concatenate([room.centers, room.centers + offset]),
-                   semi_axes=np.tile(room.semi_axes, (2, 1)),
-                   quats_xyzw=np.tile(room.quats_xyzw, (2, 1)))
+    return room.with_more(replace(room, centers=room.centers + offset, landmark_ids=tuple(
+        f'{landmark_id}_2' for landmark_id in room.landmark_ids)))
 
 
 def with_others(landmark_map: LandmarkMap, count: int) -> LandmarkMap:
@@ -117,6 +120,12 @@ def depth_image(room: LandmarkMap, map_from_camera, bboxes_xyxy):
     for depth_m, left, top, right, bottom in sorted(seen, reverse=True):
         depths_m[top:bottom, left:right] = depth_m
     return depths_m
+
+
+def embeddings_of(landmark_ids, means, key='key') -> LandmarkEmbeddings:
+    """Return image embeddings (L, d) of landmarks, without medoids."""
+    return LandmarkEmbeddings(key, tuple(landmark_ids), means.astype(np.float16), np.empty(
+        (0, means.shape[1]), np.float16), np.zeros(len(means) + 1, np.int64))
 
 
 def make_layer(room: LandmarkMap, keyframes=6, points=40) -> KeyframeLayer:

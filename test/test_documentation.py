@@ -3,11 +3,10 @@
 """README, doc/ and config/ agree with the declarations in the code."""
 
 import ast
-import importlib.machinery
-import importlib.util
 import json
 import math
 import re
+import runpy
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -34,18 +33,8 @@ OF_ROS = re.compile('/(clock|rosout|parameter_events|transition_event|get_type_d
                     '.*_parameters(_atomically)?|get_parameter_types)$')
 
 
-@pytest.fixture(scope='module')
-def document():
-    """Return the script that writes the documents, as a module."""
-    loader = importlib.machinery.SourceFileLoader('document', str(PROJECT / 'script/document'))
-    module = importlib.util.module_from_spec(
-        importlib.util.spec_from_loader('document', loader))
-    loader.exec_module(module)
-    return module
-
-
-def test_documents_are_what_the_tables_say(document):
-    for path, text in document.documents().items():
+def test_documents_are_what_the_tables_say():
+    for path, text in runpy.run_path(str(PROJECT / 'script/document'))['documents']().items():
         assert path.read_text() == text, f'{path} is out of date: run script/document'
 
 

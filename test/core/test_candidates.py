@@ -12,7 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from reference import candidate_mask, same_class, verify
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, map_of, see_room, unit_rows, with_others
+from scene import (
+    CAMERA,
+    MAP_FROM_CAMERA,
+    embeddings_of,
+    make_room,
+    map_of,
+    see_room,
+    unit_rows,
+    with_others,
+)
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
@@ -21,7 +30,7 @@ from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.map.culling import FEW, make_groups, sort_landmarks, visible_members
 from cliploc_ros.core.map.landmark_details import LEAST_CLASS_SHARE, LandmarkDetails
-from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, with_images
+from cliploc_ros.core.map.landmark_embeddings import with_images
 from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings, nearest_landmarks
 from cliploc_ros.core.observation import Detections, Observation
@@ -307,8 +316,7 @@ def world(rng):
     labels, means, crops = (unit_rows(rows).astype(np.float32) for rows in (
         gap[0] + 0.25 * objects, gap[1] + objects,
         gap[1] + objects + 0.06 * rng.normal(size=objects.shape)))
-    images = LandmarkEmbeddings('key', tuple(map(str, range(COUNT))), means.astype(np.float16),
-                                np.zeros((0, SIZE), np.float16), np.zeros(COUNT + 1, np.int64))
+    images = embeddings_of(map(str, range(COUNT)), means)
     return LabelEmbeddings.of(labels), images, crops
 
 

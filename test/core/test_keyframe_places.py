@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, make_layer, make_room, rigid
+from scene import CAMERA, level, make_layer, make_room, rigid
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.covariance import normalized_square
@@ -309,9 +309,7 @@ def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_po
 
 def test_a_constraint_tells_how_far_the_vertical_is_off():
     def tilted(degrees):
-        """Return the pose of a camera that looks along the map's x axis, rolled to the side."""
-        level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-        return make_transform(level @ rigid(degrees=degrees)[:3, :3], np.array([5.0, 6.0, 1.0]))
+        return level(5.0, 6.0) @ rigid(degrees=degrees)  # to the side
     constraint = Constraint(max_tilt=np.radians(30.0))
     covariance = np.diag([1.0, 1.0, 1.0, np.radians(4.0) ** 2, 1.0, 1.0])  # about the x axis
     assert constraint.tilt_error(tilted(20.0), covariance) == 0.0, 'unknown'

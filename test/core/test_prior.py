@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scene import MAP_FROM_CAMERA, doubled_room, make_room, observe, rigid
+from scene import MAP_FROM_CAMERA, doubled_room, level, make_room, observe
 from scipy.spatial.transform import Rotation
 from test_map_file import floor, join
 
 from cliploc_ros.core.acceptance.confidence import confidences, region_odds
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Region
+from cliploc_ros.core.observation import Region
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
@@ -41,7 +41,7 @@ def ask(landmark_map=TWINS, objects=12, options=OPTIONS, **known):
 
 def looking(yaw, x=0.0, y=0.0):
     """Return a level camera pose."""
-    return (rigid((x, y, 0.0), degrees=math.degrees(yaw)) @ np.linalg.inv(OPTICAL_FROM_BODY))[None]
+    return level(x, y, math.degrees(yaw), 0.0)[None]
 
 
 AREA = np.prod(np.ptp(TWINS.centers[:, :2], axis=0) + 2.0)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from scene import CAMERA, doubled_room, make_room, map_of, rigid, see_room
+from scene import CAMERA, doubled_room, level, make_room, map_of, rigid, see_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -35,7 +35,7 @@ from cliploc_ros.core.calibration import CALIBRATION, FILE
 from cliploc_ros.core.fit.covariance import share_within
 from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.fit.succession import succeed
-from cliploc_ros.core.geometry.transforms import RIGHT_M, make_transform
+from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
@@ -180,20 +180,16 @@ def test_each_number_states_its_unit_and_meaning_and_the_command_that_fits_it():
 
 
 WRONG_MOUNT = CALIBRATION.attitude.wrong_mount
-# Optical axes of a level camera that looks along the map's x axis: right, down, forward.
-LEVEL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 def turned(axis, degrees):
     """Return poses (m, 4, 4) of a level camera, turned about one of its axes."""
-    poses = np.tile(np.eye(4), (len(degrees), 1, 1))
-    poses[:, :3, :3] = LEVEL @ Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-    return poses
+    return np.array([level() @ rigid(axis=axis, degrees=angle) for angle in degrees])
 
 
 @pytest.mark.parametrize('axis', ['x', 'z'])
 def test_the_more_a_camera_is_tilted_the_more_speaks_against_it(axis):
-    against = tilt_handicaps(turned(axis, np.arange(0, 181, 15)[:, None]), 40.0)
+    against = tilt_handicaps(turned(axis, np.arange(0, 181, 15)), 40.0)
     assert (np.diff(against) >= 0.0).all()
     # handheld and downward cameras lose no confidence, cameras upside down all of it
     assert (against[:5] == 0.0).all()
@@ -202,8 +198,8 @@ def test_the_more_a_camera_is_tilted_the_more_speaks_against_it(axis):
 
 
 def test_the_heading_does_not_matter_nor_a_deviation_of_zero():
-    assert (tilt_handicaps(turned('y', np.arange(0, 360, 30)[:, None]), 40.0) == 0.0).all()
-    assert (tilt_handicaps(turned('z', np.arange(0, 181, 15)[:, None]), 0.0) == 0.0).all()
+    assert (tilt_handicaps(turned('y', np.arange(0, 360, 30)), 40.0) == 0.0).all()
+    assert (tilt_handicaps(turned('z', np.arange(0, 181, 15)), 0.0) == 0.0).all()
 
 
 @pytest.mark.parametrize('deviations_m', [(0.3, 0.3, 0.3), (0.5, 0.1, 0.02), (2.0, 1.0, 0.1),
@@ -372,7 +368,6 @@ def test_a_contradiction_makes_both_answers_less_certain():
 
 
 ROOM = make_room()
-UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # looks along y, z is up
 
 
 def together(first, second):
@@ -420,7 +415,7 @@ def arrangement(off_m):
 
 def test_a_turn_about_an_axis_that_all_objects_share_is_a_rival():
     """Things on one axis leave the turn about it open; things off the axis determine it."""
-    camera = make_transform(UP, np.array([0.0, -2.5, 1.0]))
+    camera = level(0.0, -2.5, 90.0)
     on_axis, spread = arrangement(0.06), arrangement(0.8)
     rows = np.arange(6)
     turned = turned_about_axis(arrangement(0.0), camera, rows)
@@ -453,7 +448,7 @@ OFFICE = of_things([*DESK, ('cup', 0.4, 0.0, 0.75), ('chair', 0.3, 1.6, 0.4),
 
 def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng, monkeypatch):
     """An image may show a desk that the map lacks; its things stand 5 to 10 cm otherwise."""
-    terms, camera = CALIBRATION.group, make_transform(UP, np.array([0.3, -1.8, 1.2]))
+    terms, camera = CALIBRATION.group, level(0.3, -1.8, 90.0, 1.2)
 
     def ask(seen):
         found = Relocalizer(OFFICE, RelocalizerOptions(matching='class')).relocalize(
@@ -484,7 +479,7 @@ def test_a_turn_about_a_table_that_takes_chairs_to_chairs_is_a_rival(table):
     """The axis is the table's, or the middle of the chairs; a turn by 45 degrees fits no chair."""
     room = of_things([*table, *(('chair', x, y, 0.4) for x, y in (
         (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)))])
-    camera = make_transform(UP, np.array([0.0, -3.0, 1.4]))
+    camera = level(0.0, -3.0, 90.0, 1.4)
     turned = turned_about_axis(room, camera, np.arange(len(room)))
     np.testing.assert_allclose(turned[:3, :3, 3], [[3, 0, 1.4], [0, 3, 1.4], [-3, 0, 1.4]],
                                atol=1e-9)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scene import boxes_of, map_of, rigid
+from scene import boxes_of, level, map_of, rigid
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.calibration import CALIBRATION
@@ -109,17 +109,10 @@ def room():
                   np.c_[x, y, rng.uniform(0.3, 1.8, COUNT)], rng.uniform(0.1, 0.25, (COUNT, 3)))
 
 
-def pose_at(x, y, yaw_deg):
-    """Return map_from_camera of a level camera, 1 m above the floor."""
-    yaw = np.radians(yaw_deg)
-    forward, right = np.array([np.cos(yaw), np.sin(yaw), 0.0]), [np.sin(yaw), -np.cos(yaw), 0.0]
-    return make_transform(np.column_stack([right, [0.0, 0.0, -1.0], forward]), np.array([x, y, 1]))
-
-
 def drive(count):
     """Return poses on a circle about the middle that look outwards, 20 degrees apart."""
     angles = np.radians(20.0 * np.arange(count))
-    return [pose_at(3.0 + np.cos(angle), 3.0 + np.sin(angle), np.degrees(angle) + 15.0)
+    return [level(3.0 + np.cos(angle), 3.0 + np.sin(angle), np.degrees(angle) + 15.0)
             for angle in angles]
 
 
@@ -206,7 +199,7 @@ def test_a_place_that_the_map_does_not_show_is_uncertain(watch, room):
     """The robot drives through a door to other objects of the same classes."""
     follow(watch, room, drive(10))
     annex = replace(room, centers=room.centers + np.array([30.0, 0.0, 0.0]))
-    way = [pose_at(30.0 + one[0, 3], one[1, 3], 20.0 * row) for row, one in enumerate(drive(40))]
+    way = [level(30.0 + one[0, 3], one[1, 3], 20.0 * row) for row, one in enumerate(drive(40))]
     near = [moved(way[0], x, 0.0) for x in np.linspace(-27.0, 0.0, 30)]
     follow(watch, room, near, first=10, rows=[])
     states = {watch.look(see(annex, pose, 40 + number), pose).state
@@ -319,13 +312,13 @@ def test_invalid_inputs_are_named(watch, room):
 
 
 def test_a_pose_against_the_vertical_is_less_likely():
-    level = pose_at(0.0, 0.0, 0.0)
-    tilted = level @ rigid(axis='x', degrees=15.0)
+    straight = level()
+    tilted = straight @ rigid(axis='x', degrees=15.0)
     up = np.array([0.0, -1.0, 0.0])
-    assert by_vertical(level, None, 1.0) == by_vertical(level, up, 1.0) == 0.0
+    assert by_vertical(straight, None, 1.0) == by_vertical(straight, up, 1.0) == 0.0
     assert by_vertical(tilted, up, 1.0) < -3.0
     upside_down = -up * (1.0 + 1e-12)  # by rounding
-    assert by_vertical(level, upside_down, 1.0) == -CALIBRATION.attitude.wrong_mount
+    assert by_vertical(straight, upside_down, 1.0) == -CALIBRATION.attitude.wrong_mount
 
 
 def things(*centers):
@@ -340,18 +333,18 @@ def test_what_an_image_should_show():
                   (3, 2.35, 1),  # cut by the border
                   (30, 1, 1),  # too far
                   (3, -1, 1))  # in view
-    found = expect(some, CAMERA, pose_at(0, 0, 0), np.array([5]))
+    found = expect(some, CAMERA, level(0, 0, 0), np.array([5]))
     assert found.landmarks.tolist() == [0, 5]
     assert found.was_seen.tolist() == [False, True]
     assert found.in_sight.tolist() == [True, True]
     # no visible landmark is beside it, so a wall may hide it
-    assert not expect(some, CAMERA, pose_at(0, 0, 0), np.empty(0, dtype=int)).in_sight.any()
+    assert not expect(some, CAMERA, level(0, 0, 0), np.empty(0, dtype=int)).in_sight.any()
 
 
 @pytest.mark.parametrize(('yaw_deg', 'side'), [(0, 4), (44, 4), (46, 5), (181, 0), (-1, 3)])
 def test_the_side_of_a_landmark_is_that_from_which_the_camera_looks(yaw_deg, side):
     ahead = [2 * np.cos(np.radians(yaw_deg)), 2 * np.sin(np.radians(yaw_deg)), 1]
-    found = expect(things(ahead), CAMERA, pose_at(0, 0, yaw_deg), np.array([0]))
+    found = expect(things(ahead), CAMERA, level(0, 0, yaw_deg), np.array([0]))
     assert found.sides.tolist() == [side]
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import make_layer, make_room, map_of, rigid
+from scene import level, make_layer, make_room, map_of, rigid
 from scipy.spatial.transform import Rotation
 from walk import CAMERA, join_maps, make_table, moved, see, walk_around
 
@@ -281,7 +281,7 @@ def test_what_was_never_detected_is_never_simulated(detections):
     false = moved(TABLE, {4: TABLE.centers[4] + (0.0, 0.0, 1.0)})
     views, witness = witness_of(false, detections)
     model = relocalization.measure_detector(false, detections, views, witness)
-    assert all(4 not in model.in_view(pose)[0] for pose in detections.map_from_camera)
+    assert all(4 not in model.in_level(pose)[0] for pose in detections.map_from_camera)
 
 
 @pytest.mark.parametrize(('table', 'named'), [
@@ -326,18 +326,12 @@ def layer_at(*poses):
     return replace(make_layer(ROOM, len(poses), points=5), map_from_camera=np.array(poses))
 
 
-def view(x=0.0, degrees=0.0):
-    """Return the pose of a camera that looks along x, 1 m above the floor."""
-    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    return rigid((x, 0.0, 1.0), degrees=degrees) @ make_transform(level, np.zeros(3))
-
-
 @pytest.mark.parametrize(('x', 'degrees', 'reached'), [
     (1.9, 0.0, True), (2.1, 0.0, False), (0.0, -41.0, False), (0.9, 20.0, True),
     (1.1, 20.0, False)])
 def test_reach_is_near_and_in_the_same_direction(x, degrees, reached):
-    here = view(x, degrees)
-    assert in_reach(layer_at(view()), here[None, :3, 3], here[None, :3, 2]) == [reached]
+    here = level(x, 0.0, degrees)
+    assert in_reach(layer_at(level()), here[None, :3, 3], here[None, :3, 2]) == [reached]
 
 
 @pytest.fixture(scope='module')
@@ -347,12 +341,12 @@ def room_report():
 
 def test_places_without_a_keyframe_are_counted_and_named(room_report):
     grid = room_report.grid
-    everywhere = layer_at(*(make_transform(view(0.0, angle)[:3, :3], place)
+    everywhere = layer_at(*(make_transform(level(0.0, 0.0, angle)[:3, :3], place)
                             for place in grid.positions for angle in range(0, 360, 30)))
-    full = check_keyframes(everywhere, grid, np.array([view(), view(50.0)]))
+    full = check_keyframes(everywhere, grid, np.array([level(), level(50.0)]))
     assert full.reached_positions == 1.0 and not len(full.without)
     assert (full.headings == grid.headings).all()
-    nowhere = check_keyframes(layer_at(view(500.0)), grid, np.array([view(), view(500.0)]))
+    nowhere = check_keyframes(layer_at(level(500.0)), grid, np.array([level(), level(500.0)]))
     assert nowhere.reached_positions == 0.0
     assert nowhere.recorded.tolist() == [False, True]
     assert len(nowhere.without) == len(grid.positions)
@@ -366,7 +360,7 @@ def test_places_without_a_keyframe_are_counted_and_named(room_report):
 
 def test_a_map_that_leaves_no_free_position_is_checked():
     hall = map_of(['hall'], np.zeros((1, 3)), (4.0, 4.0, 3.0))
-    report = check_map(hall, options=QUICK, layer=layer_at(view()))
+    report = check_map(hall, options=QUICK, layer=layer_at(level()))
     assert len(report.grid.positions) == 0
     assert report.keyframes.reached_positions == 0.0 and len(report.keyframes.headings) == 0
 
@@ -379,7 +373,7 @@ def test_the_report_has_keyframes_only_where_there_are_some(tmp_path, run_here):
     assert done.returncode == 1 and 'room.keyframes.npz:' in done.stderr
     assert run_here(main, *given).returncode == 0
     assert json.loads((tmp_path / 'out/check.json').read_text())['keyframes'] is None
-    save_layer(layer_path(tmp_path / 'room.yaml'), layer_at(view(), view(1.0)))
+    save_layer(layer_path(tmp_path / 'room.yaml'), layer_at(level(), level(1.0)))
     done = run_here(main, *given)
     assert done.returncode == 0 and 'keyframes: 2 with' in done.stdout
     assert json.loads((tmp_path / 'out/check.json').read_text())['keyframes']['points'] == 10

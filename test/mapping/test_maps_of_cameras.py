@@ -10,12 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import map_of, rigid
+from scene import level, map_of, rigid
 from scipy.spatial.transform import Rotation
 from walk import CAMERA, CLASSES, draw_errors, measure_depth, nearest_errors, see_rows
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
@@ -37,9 +36,7 @@ ERRORS = PoseErrors(0.05, 1.5, 3.0)
 
 
 def mount_of(name):
-    optical = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    return rigid((0.0, 0.0, 1.0), degrees=RIG[name][1]) @ make_transform(
-        optical, np.array([_LEVER_M, 0.0, 0.0]))
+    return rigid(degrees=RIG[name][1]) @ level(_LEVER_M)
 
 
 def make_things(count=20):

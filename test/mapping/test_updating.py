@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scene import map_of, rigid, unit_rows
+from scene import embeddings_of, map_of, rigid, unit_rows
 from scipy.spatial.transform import Rotation
 from walk import (
     CLASSES,
@@ -26,7 +26,7 @@ from walk import (
 
 from cliploc_ros.cli import build_map
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
+from cliploc_ros.core.map.landmark_embeddings import load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
@@ -175,12 +175,6 @@ def test_noisy_poses_with_gaps_are_refined_against_the_map():
     assert joint.report.pose_change_m > 0.03
 
 
-def embeddings_of(landmark_ids, looks):
-    return LandmarkEmbeddings(ENCODER, landmark_ids, looks.astype(np.float16),
-                              np.empty((0, looks.shape[1]), np.float16),
-                              np.zeros(len(looks) + 1, dtype=np.int64))
-
-
 def draw_looks(count):
     return unit_rows(np.random.default_rng(0).normal(size=(count, 24)))
 
@@ -208,7 +202,7 @@ def test_two_objects_that_exchanged_places(alike):
         looks[second] = looks[first]
     later = moved(things, {first: things.centers[second], second: things.centers[first]})
     updated = update_map(things, seen_with_looks(later, looks),
-                         embeddings=embeddings_of(things.landmark_ids, looks))
+                         embeddings=embeddings_of(things.landmark_ids, looks, ENCODER))
     report = updated.report
     assert ids(report.moved) == (set() if alike else {'thing_1', 'thing_7'})
     assert report.missing == report.new == ()
@@ -222,12 +216,12 @@ def test_looks_tell_a_moved_object_from_a_new_one():
     later = moved(FEW, {4: (1.7, 0.0, 0.8)})
     looks = draw_looks(len(FEW) + 1)
     same = update_map(FEW, seen_with_looks(later, looks),
-                      embeddings=embeddings_of(FEW.landmark_ids, looks[:-1]))
+                      embeddings=embeddings_of(FEW.landmark_ids, looks[:-1], ENCODER))
     assert ids(same.report.moved) == {'thing_4'}
     other_looks = looks.copy()
     other_looks[4] = looks[-1]
     other = update_map(FEW, seen_with_looks(later, other_looks),
-                       embeddings=embeddings_of(FEW.landmark_ids, looks[:-1]))
+                       embeddings=embeddings_of(FEW.landmark_ids, looks[:-1], ENCODER))
     assert other.report.moved == ()
     assert ids(other.report.missing) == {'thing_4'}
     assert len(other.report.new) == 1

@@ -26,14 +26,12 @@ def make_table(count=9) -> LandmarkMap:
                           rng.uniform(0.06, 0.15, (count, 3))), quats_xyzw=quats)
 
 
-def join_maps(*maps: LandmarkMap) -> LandmarkMap:
+def join_maps(joined: LandmarkMap, *maps: LandmarkMap) -> LandmarkMap:
     """Join the landmarks of several maps; ids get a mark from the second map on."""
-    ids = [name + '_b' * number for number, one in enumerate(maps) for name in one.landmark_ids]
-    labels, classes, details = (sum((getattr(landmark_map, name) for landmark_map in maps), ())
-                                for name in ('labels', 'class_ids', 'details'))
-    arrays = (np.concatenate([getattr(landmark_map, name) for landmark_map in maps])
-              for name in ('centers', 'semi_axes', 'quats_xyzw'))
-    return LandmarkMap(maps[0].frame_id, tuple(ids), labels, classes, *arrays, details)
+    for number, one in enumerate(maps, start=1):
+        joined = joined.with_more(replace(one, landmark_ids=tuple(
+            name + '_b' * number for name in one.landmark_ids)))
+    return joined
 
 
 def moved(table: LandmarkMap, places) -> LandmarkMap:

@@ -8,15 +8,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scene import make_room, unit_rows
+from scene import embeddings_of, make_room, unit_rows
 
 from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_embeddings import (
-    LandmarkEmbeddings,
-    embeddings_path,
-    save_landmark_embeddings,
-)
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path, save_landmark_embeddings
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import resolve_cache_dir
@@ -104,10 +100,7 @@ def map_file(tmp_path):
 
 def images_of(clip, ids=ROOM.landmark_ids):
     weights = resolve_clip_weights(clip)
-    size = weights.embed_dim
-    means = rows_of(len(ids), size).astype(np.float16)
-    return LandmarkEmbeddings(weights.key, tuple(ids), means, np.zeros((0, size), np.float16),
-                              np.zeros(len(ids) + 1, np.int64))
+    return embeddings_of(ids, rows_of(len(ids), weights.embed_dim), weights.key)
 
 
 def test_labels_with_weights_are_mixed(clip):
