@@ -25,6 +25,7 @@ from cliploc_ros.core.map import map_file
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.offline.recording.keyframe_layer import learn_words
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -73,9 +74,8 @@ def make_room() -> LandmarkMap:
 
 def doubled_room(offset) -> LandmarkMap:
     """Return the room and a copy of it at an offset (3,) [m]."""
-    room = make_room()
-    return room.with_more(replace(room, centers=room.centers + offset, landmark_ids=tuple(
-        f'{landmark_id}_2' for landmark_id in room.landmark_ids)))
+    return ROOM.with_more(replace(ROOM, centers=ROOM.centers + offset, landmark_ids=tuple(
+        f'{landmark_id}_2' for landmark_id in ROOM.landmark_ids)))
 
 
 def with_others(landmark_map: LandmarkMap, count: int) -> LandmarkMap:
@@ -96,6 +96,12 @@ def boxes_of(landmarks: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, camera=CAM
 def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:
     """Return a perfect observation of the room, one box for each landmark in order."""
     return Detections(boxes_of(room, map_from_camera), room.class_ids, np.full(len(room), 0.9))
+
+
+ROOM = make_room()
+SEEN = see_room(ROOM)
+#: Options with which boxes need no similarities.
+BY_CLASS = RelocalizerOptions(matching='class')
 
 
 def observe(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, rows=None, **known

@@ -5,13 +5,11 @@
 from dataclasses import replace
 
 import numpy as np
-from scene import CAMERA, embeddings_of, make_room
+from scene import CAMERA, ROOM, embeddings_of
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.offline.datasets.map_recording import MapRecording
 from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
-
-ROOM = make_room()
 
 
 def made_map(number):

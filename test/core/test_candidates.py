@@ -13,12 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference import candidate_mask, same_class, verify
 from scene import (
+    BY_CLASS,
     CAMERA,
     MAP_FROM_CAMERA,
+    ROOM,
+    SEEN,
     embeddings_of,
-    make_room,
     map_of,
-    see_room,
     unit_rows,
     with_others,
 )
@@ -252,13 +253,11 @@ def test_other_programs_do_not_cut_a_search_but_the_end_of_its_request_does():
     assert cut.reason.endswith('; raise timeout_s') and 'budget' not in cut.reason
 
 
-ROOM = make_room()
-BY_CLASS = RelocalizerOptions(matching='class')
 
 
 def see(classes) -> Observation:
     """Return a perfect view of the room by a detector with these classes."""
-    return Observation(CAMERA, replace(see_room(ROOM), class_ids=tuple(classes)))
+    return Observation(CAMERA, replace(SEEN, class_ids=tuple(classes)))
 
 
 def weighted(landmark_map: LandmarkMap, share: float) -> LandmarkMap:
@@ -295,7 +294,7 @@ def test_a_rare_class_makes_no_candidate(share, is_candidate):
 
 def test_a_class_that_a_landmark_is_only_taken_for_is_not_expected():
     """A person walking through the view does not count against the pose."""
-    seen = see_room(ROOM)
+    seen = SEEN
     detections = Detections(np.r_[seen.bboxes_xyxy, [[5.0, 5, 60, 90]]],
                             (*seen.class_ids, 'z'), np.ones(len(seen) + 1))
     frame = Observation(CAMERA, detections)

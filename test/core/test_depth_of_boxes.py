@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, rigid, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, ROOM, SEEN, rigid
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.depth_check import DepthCheck, DepthScale
@@ -28,7 +28,6 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import DatasetError, OptionsError
 from studies.worlds.depths import simulate_depths
 
-ROOM = make_room()
 CAMERA_FROM_MAP = invert_transform(MAP_FROM_CAMERA)
 ROTATION = np.ascontiguousarray(CAMERA_FROM_MAP[:3, :3])
 TRANSLATION = np.ascontiguousarray(CAMERA_FROM_MAP[:3, 3])
@@ -38,7 +37,7 @@ NONE = np.full(len(ROOM), np.nan)
 
 def look(rng, noise_px=4.0):
     """Return noisy boxes of all objects, and their depths."""
-    seen = see_room(ROOM)
+    seen = SEEN
     seen = replace(seen, bboxes_xyxy=seen.bboxes_xyxy + rng.normal(0.0, noise_px, (len(ROOM), 4)))
     return Observation(CAMERA, seen, depths=simulate_depths(ROOM.centers, ROOM.shapes,
                                                             MAP_FROM_CAMERA, rng))

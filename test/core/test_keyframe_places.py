@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, level, make_layer, make_room, rigid
+from scene import CAMERA, ROOM, level, make_layer, rigid
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.covariance import normalized_square
@@ -23,7 +23,6 @@ from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
 from cliploc_ros.offline.recording.keyframe_layer import PosedFeatures, triangulate
 
-ROOM = make_room()
 KEYFRAMES, POINTS = 6, 40
 
 

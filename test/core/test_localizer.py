@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, observe, rigid, see_room, with_others
+from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, SEEN, observe, rigid, with_others
 
 from cliploc_ros.core.acceptance.confidence import Setting, none_right
 from cliploc_ros.core.acceptance.contenders import join_frames
@@ -33,12 +33,9 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.trials import make_queries, with_neighbours
 from studies.acceptance.troubles import flickering
 
-ROOM = make_room()
-SEEN = see_room(ROOM)
 ONE = SEEN.select(np.array([0]))
 NOTHING = SEEN.select(np.array([], dtype=np.int64))
-OPTIONS = RelocalizerOptions(matching='class')
-RELOCALIZER = Relocalizer(ROOM, OPTIONS)
+RELOCALIZER = Relocalizer(ROOM, BY_CLASS)
 ODOM_FROM_MAP = rigid((30.0, -4.0, 1.0), degrees=70.0)
 
 
@@ -280,7 +277,7 @@ def test_objects_seen_one_after_the_other_are_as_good_as_at_once(landmarks, walk
     """No single frame shows three distinguishable objects. A large map is culled."""
     room, shares = with_others(ROOM, landmarks), [[0, 4, 8], [3, 7], [2, 11, 9], [1, 5]]
     frames = [see(room, pose, rows) for pose, rows in zip(walk, shares, strict=True)]
-    relocalizer = Relocalizer(room, OPTIONS)
+    relocalizer = Relocalizer(room, BY_CLASS)
     assert not any(relocalizer.relocalize([frame]).accepted for frame in frames)
     found = relocalizer.relocalize(frames)
     assert found.accepted, found.reason
@@ -300,7 +297,7 @@ def test_the_odometry_of_a_camera_that_looks_into_a_mirror_is_mirrored(room):
     wall = replace(room, centers=room.centers * [1.0, 1.0, 0.0] + [0.0, 0.0, 4.0],
                    semi_axes=np.full((len(room), 3), 0.2))
     walk = [moved(MAP_FROM_CAMERA, 0.2 * step, 4.0 * step) for step in range(4)]
-    one, four = (Relocalizer(wall, OPTIONS).relocalize([see(wall, pose) for pose in poses])
+    one, four = (Relocalizer(wall, BY_CLASS).relocalize([see(wall, pose) for pose in poses])
                  for poses in (walk[:1], walk))
     assert one.evidence.not_mirrored < 0.97
     assert four.evidence.not_mirrored == pytest.approx(one.evidence.not_mirrored, abs=1e-3)
@@ -310,7 +307,7 @@ def test_the_odometry_of_a_camera_that_looks_into_a_mirror_is_mirrored(room):
 def test_last_frames_without_objects_take_no_confidence(room):
     """The test for mirror images uses earlier frames that show objects."""
     walk = [moved(MAP_FROM_CAMERA, 0.05 * step, 2.0 * step) for step in range(6)]
-    relocalizer = Relocalizer(room, OPTIONS)
+    relocalizer = Relocalizer(room, BY_CLASS)
     every, *others = [
         relocalizer.relocalize([see(room, pose, None if step < shown else [])
                                 for step, pose in enumerate(walk)]).evidence
@@ -323,7 +320,7 @@ def test_last_frames_without_objects_take_no_confidence(room):
 
 @pytest.mark.parametrize('refine', [True, False])
 def test_the_same_view_again_is_no_more_evidence(refine, room):
-    relocalizer = Relocalizer(room, replace(OPTIONS, refine=refine))
+    relocalizer = Relocalizer(room, replace(BY_CLASS, refine=refine))
     frame = see(room, MAP_FROM_CAMERA, [0, 1, 2, 4])
     once, often = relocalizer.relocalize([frame]), relocalizer.relocalize([frame] * 5)
     assert often.score == pytest.approx(5 * once.score, rel=0.02)
@@ -348,7 +345,7 @@ def tilt_deg(found):
 @pytest.mark.parametrize('deviation_deg', [0.1, 0.5])
 def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room, verified_camera):
     """The verticals come from one sensor on one mount, so their error does not average out."""
-    relocalizer = Relocalizer(room, replace(OPTIONS, vertical_deviation_deg=deviation_deg))
+    relocalizer = Relocalizer(room, replace(BY_CLASS, vertical_deviation_deg=deviation_deg))
     at_once, one_by_one = [[0, 1, 3, 8, 7]], [[0, 1], [3], [8], [7]]
     one, four = (tilt_deg(relocalizer.relocalize([
         knowing_up(see(room, MAP_FROM_CAMERA, rows), MAP_FROM_CAMERA) for rows in shares]))
@@ -361,7 +358,7 @@ def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room, verif
 
 
 def test_bad_odometry_is_named(room, walk):
-    relocalizer = Relocalizer(room, OPTIONS)
+    relocalizer = Relocalizer(room, BY_CLASS)
     first, last = see(room, walk[0]), see(room, walk[1])
     scaled, mirrored = first.odom_from_camera.copy(), first.odom_from_camera.copy()
     scaled[:3, :3] *= 1.01
@@ -413,7 +410,7 @@ def test_earlier_frames_alone_do_not_decide(room, walk, shown):
     last = see(room, walk[-1], rows)
     last = replace(last, detections=replace(last.detections, bboxes_xyxy=np.tile(
         [600.0, 0.0, 640.0, 20.0], (len(rows), 1))))
-    relocalizer = Relocalizer(room, OPTIONS)
+    relocalizer = Relocalizer(room, BY_CLASS)
     assert relocalizer.relocalize(frames).evidence.linked > 0.99
     found = relocalizer.relocalize([*frames[:-1], last])
     assert (found.accepted, found.frames, found.refusal_kind) == (False, 4, 'frames_disagree')
@@ -459,7 +456,7 @@ def link_of(room, walk, shown, stamps_s=(0, 1, 2, 3), met=(), seen=None):
         frames.append(RELOCALIZER.search(replace(one, stamp_ns=round(1e9 * stamp_s))))
     others = [SimpleNamespace(pose=moved(walk[-1], 3.0, 90.0) if met[1] == 'elsewhere'
                               else walk[-1], odds=NO_POSE + met[0])] if met else []
-    return weakest_link(join_frames(room, OPTIONS, frames), walk[-1], seen, lambda _: others)
+    return weakest_link(join_frames(room, BY_CLASS, frames), walk[-1], seen, lambda _: others)
 
 
 def test_any_link_may_be_broken(room, walk):
@@ -475,7 +472,7 @@ def test_keyframes_and_inexact_odometry_hold_a_link(room, walk):
     assert link_of(room, walk, 'gggn', seen=Recognition((place,))).holds > 0.99
     first, last = see(room, walk[0]), see(room, walk[1])
     last = replace(last, odom_from_camera=last.odom_from_camera @ moved(np.eye(4), 0.2, 0.0))
-    joined = join_frames(room, OPTIONS, [RELOCALIZER.search(frame) for frame in (first, last)])
+    joined = join_frames(room, BY_CLASS, [RELOCALIZER.search(frame) for frame in (first, last)])
     assert weakest_link(joined, walk[1], None, lambda _: ()).holds > 0.99
 
 
@@ -487,7 +484,7 @@ def test_frames_before_a_carry_are_dropped(room, walk):
         seen = see(room, there @ np.linalg.inv(walk[2]) @ walk[row])
         frames[row] = replace(seen, stamp_ns=row * 10**9,
                               odom_from_camera=frames[row].odom_from_camera)
-    found = Relocalizer(room, OPTIONS).relocalize(frames)
+    found = Relocalizer(room, BY_CLASS).relocalize(frames)
     assert found.accepted and found.frames == len(found.frame_matches) <= 2
     assert pose_error(found.map_from_camera, there @ np.linalg.inv(walk[2]) @ walk[3])[0] < 0.05
     session = Localizer(RELOCALIZER)

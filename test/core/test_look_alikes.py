@@ -5,7 +5,7 @@
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, map_of, rigid, see_room
+from scene import CAMERA, MAP_FROM_CAMERA, SEEN, doubled_room, map_of, rigid
 
 from cliploc_ros.core.acceptance.look_alikes import find_twins
 from cliploc_ros.core.geometry.transforms import pose_error
@@ -87,7 +87,7 @@ def test_the_bays_of_a_corridor_are_twins():
 @pytest.mark.parametrize(('least_m', 'is_accepted'), [(-np.inf, False), (-1.0, True)])
 def test_a_twin_where_no_camera_can_be_counts_not(least_m, is_accepted):
     """The other room is 5 m further down."""
-    room, seen = doubled_room(np.array([9.0, 0.0, -5.0])), see_room(make_room())
+    room, seen = doubled_room(np.array([9.0, 0.0, -5.0])), SEEN
     options = RelocalizerOptions(matching='class', height_range_m=(least_m, 1.0))
     found = Relocalizer(room, options).relocalize([Observation(CAMERA, seen)])
     assert found.accepted == is_accepted
@@ -125,7 +125,7 @@ def seen(differing=0):
     similarities = np.full((12, 24), 0.2, dtype=np.float32)
     similarities[np.arange(12), np.arange(12)] = 0.3
     similarities[np.arange(differing, 12), np.arange(12 + differing, 24)] = 0.3
-    return Observation(CAMERA, see_room(make_room()), similarities)
+    return Observation(CAMERA, SEEN, similarities)
 
 
 def test_two_identical_rooms_are_refused_until_labels_differ():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, unit_rows
+from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, see_room, unit_rows
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.joined_map import MAX_MAPS, join_maps, parts_of, place_of
@@ -40,7 +40,7 @@ def read(fields):
 
 
 def test_a_written_map_is_read_back(tmp_path):
-    room = make_room()
+    room = ROOM
     odd = ('yes: "quoted" \\ #1: [\U0001f600]', 'tab\tand\nline', '\x7f', '\\ud83d', 'a\u2028"\\')
     room = replace(room, labels=(*odd, *room.labels[len(odd):]),
                    details=(FULL,) + (LandmarkDetails(support=3),) * (len(room) - 1))
@@ -55,7 +55,7 @@ def test_a_written_map_is_read_back(tmp_path):
 
 
 def test_image_embeddings_belong_to_one_map(tmp_path):
-    path, room = tmp_path / 'map.yaml', make_room()
+    path, room = tmp_path / 'map.yaml', ROOM
     rows = np.eye(12, 16, dtype=np.float16)
     seen = LandmarkEmbeddings('key', room.landmark_ids, rows, rows, np.arange(13))
     write_map(path, room, embeddings=seen)
@@ -195,13 +195,12 @@ def test_a_malformed_array_is_refused(tmp_path, embeddings, name, value, message
         load_landmark_embeddings(path)
 
 
-OPTIONS = RelocalizerOptions(matching='class')
 
 
 def floor(name, seed=0):
     """Return a map with this name of twelve objects near the camera, placed by seed."""
     rng = np.random.default_rng(seed)
-    return replace(make_room(), frame_id=name, centers=np.c_[
+    return replace(ROOM, frame_id=name, centers=np.c_[
         rng.uniform(-1.2, 1.2, (12, 2)), rng.uniform(1.5, 4, 12)])
 
 
@@ -209,7 +208,7 @@ def join(*maps):
     return join_maps(maps, [f'{landmark_map.frame_id}.yaml' for landmark_map in maps])
 
 
-def localize(landmark_map, seen, options=OPTIONS, similarities=None):
+def localize(landmark_map, seen, options=BY_CLASS, similarities=None):
     found = Relocalizer(landmark_map, options).relocalize(
         [Observation(CAMERA, see_room(seen), similarities)])
     return in_its_map(found, landmark_map)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, see_room
+from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, SEEN, doubled_room
 
 from cliploc_ros.core.acceptance import confidence
 from cliploc_ros.core.acceptance.looks import Look, Looks
@@ -16,13 +16,10 @@ from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.options import NEVER, Deadline, RelocalizerOptions
+from cliploc_ros.core.options import NEVER, Deadline
 from cliploc_ros.core.relocalizer import Relocalizer
 
 FINE = np.diag([1e-4] * 3 + [1e-5] * 3)
-ROOM = make_room()
-SEEN = see_room(ROOM)
-OPTIONS = RelocalizerOptions(matching='class')
 
 
 class Says:
@@ -56,7 +53,7 @@ def place(x=0.0, inliers=200, confirmed=0.9, reach=1.0, **fields):
                            pixels=pixels, **fields)
 
 
-def ask(recognizer=None, objects=12, options=OPTIONS, room=ROOM, **known):
+def ask(recognizer=None, objects=12, options=BY_CLASS, room=ROOM, **known):
     seen = Observation(CAMERA, SEEN.select(np.arange(objects)), **known)
     return Relocalizer(room, options).relocalize([seen], recognizer)
 
@@ -128,7 +125,7 @@ def test_objects_never_take_from_keyframes(fields, mapped):
     boxes = SEEN.select(np.arange(mapped))
     joined = Detections(np.vstack([boxes.bboxes_xyxy, strangers.bboxes_xyxy]),
                         boxes.class_ids + strangers.class_ids, np.full(mapped + 6, 0.9))
-    recognizer, relocalizer = Says(place(0.003, **fields)), Relocalizer(ROOM, OPTIONS)
+    recognizer, relocalizer = Says(place(0.003, **fields)), Relocalizer(ROOM, BY_CLASS)
     alone = ask(recognizer, objects=0)
     found = relocalizer.relocalize([Observation(CAMERA, joined)], recognizer)
     # the map's other objects are in sight and missed, while the strangers are not explained
@@ -159,11 +156,11 @@ def test_points_that_agree_by_chance_change_nothing():
 
 @pytest.mark.parametrize('cause', ['too few objects', 'a search cut short', 'earlier looks'])
 def test_a_dozen_points_do_not_override_what_objects_lack(cause):
-    objects, options, looks = 12, OPTIONS, Looks()
+    objects, options, looks = 12, BY_CLASS, Looks()
     if cause == 'too few objects':
         objects = 2
     elif cause == 'a search cut short':
-        options = replace(OPTIONS, iterations=100, algorithm='bf', time_budget_s=0.0)
+        options = replace(BY_CLASS, iterations=100, algorithm='bf', time_budget_s=0.0)
     seen = Observation(CAMERA, SEEN.select(np.arange(objects)), stamp_ns=10,
                        odom_from_camera=np.eye(4))
     if cause == 'earlier looks':
@@ -181,7 +178,7 @@ def test_a_place_that_moves_otherwise_than_odometry_says_is_no_room():
     first = Observation(CAMERA, SEEN.select(np.arange(0)), odom_from_camera=np.eye(4))
     second = replace(first, stamp_ns=10, odom_from_camera=moved(0.3, np.eye(4)))
     looks = Looks().with_look(Look(first, MAP_FROM_CAMERA, 0.99, place()), accepted=True)
-    relocalizer = Relocalizer(ROOM, OPTIONS)
+    relocalizer = Relocalizer(ROOM, BY_CLASS)
     found = [relocalizer.locate([relocalizer.search(observation)], looks=looks,
                                 recognizer=Says(place()))
              for observation in (second, replace(second, odom_from_camera=np.eye(4)))]

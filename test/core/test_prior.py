@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scene import MAP_FROM_CAMERA, doubled_room, level, make_room, observe
+from scene import BY_CLASS, MAP_FROM_CAMERA, ROOM, doubled_room, level, observe
 from scipy.spatial.transform import Rotation
 from test_map_file import floor, join
 
@@ -22,7 +22,6 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 
 TERMS = CALIBRATION.prior
-OPTIONS = RelocalizerOptions(matching='class')
 TWINS = doubled_room(np.array([10.0, 0.0, 0.0]))
 LACKING = TWINS.select(range(21))
 ANY_YAW = 100.0
@@ -34,9 +33,9 @@ def region(x=0.0, y=0.0, sigma_m=0.5, probability=0.95, frame_id='map', yaw=0.0,
                   np.diag([sigma_m, sigma_m, yaw_deviation]) ** 2, probability)
 
 
-def ask(landmark_map=TWINS, objects=12, options=OPTIONS, **known):
+def ask(landmark_map=TWINS, objects=12, options=BY_CLASS, **known):
     return Relocalizer(landmark_map, options).relocalize(
-        [observe(make_room(), rows=range(objects), **known)])
+        [observe(ROOM, rows=range(objects), **known)])
 
 
 def looking(yaw, x=0.0, y=0.0):
@@ -99,7 +98,7 @@ def test_a_region_of_another_floor_decides_between_equal_floors():
     floors = join(floor('floor_1'), floor('floor_2'))
     seen = observe(floor(''))
     for row, name in enumerate(('floor_1', 'floor_2')):
-        found = Relocalizer(floors, OPTIONS).relocalize(
+        found = Relocalizer(floors, BY_CLASS).relocalize(
             [replace(seen, region=region(frame_id=name))])
         assert (found.map_from_camera[0, 3] > 1e3) == bool(row)
 
@@ -107,10 +106,10 @@ def test_a_region_of_another_floor_decides_between_equal_floors():
 def test_a_confident_wrong_region_accepts_nothing_and_is_named():
     wrong = region(5.0, probability=1.0)
     assert not ask(region=wrong).accepted, 'neither room is recognized'
-    refused = ask(make_room(), 3, region=wrong)
-    assert refused.confidence < ask(make_room(), 3).confidence
+    refused = ask(ROOM, 3, region=wrong)
+    assert refused.confidence < ask(ROOM, 3).confidence
     assert 'prior' in refused.reason
-    sure = ask(make_room(), region=wrong)
+    sure = ask(ROOM, region=wrong)
     assert sure.accepted and pose_error(sure.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
 
 
@@ -151,14 +150,14 @@ def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries,
 
 def test_the_right_pose_is_the_rival_of_one_by_a_wrong_vertical(room):
     up = Rotation.from_euler('x', 45, degrees=True).apply(UP_IN_CAMERA)
-    found = Relocalizer(room, OPTIONS).relocalize([with_vertical(room, up)])
+    found = Relocalizer(room, BY_CLASS).relocalize([with_vertical(room, up)])
     assert not found.accepted
     assert found.evidence.rival.place == pytest.approx(MAP_FROM_CAMERA[:3, 3], abs=0.05)
 
 
 def test_two_objects_and_the_vertical_fix_a_pose(room):
     """The pose is refused, since four objects are required; without a vertical there is none."""
-    relocalizer = Relocalizer(room, OPTIONS)
+    relocalizer = Relocalizer(room, BY_CLASS)
     found = relocalizer.relocalize([with_vertical(room, rows=[0, 1])])
     assert found.solved and not found.accepted
     assert len(found.matches) == 2
@@ -191,5 +190,5 @@ def test_the_papers_algorithms_ask_for_no_vertical(room):
                                 np.array([1.0, 0.0])])
 def test_a_vertical_is_a_unit_vector(room, up):
     with pytest.raises(OptionsError, match='up_in_camera'):
-        Relocalizer(room, OPTIONS).relocalize([with_vertical(room, up)])
+        Relocalizer(room, BY_CLASS).relocalize([with_vertical(room, up)])
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, SEEN
 
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.localizer import (
@@ -26,8 +26,6 @@ from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.models.observer import Observer
 
-ROOM = make_room()
-SEEN = see_room(ROOM)
 IMAGE = np.random.default_rng(0).integers(0, 255, (CAMERA.height, CAMERA.width, 3), np.uint8)
 LABELS = LabelEmbeddings.of(np.linalg.qr(np.random.default_rng(1).normal(
     size=(16, 16)))[0][:len(ROOM)].astype(np.float32))
@@ -233,7 +231,7 @@ def test_no_crop_is_class_matching_and_all_crops_are_hybrid(embedded):
     *_, last = stages = searches(Crops(lambda rows: CropSimilarities(
         unit[rows], labels) if embedded else unit[rows]))
     hybrid = Relocalizer(ROOM, RelocalizerOptions())
-    by_class = Relocalizer(ROOM, RelocalizerOptions(matching='class')).relocalize([VIEW])
+    by_class = Relocalizer(ROOM, BY_CLASS).relocalize([VIEW])
     none = hybrid.relocalize([stages[0]])
     assert np.array_equal(none.map_from_camera, by_class.map_from_camera)
     assert none.confidence == by_class.confidence

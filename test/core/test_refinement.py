@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reference import scene_of, verify
-from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room, observe, rigid
+from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, boxes_of, observe, rigid
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -23,7 +23,6 @@ from cliploc_ros.core.geometry.transforms import (
 )
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M
-from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
@@ -102,8 +101,6 @@ def test_derivatives_are_those_of_differences(room, rng):
 
 
 
-ROOM = make_room()
-BY_CLASS = RelocalizerOptions(matching='class')
 
 
 UNSHARED, EXACT = np.zeros((len(ROOM), 2)), np.zeros(ERRORS)

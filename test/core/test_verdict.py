@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from scene import CAMERA, doubled_room, level, make_room, map_of, rigid, see_room
+from scene import BY_CLASS, CAMERA, ROOM, SEEN, doubled_room, level, map_of, rigid, see_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -125,8 +125,8 @@ def test_a_picture_needs_motion_to_be_told_from_the_place_and_motion_tells():
 
 
 def test_the_confidence_counts_the_published_covariance(verified_camera):
-    seen = see_room(make_room())
-    found = Relocalizer(make_room(), RelocalizerOptions(matching='class')).relocalize(
+    seen = SEEN
+    found = Relocalizer(ROOM, BY_CLASS).relocalize(
         [Observation(CAMERA, seen.select(np.arange(4)))])
     assert found.evidence.near < 1.0
     assert found.evidence.near == share_within(
@@ -367,7 +367,6 @@ def test_a_contradiction_makes_both_answers_less_certain():
     np.testing.assert_allclose(just_agreeing[0], agreeing[0], rtol=1e-9)
 
 
-ROOM = make_room()
 
 
 def together(first, second):
@@ -377,14 +376,14 @@ def together(first, second):
 
 
 def support_of(landmark_map, detections):
-    found = Relocalizer(landmark_map, RelocalizerOptions(matching='class')).relocalize(
+    found = Relocalizer(landmark_map, BY_CLASS).relocalize(
         [Observation(CAMERA, detections)])
     return found.hypotheses[0].support
 
 
 def test_one_thing_under_two_class_names_counts_once():
     """The map has each landmark also under a second class, and the image each box."""
-    seen = see_room(ROOM)
+    seen = SEEN
     renamed = tuple(f'also {name}' for name in ROOM.class_ids)
     both = replace(doubled_room(np.zeros(3)), class_ids=ROOM.class_ids + renamed)
     alone = support_of(ROOM, seen)
@@ -395,7 +394,7 @@ def test_one_thing_under_two_class_names_counts_once():
 
 def test_a_second_box_of_an_explained_thing_is_not_unexplained():
     """Its class is another one in the map; a box elsewhere is unexplained."""
-    seen = see_room(ROOM)
+    seen = SEEN
     again = replace(seen.select(np.arange(1)), class_ids=(ROOM.class_ids[1],))
     elsewhere = replace(again, bboxes_xyxy=np.array([[2.0, 400.0, 60.0, 470.0]]))
     base = support_of(ROOM, seen).unexplained
@@ -451,7 +450,7 @@ def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng, 
     terms, camera = CALIBRATION.group, level(0.3, -1.8, 90.0, 1.2)
 
     def ask(seen):
-        found = Relocalizer(OFFICE, RelocalizerOptions(matching='class')).relocalize(
+        found = Relocalizer(OFFICE, BY_CLASS).relocalize(
             [Observation(CAMERA, seen, up_in_camera=camera[2, :3])])
         likely.append(found.evidence.likely)
         return found.hypotheses[0].support.group, found.accepted

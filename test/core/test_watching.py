@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scene import boxes_of, level, map_of, rigid
+from scene import BY_CLASS, boxes_of, level, map_of, rigid
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.calibration import CALIBRATION
@@ -15,7 +15,6 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.map.visibility import Expected, Missing, expect
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.camera import ImageFaults
 from cliploc_ros.core.watch.look import (
@@ -139,7 +138,7 @@ def moved(pose, x, y, yaw_deg=0.0):
 
 @pytest.fixture
 def watch(room):
-    return Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
+    return Watch(Relocalizer(room, BY_CLASS))
 
 
 def follow(watch, room, poses, wrong=None, first=0, **seen):
@@ -246,7 +245,7 @@ def test_a_jump_in_place_or_in_heading_alone_speaks_against_the_new_pose(change)
 def test_without_odometry_the_watch_learns_more_slowly(room):
     chances = []
     for odom in (True, False):
-        watch = Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
+        watch = Watch(Relocalizer(room, BY_CLASS))
         wrong = moved(np.eye(4), 2.0, 0.5)
         chances.append([report.probability for report in follow(watch, room, drive(12), wrong,
                                                           odom=odom)])
@@ -386,7 +385,7 @@ def test_what_a_detector_finds_now_and_then_is_not_missing_at_once(seen_every, m
 
 
 def test_a_look_counts_what_it_explains_and_what_it_does_not(room):
-    options, pose = RelocalizerOptions(matching='class'), drive(1)[0]
+    options, pose = BY_CLASS, drive(1)[0]
     seen = see(room, pose)
     count, others = len(seen.detections), np.array([[300.0, 5, 310, 15], [400, 5, 410, 15]])
     for known, class_ids in ((2, ('a', 'b')), (1, ('a', 'unknown')), (0, ('other', 'unknown'))):
@@ -405,7 +404,7 @@ def test_a_look_counts_what_it_explains_and_what_it_does_not(room):
 
 
 def test_a_pose_that_is_off_is_aligned_with_what_is_seen(room):
-    options, pose = RelocalizerOptions(matching='class'), drive(1)[0]
+    options, pose = BY_CLASS, drive(1)[0]
     away = measure(align(look_at(room, see(room, pose), options), moved(pose, 0.2, 0.1)))[0]
     assert away.away_m == pytest.approx(np.hypot(0.2, 0.1), abs=0.06)
     pose = drive(5)[4]

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import level, make_layer, make_room, map_of, rigid
+from scene import ROOM, level, make_layer, map_of, rigid
 from scipy.spatial.transform import Rotation
 from walk import CAMERA, join_maps, make_table, moved, see, walk_around
 
@@ -319,7 +319,6 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([CHECK, CHECK_DATA])
 
 
-ROOM = make_room()
 
 
 def layer_at(*poses):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scene import embeddings_of, make_room, unit_rows
+from scene import ROOM, embeddings_of, unit_rows
 
 from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
@@ -89,7 +89,6 @@ def test_each_class_is_encoded_once(clip, caplog):
 
 
 # ---- the rows of a map: labels, images, or both
-ROOM = make_room()
 
 
 @pytest.fixture
