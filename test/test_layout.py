@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ElementTree
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -35,6 +36,7 @@ def prefix_of(module: str) -> str:
     return prefix
 
 
+@cache
 def imported_modules(path: Path) -> set[str]:
     """Return the modules that a file imports, inside functions too."""
     found = set()

@@ -53,27 +53,6 @@ def test_rare_classes_come_first_and_nothing_twice():
     assert both.pairs.tolist() == [[0, 1], [1, 1], [2, 1], [1, 3], [0, 0], [0, 2], [2, 0], [2, 2]]
 
 
-@given(st.lists(st.sampled_from('abc'), min_size=1, max_size=9),
-       st.sets(st.tuples(st.integers(0, 8), st.sampled_from('abcd')), max_size=12),
-       st.lists(st.sampled_from('abcde'), max_size=6), st.integers(0, 20))
-def test_landmarks_of_several_classes_agree_with_their_mask(landmarks, others, detections, limit):
-    others = sorted((row, name) for row, name in others
-                    if row < len(landmarks) and landmarks[row] != name)
-    index = ClassIndex.of(landmarks, others)
-    mask = same_class(tuple(detections), tuple(landmarks))
-    for row, name in others:
-        mask[[detection == name for detection in detections], row] = True
-    classes = index.classes_of(detections)
-    assert (frame_search.class_candidates(index, classes).pairs == np.argwhere(mask)).all()
-    rarest = frame_search.class_candidates(index, classes, 100).pairs
-    assert sorted(rarest.tolist()) == np.argwhere(mask).tolist()
-    assert (frame_search.class_candidates(index, classes, limit).pairs == rarest[:limit]).all()
-    rows, columns = np.indices(mask.shape).reshape(2, -1)
-    assert (index.have(columns, classes[rows]) == mask.ravel()).all()
-    assert (np.diff(index.members[:, 0]) >= 0).all()  # in the map's order
-    assert (index.of_landmarks == index.classes_of(landmarks)).all()
-
-
 def sorted_whole(similarities, k):
     order = np.argsort(-similarities, axis=1, kind='stable')[:, :k]
     return order, np.take_along_axis(similarities, order, axis=1)

@@ -79,9 +79,11 @@ def test_right_depth_makes_poses_better_and_surer():
 
 
 @pytest.mark.parametrize('change', [
-    lambda depths, rng: 1.6 * depths, lambda depths, rng: rng.uniform(0.5, 9.0, len(depths))],
-    ids=['scale', 'random'])
-def test_wrong_depth_does_no_harm(change):
+    lambda depths, rng: 1.6 * depths, lambda depths, rng: rng.uniform(0.5, 9.0, len(depths)),
+    lambda depths, rng: NONE, lambda depths, rng: 0.0 * depths, lambda depths, rng: depths / 0.0],
+    ids=['scale', 'random', 'none', 'zero', 'infinite'])
+@pytest.mark.filterwarnings('ignore:divide by zero')
+def test_wrong_depth_and_none_do_no_harm(change):
     rng = np.random.default_rng(3)
     for _ in range(8):
         one = look(rng)
@@ -92,15 +94,6 @@ def test_wrong_depth_does_no_harm(change):
         np.testing.assert_array_equal(found.map_from_camera, alone.map_from_camera)
         # a mirror image is also judged without depth
         assert found.confidence == alone.confidence
-
-
-@pytest.mark.parametrize('depths', [NONE, np.zeros(len(ROOM)), np.full(len(ROOM), np.inf)])
-def test_no_depth_is_as_no_depth_camera(rng, depths):
-    one = look(rng)
-    alone, found = (RELOCALIZER.relocalize([replace(one, depths=values)])
-                    for values in (None, depths))
-    np.testing.assert_array_equal(found.map_from_camera, alone.map_from_camera)
-    assert (found.confidence, found.depth) == (alone.confidence, None)
 
 
 @pytest.mark.parametrize('given', [{'depths': NONE[1:]},

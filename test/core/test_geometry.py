@@ -64,14 +64,6 @@ def test_beyond_the_fold_of_a_lens_is_nan():
     assert np.isnan(folded.project_normalized(sides)).all(axis=1).tolist() == [True, True, False]
 
 
-def test_boxes_of_the_plane_come_back_as_pixels():
-    boxes = np.array([[100.0, 50.0, 300.0, 250.0], [0.0, 10.0, 20.0, 40.0]])
-    edges = camera('none').normalize_bboxes(boxes)
-    np.testing.assert_allclose(edges[0], [
-        (100 - 318.6) / 400, (50 - 255.3) / 401, (300 - 318.6) / 400, (250 - 255.3) / 401])
-    np.testing.assert_allclose(camera('none').bboxes_in_pixels(edges), boxes, atol=1e-9)
-
-
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'fx': 0.0}, 'positive'), ({'fy': float('nan')}, 'finite'), ({'width': 0}, '0x480'),
     ({'distortion_model': 'mystery', 'distortion': (0.1,)}, "'mystery'"),

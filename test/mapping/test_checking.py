@@ -26,7 +26,6 @@ from cliploc_ros.offline.mapping.check import findings, relocalization
 from cliploc_ros.offline.mapping.check.checking import check_map, give_advice
 from cliploc_ros.offline.mapping.check.report import BY_OBJECTS, Measure, check_keyframes, in_reach
 from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
-from cliploc_ros.offline.mapping.landmarks import Landmarks
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.offline.mapping.systematic import find_corrections
 from cliploc_ros.offline.mapping.triangulation import add_depths
@@ -214,22 +213,6 @@ def test_systematic_errors_are_measured(spoil, name, value, tolerance):
     assert found[name].value == pytest.approx(value, abs=tolerance)
     # a turned mount looks almost like a shifted principal point
     assert found[name].explained > 0.8 * max(result.explained for result in found.values())
-
-
-def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
-    views, witness = witness_of(TABLE, detections)
-    first, *others = relocalization.make_folds(views, witness, QUICK)
-    bare = first._replace(rows=first.rows[:0], landmarks=Landmarks.none())
-    trials = relocalization.try_recording(TABLE, detections, witness.shown, [bare, *others], QUICK,
-                                          lambda share: None)
-    assert len(trials) == 12
-    bare_stamps = detections.stamps_s[bare.frames]
-    of_bare = [trial for trial in trials if trial.stamp_s in bare_stamps]
-    assert of_bare
-    assert {trial.verdict for trial in of_bare} == {'refused'}
-    # the other parts have no information on the map there
-    assert all(trial.is_judged == (trial.stamp_s not in bare_stamps) for trial in trials)
-    assert any(trial.verdict == 'accepted' for trial in trials)
 
 
 def test_a_walk_that_passes_each_object_once_is_judged_by_what_it_can_tell():
