@@ -241,66 +241,50 @@ OWN = re.compile('/(detector|relocalizer|wake_up|diagnostics|clock|parameter_eve
                  'tf(_static)?)(/.*)?$')
 
 
-def relocalization_launch() -> list[ast.stmt]:
-    """Return the statements of the launch file, which cannot be imported without launch_ros."""
-    return ast.parse((LAUNCH / 'relocalization.launch.py').read_text()).body
-
-
-def literals(statements: list[ast.stmt]) -> dict:
-    """Return the literal values that are assigned to names."""
+def literals(name: str) -> dict:
+    """Return the literals assigned in a launch file, which cannot be imported without ROS."""
     return {statement.targets[0].id: ast.literal_eval(statement.value)
-            for statement in statements if isinstance(statement, ast.Assign)}
+            for statement in ast.parse((LAUNCH / name).read_text()).body
+            if isinstance(statement, ast.Assign)}
 
 
-@pytest.fixture
-def constants():
-    return literals(relocalization_launch())
-
-
-@pytest.fixture
-def of_wake_up():
-    """Return the arguments of wake_up.launch.py: defaults and descriptions."""
-    return literals(ast.parse((LAUNCH / 'wake_up.launch.py').read_text()).body)['ARGUMENTS']
-
-
-@pytest.fixture
-def arguments(constants):
-    """Return the names of all launch arguments."""
-    return set().union(*(constants[group] for group in (
-        'NAMES', 'OTHERS', 'DETECTOR_PARAMETERS', 'RELOCALIZER_PARAMETERS')))
+PASSED = literals('relocalization.launch.py')
+#: Arguments of wake_up.launch.py: defaults and descriptions.
+OF_WAKE_UP = literals('wake_up.launch.py')['ARGUMENTS']
 
 
 @pytest.mark.parametrize('node', ['detector', 'relocalizer'])
-def test_arguments_are_parameters(constants, node):
-    passed = constants[f'{node.upper()}_PARAMETERS'].keys()
+def test_arguments_are_parameters(node):
+    passed = PASSED[f'{node.upper()}_PARAMETERS'].keys()
     assert len(passed) > 3
     declared = {row.name for row in NODES[node]} | {'use_sim_time'}
     assert passed <= declared
 
 
-def test_every_topic_and_service_can_be_remapped(constants):
+def test_every_topic_and_service_can_be_remapped():
     """The policy names them all; a test compares it with the graph."""
     relative = {name[1:] for name in names_of_policy() if not OWN.match(name)}
-    assert set(constants['NAMES']) | {'image/compressed', 'depth/compressedDepth'} == relative
+    assert set(PASSED['NAMES']) | {'image/compressed', 'depth/compressedDepth'} == relative
 
 
-def test_a_wake_up_is_launched_with_its_own_options(of_wake_up):
+def test_a_wake_up_is_launched_with_its_own_options():
     text = (LAUNCH / 'wake_up.launch.py').read_text()
     options = make_parser().parse_args([])
     assert set(re.findall(r"'--([a-z-]+)', LaunchConfiguration", text)) - {'log-level'} == {
         name.replace('_', '-') for name in vars(options)}
-    assert of_wake_up['relocalizer'][0] == options.relocalizer
-    assert float(of_wake_up['wake_up_timeout'][0]) == options.timeout
-    assert float(of_wake_up['wake_up_turn_deg'][0]) == options.turn_deg
+    assert OF_WAKE_UP['relocalizer'][0] == options.relocalizer
+    assert float(OF_WAKE_UP['wake_up_timeout'][0]) == options.timeout
+    assert float(OF_WAKE_UP['wake_up_turn_deg'][0]) == options.turn_deg
 
 
-def test_the_documents_give_arguments_that_exist(arguments, of_wake_up):
+def test_the_documents_give_arguments_that_exist():
     given = set()
     for path in (PROJECT / 'README.md', *(PROJECT / 'doc').glob('*.md')):
         # node arguments are written `-p name:=value` and `-r name:=name`
         given |= set(re.findall(r'(?<!-[pr] )\b([a-z]\w*):=', path.read_text()))
     assert len(given) > 10
-    assert given <= arguments | of_wake_up.keys()
+    assert given <= OF_WAKE_UP.keys() | set().union(*(PASSED[group] for group in (
+        'NAMES', 'OTHERS', 'DETECTOR_PARAMETERS', 'RELOCALIZER_PARAMETERS')))
 
 
 def test_nav2_calls_our_service_and_waits_long_enough():

@@ -27,6 +27,7 @@ PROJECT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [PROJECT / 'README.md', *sorted((PROJECT / 'doc').glob('*.md'))]
 LINKING = [*DOCUMENTS, *(PROJECT / name for name in (
     'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md', 'studies/README.md'))]
+POLICY = ElementTree.parse(PROJECT / 'config/security_policy.xml')
 # parameters of every node
 OF_ROS = re.compile('/(clock|rosout|parameter_events|transition_event|get_type_description|'
                     'change_state|get_state|get_available_.*|get_transition_graph|'
@@ -112,8 +113,7 @@ def test_the_messages_that_are_looked_up_exist():
 @pytest.mark.parametrize('node', ['detector', 'relocalizer'])
 def test_the_interface_has_every_topic_and_service_and_no_other(node):
     """The policy has them all; a test compares it with the graph."""
-    policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
-    profile = policy.find(f'.//profile[@node="{node}"]')
+    profile = POLICY.find(f'.//profile[@node="{node}"]')
     used = {entry.text for group in profile for entry in group if not OF_ROS.search(entry.text)}
     section = (PROJECT / 'doc/interface.md').read_text().split(f'\n## {node}\n')[1]
     section = re.split('^##', section, maxsplit=1, flags=re.MULTILINE)[0]
@@ -143,8 +143,7 @@ def test_nav2s_example_is_of_parameters_that_there_are():
 
 
 def published_topics():
-    policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
-    return {topic.text for topic in policy.findall(
+    return {topic.text for topic in POLICY.findall(
         './/profile[@node="relocalizer"]/topics[@publish="ALLOW"]/topic')}
 
 
@@ -157,8 +156,7 @@ def test_foxglove_shows_what_is_published_and_calls_what_is_served():
     shown = {*panels['3D!map']['topics'], panels['Image!debug']['imageMode']['imageTopic'],
              panels['DiagnosticStatusPanel!relocalizer']['topicToRender']}
     assert shown <= published_topics()
-    policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
-    served = {service.text for service in policy.findall('.//services[@reply="ALLOW"]/service')}
+    served = {service.text for service in POLICY.findall('.//services[@reply="ALLOW"]/service')}
     called = {panel['serviceName'] for name, panel in panels.items() if 'CallService' in name}
     assert called <= served
 

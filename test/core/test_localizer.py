@@ -287,7 +287,7 @@ def test_objects_seen_one_after_the_other_are_as_good_as_at_once(landmarks, walk
     assert [match.detection for match in found.matches] == [0, 1]
     assert [match.landmark for match in found.matches] == shares[-1]
     # with a known vertical, two objects suffice to check their camera
-    upright = relocalizer.relocalize([knowing_up(frame, pose)
+    upright = relocalizer.relocalize([replace(frame, up_in_camera=pose[2, :3])
                                       for frame, pose in zip(frames, walk, strict=True)])
     assert (len(found.cameras), len(upright.cameras)) == (2, 4)
 
@@ -307,9 +307,8 @@ def test_the_odometry_of_a_camera_that_looks_into_a_mirror_is_mirrored(room):
 def test_last_frames_without_objects_take_no_confidence(room):
     """The test for mirror images uses earlier frames that show objects."""
     walk = [moved(MAP_FROM_CAMERA, 0.05 * step, 2.0 * step) for step in range(6)]
-    relocalizer = Relocalizer(room, BY_CLASS)
     every, *others = [
-        relocalizer.relocalize([see(room, pose, None if step < shown else [])
+        RELOCALIZER.relocalize([see(room, pose, None if step < shown else [])
                                 for step, pose in enumerate(walk)]).evidence
         for shown in (6, 4, 2)]
     assert every.confidence > 0.99
@@ -330,16 +329,6 @@ def test_the_same_view_again_is_no_more_evidence(refine, room):
         np.testing.assert_allclose(often.cameras[-1].moves, once.cameras[0].moves, atol=0.1)
 
 
-UP = np.array([0.0, 0.0, 1.0])
-
-
-def knowing_up(frame, map_from_camera):
-    return replace(frame, up_in_camera=map_from_camera[:3, :3].T @ UP)
-
-
-def tilt_deg(found):
-    """Return the standard deviation of the tilt in a covariance."""
-    return np.degrees(np.sqrt(np.linalg.eigvalsh(found.covariance[3:5, 3:5]).max()))
 
 
 @pytest.mark.parametrize('deviation_deg', [0.1, 0.5])
@@ -347,9 +336,10 @@ def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room, verif
     """The verticals come from one sensor on one mount, so their error does not average out."""
     relocalizer = Relocalizer(room, replace(BY_CLASS, vertical_deviation_deg=deviation_deg))
     at_once, one_by_one = [[0, 1, 3, 8, 7]], [[0, 1], [3], [8], [7]]
-    one, four = (tilt_deg(relocalizer.relocalize([
-        knowing_up(see(room, MAP_FROM_CAMERA, rows), MAP_FROM_CAMERA) for rows in shares]))
-        for shares in (at_once, one_by_one))
+    tilts = (relocalizer.relocalize([
+        replace(see(room, MAP_FROM_CAMERA, rows), up_in_camera=MAP_FROM_CAMERA[2, :3])
+        for rows in shares]).covariance[3:5, 3:5] for shares in (at_once, one_by_one))
+    one, four = (np.degrees(np.sqrt(np.linalg.eigvalsh(tilt).max())) for tilt in tilts)
     print(f'\ntilt: the same objects in one frame {one:.3f} deg, in four {four:.3f} deg')
     assert 0.95 * deviation_deg < one < 1.05 * deviation_deg, 'the boxes alone give 1.3 degrees'
     # refinement gives four verticals more weight than one, and the boxes less
@@ -358,7 +348,6 @@ def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room, verif
 
 
 def test_bad_odometry_is_named(room, walk):
-    relocalizer = Relocalizer(room, BY_CLASS)
     first, last = see(room, walk[0]), see(room, walk[1])
     scaled, mirrored = first.odom_from_camera.copy(), first.odom_from_camera.copy()
     scaled[:3, :3] *= 1.01
@@ -367,10 +356,10 @@ def test_bad_odometry_is_named(room, walk):
         bad = replace(first, odom_from_camera=odom)
         for number, frames in enumerate(([bad, last], [last, bad]), 1):
             with pytest.raises(OptionsError, match=f'frame {number} of 2 is {named}'):
-                relocalizer.relocalize(frames)
+                RELOCALIZER.relocalize(frames)
     for count in (0, MAX_FRAMES + 1):
         with pytest.raises(OptionsError, match=f'^{count} observations'):
-            relocalizer.relocalize([first] * count)
+            RELOCALIZER.relocalize([first] * count)
 
 
 @pytest.fixture(scope='module')
@@ -402,17 +391,19 @@ def test_a_robot_that_is_carried_is_where_its_newest_image_is(gap_s, office_map,
     assert sum(count > 1 for count in stayed) >= 8, 'frames of a robot that drives are fused'
 
 
+def strangers(frame):
+    """Return the frame with three boxes of mapped classes that show no landmark."""
+    return replace(frame, detections=replace(frame.detections.select(np.arange(3)), bboxes_xyxy=(
+        np.tile([600.0, 0.0, 640.0, 20.0], (3, 1)))))
+
+
 @pytest.mark.parametrize('shown', ['nothing', 'unmapped'])
 def test_earlier_frames_alone_do_not_decide(room, walk, shown):
     """The newest image shows no object, or objects of the map's classes that do not match."""
     frames = [see(room, pose) for pose in walk]
-    rows = [] if shown == 'nothing' else [0, 1, 2]
-    last = see(room, walk[-1], rows)
-    last = replace(last, detections=replace(last.detections, bboxes_xyxy=np.tile(
-        [600.0, 0.0, 640.0, 20.0], (len(rows), 1))))
-    relocalizer = Relocalizer(room, BY_CLASS)
-    assert relocalizer.relocalize(frames).evidence.linked > 0.99
-    found = relocalizer.relocalize([*frames[:-1], last])
+    last = see(room, walk[-1], []) if shown == 'nothing' else strangers(frames[-1])
+    assert RELOCALIZER.relocalize(frames).evidence.linked > 0.99
+    found = RELOCALIZER.relocalize([*frames[:-1], last])
     assert (found.accepted, found.frames, found.refusal_kind) == (False, 4, 'frames_disagree')
 
 
@@ -449,10 +440,8 @@ def test_the_evidence_for_the_weakest_link(shown, stamps_s, met, kept, odds_brok
 def link_of(room, walk, shown, stamps_s=(0, 1, 2, 3), met=(), seen=None):
     frames = []
     for pose, what, stamp_s in zip(walk, shown, stamps_s, strict=True):
-        one = see(room, pose, {'g': None, 'n': [], 'b': [0, 1, 2]}[what])
-        if what == 'b':
-            one = replace(one, detections=replace(one.detections, bboxes_xyxy=np.tile(
-                [600.0, 0.0, 640.0, 20.0], (3, 1))))
+        one = see(room, pose, [] if what == 'n' else None)
+        one = strangers(one) if what == 'b' else one
         frames.append(RELOCALIZER.search(replace(one, stamp_ns=round(1e9 * stamp_s))))
     others = [SimpleNamespace(pose=moved(walk[-1], 3.0, 90.0) if met[1] == 'elsewhere'
                               else walk[-1], odds=NO_POSE + met[0])] if met else []
