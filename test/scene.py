@@ -98,6 +98,12 @@ def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:
     return Detections(boxes_of(room, map_from_camera), room.class_ids, np.full(len(room), 0.9))
 
 
+def with_boxes(seen: Detections, bboxes_xyxy, class_ids) -> Detections:
+    """Return detections with further boxes (m, 4) of some classes."""
+    return Detections(np.concatenate([seen.bboxes_xyxy, bboxes_xyxy]),
+                      (*seen.class_ids, *class_ids), np.full(len(seen) + len(class_ids), 0.9))
+
+
 ROOM = make_room()
 SEEN = see_room(ROOM)
 #: Options with which boxes need no similarities.

@@ -37,8 +37,7 @@ NONE = np.full(len(ROOM), np.nan)
 
 def look(rng, noise_px=4.0):
     """Return noisy boxes of all objects, and their depths."""
-    seen = SEEN
-    seen = replace(seen, bboxes_xyxy=seen.bboxes_xyxy + rng.normal(0.0, noise_px, (len(ROOM), 4)))
+    seen = replace(SEEN, bboxes_xyxy=SEEN.bboxes_xyxy + rng.normal(0.0, noise_px, (len(ROOM), 4)))
     return Observation(CAMERA, seen, depths=simulate_depths(ROOM.centers, ROOM.shapes,
                                                             MAP_FROM_CAMERA, rng))
 

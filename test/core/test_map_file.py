@@ -40,10 +40,9 @@ def read(fields):
 
 
 def test_a_written_map_is_read_back(tmp_path):
-    room = ROOM
     odd = ('yes: "quoted" \\ #1: [\U0001f600]', 'tab\tand\nline', '\x7f', '\\ud83d', 'a\u2028"\\')
-    room = replace(room, labels=(*odd, *room.labels[len(odd):]),
-                   details=(FULL,) + (LandmarkDetails(support=3),) * (len(room) - 1))
+    room = replace(ROOM, labels=(*odd, *ROOM.labels[len(odd):]),
+                   details=(FULL,) + (LandmarkDetails(support=3),) * (len(ROOM) - 1))
     write_map(tmp_path / 'map.yaml', room, ['two\nlines become one'])
     loaded = LandmarkMap.from_file(tmp_path / 'map.yaml')
     assert (loaded.frame_id, loaded.landmark_ids, loaded.labels, loaded.class_ids,

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, SEEN, doubled_room, rigid
+from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, SEEN, doubled_room, rigid, with_boxes
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -20,7 +20,7 @@ from cliploc_ros.core.keyframes.layer import FROM_DEPTH
 from cliploc_ros.core.keyframes.localization import NOTHING_KNOWN
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import find_pose
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import NEVER, Deadline
 from cliploc_ros.core.relocalizer import Relocalizer
 
@@ -125,11 +125,8 @@ def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
 def test_objects_never_take_from_keyframes(fields, mapped):
     """Most objects of a room are never mapped; in this test their boxes fit nowhere."""
     corners = np.array([[x, y] for x in (10.0, 560.0) for y in (10.0, 220.0, 420.0)])
-    strangers = Detections(np.hstack([corners, corners + np.array([25.0, 45.0])]), tuple('abcabc'),
-                           np.full(6, 0.9))
-    boxes = SEEN.select(np.arange(mapped))
-    joined = Detections(np.vstack([boxes.bboxes_xyxy, strangers.bboxes_xyxy]),
-                        boxes.class_ids + strangers.class_ids, np.full(mapped + 6, 0.9))
+    joined = with_boxes(SEEN.select(np.arange(mapped)),
+                        np.hstack([corners, corners + np.array([25.0, 45.0])]), 'abcabc')
     recognizer, relocalizer = Says(place(0.003, **fields)), Relocalizer(ROOM, BY_CLASS)
     alone = ask(recognizer, objects=0)
     found = relocalizer.relocalize([Observation(CAMERA, joined)], recognizer)

@@ -116,8 +116,7 @@ def test_a_confident_wrong_region_accepts_nothing_and_is_named():
 @given(st.lists(st.tuples(st.floats(-5, 9), st.floats(-3, 0)), min_size=1, max_size=5))
 def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
     odds, prior = np.array(contenders).T
-    poses = np.tile(np.eye(4), (len(odds), 1, 1))
-    poses[:, 0, 3] = 5.0 * np.arange(len(odds))
+    poses = np.array([level(5.0 * row) for row in range(len(odds))])
     told = confidences(odds, poses, 2.0, prior=prior)
     alone = [confidences(odds[[row]], poses[[row]], 2.0)[0] for row in range(len(odds))]
     assert (told <= np.array(alone) + 1e-9).all()

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scene as scenes
 import yaml
-from scene import BY_CLASS, CAMERA, ROOM, SEEN, doubled_room, level, map_of, rigid, see_room
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -37,14 +37,17 @@ from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.fit.succession import succeed
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.keyframes.places import RecognizedPlace
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.scene import make_scene
-from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.trials import make_queries
 from studies.acceptance.troubles import exchange_landmarks
+
+
+def at(x=0.0):
+    return scenes.rigid((x, 0.0, 0.0))
+
 
 OPTIONS = RelocalizerOptions()
 SURE = Evidence(inliers=9, likely=0.99)
@@ -125,20 +128,11 @@ def test_a_picture_needs_motion_to_be_told_from_the_place_and_motion_tells():
 
 
 def test_the_confidence_counts_the_published_covariance(verified_camera):
-    seen = SEEN
-    found = Relocalizer(ROOM, BY_CLASS).relocalize(
-        [Observation(CAMERA, seen.select(np.arange(4)))])
+    found = Relocalizer(scenes.ROOM, scenes.BY_CLASS).relocalize(
+        [scenes.observe(scenes.ROOM, rows=range(4))])
     assert found.evidence.near < 1.0
     assert found.evidence.near == share_within(
         RIGHT_M, CALIBRATION.covariance.caution * found.covariance)
-
-
-@pytest.fixture(scope='module')
-def office_queries(shared_data):
-    folder = shared_data / 'tum_fr3_office'
-    landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
-    recorded = load_queries(folder / 'queries.npz', landmark_map.landmark_ids)
-    return landmark_map, make_queries(recorded, landmark_map, True)
 
 
 def mirrored(observation):
@@ -149,13 +143,12 @@ def mirrored(observation):
 
 
 @pytest.mark.parametrize('algorithm', ['auto', 'ransac'])
-def test_the_true_pose_of_a_mirrored_image_is_a_rival(office_queries, algorithm):
+def test_the_true_pose_of_a_mirrored_image_is_a_rival(office_map, queries, algorithm):
     """It is far from all reflections of the wrong pose, which explains five objects or more."""
-    landmark_map, queries = office_queries
-    relocalizer = Relocalizer(landmark_map, replace(OPTIONS, matching='class',
-                                                    algorithm=algorithm))
+    relocalizer = Relocalizer(office_map, replace(scenes.BY_CLASS, algorithm=algorithm))
+    asked = make_queries(queries, office_map, every_frame=True)
     for number in (176, 200):
-        observation = next(query for query in queries if query.number == number).observation
+        observation = next(query for query in asked if query.number == number).observation
         found = relocalizer.relocalize([observation])
         assert found.accepted, found.reason
         assert found.evidence.not_mirrored > 0.95
@@ -184,7 +177,7 @@ WRONG_MOUNT = CALIBRATION.attitude.wrong_mount
 
 def turned(axis, degrees):
     """Return poses (m, 4, 4) of a level camera, turned about one of its axes."""
-    return np.array([level() @ rigid(axis=axis, degrees=angle) for angle in degrees])
+    return np.array([scenes.level() @ scenes.rigid(axis=axis, degrees=angle) for angle in degrees])
 
 
 @pytest.mark.parametrize('axis', ['x', 'z'])
@@ -226,13 +219,10 @@ def test_another_place_is_hardly_ever_accepted(matching, office_map, queries, th
     assert np.mean(accepted) <= thresholds['trust']['accepted_elsewhere'][matching]
 
 
-APART = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10]], dtype=np.float64)
-
-
 @pytest.fixture
 def compared(office_map, queries):
     """Return a frame with three separate boxes and one that nearly repeats the third."""
-    boxes = np.concatenate([APART, [[201.0, 0.0, 210.0, 10.0]]])
+    boxes = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10], [201.0, 0, 210, 10]])
     camera = queries[0].observation.camera
     detections = Detections(boxes, ('chair', *office_map.class_ids[4:5], 'none', 'none'),
                             np.ones(4))
@@ -283,9 +273,7 @@ def test_labels_and_classes_support_a_pose(compared, office_map, queries):
 
 
 def poses_at(*positions):
-    poses = np.tile(np.eye(4), (len(positions), 1, 1))
-    poses[:, 0, 3] = positions
-    return poses
+    return np.array([at(x) for x in positions])
 
 
 STRONG, FORTY = Support(7, 5.0, 10.0, 14.0, 14.0), Setting(40)
@@ -306,29 +294,22 @@ def test_confidence_is_shared_by_poses_that_differ():
 
 def test_poses_that_agree_speak_for_each_other():
     assert share([STRONG, STRONG], poses_at(0, 0.6), FORTY).min() > 0.99
-    turned = poses_at(0, 0.6)
-    turned[1, :3, :3] = Rotation.from_euler('z', 90, degrees=True).as_matrix()
+    turned = np.array([at(), scenes.rigid((0.6, 0.0, 0.0), degrees=90.0)])
     assert share([STRONG, STRONG], turned, FORTY).max() <= 0.5
 
 
 def test_a_large_map_takes_confidence_and_a_known_vertical_gives_some():
     fair = Support(4, 3.0, 8.0, 6.0, 8.0)
-    small, large, level, vague = (share([fair], poses_at(0), setting)[0] for setting in (
+    small, large, upright, vague = (share([fair], poses_at(0), setting)[0] for setting in (
         Setting(20), Setting(2000), Setting(2000, 1.0), Setting(2000, 45.0)))
-    assert large < level < small
+    assert large < upright < small
     assert vague == large
     # a better vertical than in the fit has the same effect as the best one in the fit
     assert (share([fair], poses_at(0), Setting(2000, 0.01))
             == share([fair], poses_at(0), Setting(2000, 0.5)))
 
 
-
-
 OWN = np.diag([0.04, 0.01, 0.02, 0.001, 0.002, 0.003])
-
-
-def at(x=0.0):
-    return rigid((x, 0.0, 0.0))
 
 
 def test_a_better_answer_tells_what_it_knows_better():
@@ -367,65 +348,55 @@ def test_a_contradiction_makes_both_answers_less_certain():
     np.testing.assert_allclose(just_agreeing[0], agreeing[0], rtol=1e-9)
 
 
-
-
-def together(first, second):
-    return Detections(np.concatenate([first.bboxes_xyxy, second.bboxes_xyxy]),
-                      first.class_ids + second.class_ids,
-                      np.concatenate([first.scores, second.scores]))
-
-
 def support_of(landmark_map, detections):
-    found = Relocalizer(landmark_map, BY_CLASS).relocalize(
-        [Observation(CAMERA, detections)])
-    return found.hypotheses[0].support
+    frame = Observation(scenes.CAMERA, detections)
+    return Relocalizer(landmark_map, scenes.BY_CLASS).relocalize([frame]).hypotheses[0].support
 
 
 def test_one_thing_under_two_class_names_counts_once():
     """The map has each landmark also under a second class, and the image each box."""
-    seen = SEEN
-    renamed = tuple(f'also {name}' for name in ROOM.class_ids)
-    both = replace(doubled_room(np.zeros(3)), class_ids=ROOM.class_ids + renamed)
-    alone = support_of(ROOM, seen)
-    twice = support_of(both, together(seen, replace(seen, class_ids=renamed)))
+    renamed = tuple(f'also {name}' for name in scenes.ROOM.class_ids)
+    both = replace(scenes.doubled_room(np.zeros(3)), class_ids=scenes.ROOM.class_ids + renamed)
+    alone = support_of(scenes.ROOM, scenes.SEEN)
+    twice = support_of(both, scenes.with_boxes(scenes.SEEN, scenes.SEEN.bboxes_xyxy, renamed))
     assert (twice.inliers, twice.score) == pytest.approx((alone.inliers, alone.score), abs=0.2)
     assert twice.unlabelled == pytest.approx(alone.unlabelled, abs=0.2)
 
 
 def test_a_second_box_of_an_explained_thing_is_not_unexplained():
     """Its class is another one in the map; a box elsewhere is unexplained."""
-    seen = SEEN
-    again = replace(seen.select(np.arange(1)), class_ids=(ROOM.class_ids[1],))
-    elsewhere = replace(again, bboxes_xyxy=np.array([[2.0, 400.0, 60.0, 470.0]]))
-    base = support_of(ROOM, seen).unexplained
-    assert support_of(ROOM, together(seen, again)).unexplained == pytest.approx(base, abs=0.01)
-    assert support_of(ROOM, together(seen, elsewhere)).unexplained == pytest.approx(base + 1.0)
-    two = together(elsewhere, elsewhere)
-    assert support_of(ROOM, together(seen, two)).unexplained == pytest.approx(base + 1.0)
+    def unexplained(boxes):
+        more = scenes.with_boxes(scenes.SEEN, boxes, scenes.ROOM.class_ids[1:2] * len(boxes))
+        return support_of(scenes.ROOM, more).unexplained
+
+    base, elsewhere = support_of(scenes.ROOM, scenes.SEEN).unexplained, [[2.0, 400.0, 60.0, 470.0]]
+    assert unexplained(scenes.SEEN.bboxes_xyxy[:1]) == pytest.approx(base, abs=0.01)
+    assert unexplained(elsewhere) == pytest.approx(base + 1.0)
+    assert unexplained(elsewhere * 2) == pytest.approx(base + 1.0)
 
 
 def arrangement(off_m):
     """Return things above each other, with every second one off the axis by a distance [m]."""
     rows = np.arange(6)
-    return map_of([f'thing {row}' for row in rows], np.c_[
+    return scenes.map_of([f'thing {row}' for row in rows], np.c_[
         off_m * (rows % 2) * np.array([1, 1, 1, -1, 1, 1]), np.zeros(6), 0.4 * rows],
         (0.12, 0.12, 0.15))
 
 
 def test_a_turn_about_an_axis_that_all_objects_share_is_a_rival():
     """Things on one axis leave the turn about it open; things off the axis determine it."""
-    camera = level(0.0, -2.5, 90.0)
+    camera = scenes.level(0.0, -2.5, 90.0)
     on_axis, spread = arrangement(0.06), arrangement(0.8)
     rows = np.arange(6)
     turned = turned_about_axis(arrangement(0.0), camera, rows)
     away = np.linalg.norm(turned[:, None, :3, 3] - arrangement(0.0).centers, axis=2)
     np.testing.assert_allclose(away, np.tile(away[0], (len(turned), 1)), atol=1e-9)
     assert len(turned) >= 7
-    assert len(turned_about_axis(ROOM, camera, np.arange(12))) == 0
+    assert len(turned_about_axis(scenes.ROOM, camera, np.arange(12))) == 0
     # a camera that is not verified yet also lowers the confidence
     options = RelocalizerOptions(matching='class', min_confidence=0.75)
     found = [Relocalizer(room, options).relocalize(
-        [Observation(CAMERA, see_room(room, camera), up_in_camera=camera[2, :3])])
+        [Observation(scenes.CAMERA, scenes.see_room(room, camera), up_in_camera=camera[2, :3])])
         for room in (on_axis, spread)]
     assert [pose.accepted for pose in found] == [False, True]
     assert found[0].evidence.distinct < 0.8
@@ -435,8 +406,8 @@ def test_a_turn_about_an_axis_that_all_objects_share_is_a_rival():
 def of_things(things):
     """Return a map of things of known class and place, z up."""
     sizes = {'tv': (0.25, 0.05, 0.2), 'keyboard': (0.2, 0.07, 0.02), 'mouse': (0.03, 0.05, 0.02)}
-    return map_of([name for name, *_ in things], [place for _, *place in things],
-                  [sizes.get(name, (0.2, 0.2, 0.3)) for name, *_ in things])
+    return scenes.map_of([name for name, *_ in things], [place for _, *place in things],
+                         [sizes.get(name, (0.2, 0.2, 0.3)) for name, *_ in things])
 
 
 DESK = [('tv', 0.0, 0.3, 1.0), ('tv', 0.6, 0.3, 1.0), ('keyboard', 0.2, -0.1, 0.75),
@@ -447,29 +418,29 @@ OFFICE = of_things([*DESK, ('cup', 0.4, 0.0, 0.75), ('chair', 0.3, 1.6, 0.4),
 
 def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng, monkeypatch):
     """An image may show a desk that the map lacks; its things stand 5 to 10 cm otherwise."""
-    terms, camera = CALIBRATION.group, level(0.3, -1.8, 90.0, 1.2)
+    terms, camera = CALIBRATION.group, scenes.level(0.3, -1.8, 90.0, 1.2)
 
     def ask(seen):
-        found = Relocalizer(OFFICE, BY_CLASS).relocalize(
-            [Observation(CAMERA, seen, up_in_camera=camera[2, :3])])
+        found = Relocalizer(OFFICE, scenes.BY_CLASS).relocalize(
+            [Observation(scenes.CAMERA, seen, up_in_camera=camera[2, :3])])
         likely.append(found.evidence.likely)
         return found.hypotheses[0].support.group, found.accepted
 
     likely = []
-    room = see_room(OFFICE, camera)
+    room = scenes.see_room(OFFICE, camera)
     assert ask(room.select(np.arange(4))) == (pytest.approx(terms.unmapped), True)
     assert ask(room.select(np.arange(5))) == (0.0, True), 'more than four'
     assert ask(room.select(np.array([0, 2, 3, 6]))) == (0.0, True), 'the rest of the room'
     turns, off_m = rng.uniform(0.0, 2.0 * np.pi, (20, 4)), rng.uniform(0.05, 0.1, (20, 4))
     shifts = np.stack([off_m * np.cos(turns), off_m * np.sin(turns), 0.0 * turns], axis=2)
     desk = of_things(DESK)
-    groups = [ask(see_room(replace(desk, centers=desk.centers + shift), camera))[0]
+    groups = [ask(scenes.see_room(replace(desk, centers=desk.centers + shift), camera))[0]
               for shift in shifts]
     assert min(groups) >= terms.unmapped and np.sum(np.array(groups) > 1.0) >= 3
     most = CALIBRATION.keyframes.most_objects
     assert objects_utility(Support(99.0)) == objects_utility(Support(most))
     monkeypatch.setattr(confidence, '_of_group', lambda *_: 0.0)
-    assert ask(see_room(replace(desk, centers=desk.centers + shifts[-1]), camera))[0] == 0.0
+    assert ask(scenes.see_room(replace(desk, centers=desk.centers + shifts[-1]), camera))[0] == 0.0
     assert likely[-2] < likely[-1] < 0.9999
 
 
@@ -478,7 +449,7 @@ def test_a_turn_about_a_table_that_takes_chairs_to_chairs_is_a_rival(table):
     """The axis is the table's, or the middle of the chairs; a turn by 45 degrees fits no chair."""
     room = of_things([*table, *(('chair', x, y, 0.4) for x, y in (
         (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)))])
-    camera = level(0.0, -3.0, 90.0, 1.4)
+    camera = scenes.level(0.0, -3.0, 90.0, 1.4)
     turned = turned_about_axis(room, camera, np.arange(len(room)))
     np.testing.assert_allclose(turned[:3, :3, 3], [[3, 0, 1.4], [0, 3, 1.4], [-3, 0, 1.4]],
                                atol=1e-9)
