@@ -251,59 +251,43 @@ def test_derivatives_of_a_box_are_those_of_small_steps():
 
 
 # ---- maps of a real office, compared with the limits in test/thresholds.yaml
-@pytest.fixture(scope='module')
-def office(shared_data) -> Path:
-    return shared_data / 'tum_fr3_office'
+REQUIRED = yaml.safe_load((Path(__file__).parents[1] / 'thresholds.yaml').read_text())['mapping']
 
 
 @pytest.fixture(scope='module')
-def observations(office):
-    return load_observations(office / 'observations.npz')
+def office(shared_data):
+    """Return the observations of the office, and their splits."""
+    folder = shared_data / 'tum_fr3_office'
+    return (load_observations(folder / 'observations.npz'),
+            json.loads((folder / 'splits.json').read_text()))
 
 
 @pytest.fixture(scope='module')
-def splits(office) -> dict:
-    return json.loads((office / 'splits.json').read_text())
-
-
-@pytest.fixture(scope='module')
-def even(observations, splits):
-    return observations.select_frames(splits['even']['map'])
-
-
-@pytest.fixture(scope='module')
-def even_map(even):
-    return build_map(even).landmark_map
-
-
-@pytest.fixture(scope='session')
-def required() -> dict:
-    path = Path(__file__).parents[1] / 'thresholds.yaml'
-    return yaml.safe_load(path.read_text())['mapping']
-
-
-def held_out(observations, split, landmark_map):
-    frames = sorted({frame for _, _, frame in split['queries']})
-    views = make_views(observations.select_frames(frames))
-    quality = explained_boxes(views, landmarks_of_map(landmark_map, observations.class_names))
-    return quality.explained, quality.median_iou
+def even(office):
+    """Return the mapped frames of the even split, and their map."""
+    observations, splits = office
+    frames = observations.select_frames(splits['even']['map'])
+    return frames, build_map(frames).landmark_map
 
 
 @pytest.mark.parametrize('name', ['even', *(pytest.param(name, marks=pytest.mark.full)
                                            for name in ('block0', 'block1'))])
-def test_other_frames_are_explained(observations, splits, even_map, required, name):
-    built = even_map if name == 'even' else build_map(
-        observations.select_frames(splits[name]['map'])).landmark_map
-    explained, iou = held_out(observations, splits[name], built)
-    print(f'{name}: {len(built)} landmarks, explained {explained:.3f}, median IoU {iou:.3f}')
-    assert explained >= required[name]['explained']
-    assert iou >= required[name]['median_iou']
+def test_other_frames_are_explained(office, even, name):
+    observations, split = office[0], office[1][name]
+    built = even[1] if name == 'even' else build_map(
+        observations.select_frames(split['map'])).landmark_map
+    views = make_views(observations.select_frames(sorted({row[2] for row in split['queries']})))
+    held_out = explained_boxes(views, landmarks_of_map(built, observations.class_names))
+    print(f'{name}: {len(built)} landmarks, explained {held_out.explained:.3f}, median IoU '
+          f'{held_out.median_iou:.3f}')
+    assert held_out.explained >= REQUIRED[name]['explained']
+    assert held_out.median_iou >= REQUIRED[name]['median_iou']
 
 
 @pytest.mark.full
-def test_joint_refinement_makes_up_for_slow_pose_errors(even, even_map, required):
-    given = PoseErrors(0.05, 1.0, 3.0)
-    noisy = walk.disturb(even, walk.draw_errors(even.stamps_s, given, seed=0))
+def test_joint_refinement_makes_up_for_slow_pose_errors(even):
+    (frames, even_map), given = even, PoseErrors(0.05, 1.0, 3.0)
+    noisy = walk.disturb(frames, walk.draw_errors(frames.stamps_s, given, seed=0))
 
     def median_offset(built):
         """Return the distances of landmarks to those of true poses [m]."""
@@ -313,12 +297,12 @@ def test_joint_refinement_makes_up_for_slow_pose_errors(even, even_map, required
     joint = build_map(noisy, MappingOptions(pose_errors=given))
     print(f'plain: {len(plain.landmark_map)} landmarks, off by {median_offset(plain):.3f} m; '
           f'joint: {len(joint.landmark_map)}, off by {median_offset(joint):.3f} m')
-    assert median_offset(joint) <= required['joint_share'] * median_offset(plain)
+    assert median_offset(joint) <= REQUIRED['joint_share'] * median_offset(plain)
     assert len(joint.landmark_map) < len(plain.landmark_map)
 
 
 @pytest.mark.full
-def test_poses_of_motion_capture_are_left_alone(even, even_map):
-    built = build_map(even, MappingOptions(estimate_pose_errors=True))
+def test_poses_of_motion_capture_are_left_alone(even):
+    built = build_map(even[0], MappingOptions(estimate_pose_errors=True))
     assert built.report.pose_change_m == 0.0
-    assert (built.landmark_map.centers == even_map.centers).all()
+    assert (built.landmark_map.centers == even[1].centers).all()

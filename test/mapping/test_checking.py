@@ -316,12 +316,8 @@ def test_reach_is_near_and_in_the_same_direction(x, degrees, reached):
     assert in_reach(layer_at(level()), here[None, :3, 3], here[None, :3, 2]) == [reached]
 
 
-@pytest.fixture(scope='module')
-def room_report():
-    return check_map(ROOM, options=CheckOptions(max_positions=6, headings=4))
-
-
-def test_places_without_a_keyframe_are_counted_and_named(room_report):
+def test_places_without_a_keyframe_are_counted_and_named():
+    room_report = check_map(ROOM, options=CheckOptions(max_positions=6, headings=4))
     grid = room_report.grid
     everywhere = layer_at(*(make_transform(level(0.0, 0.0, angle)[:3, :3], place)
                             for place in grid.positions for angle in range(0, 360, 30)))

@@ -371,20 +371,17 @@ def update(folder, *options):
 
 @pytest.fixture(scope='module')
 def updated(tmp_path_factory):
-    """Return the folder of a map that was updated in place."""
+    """Return the folder of a map that was updated in place, and the report."""
     folder = tmp_path_factory.mktemp('changed')
     for name in ('map.yaml', 'map.embeddings.npz'):
         shutil.copyfile(ROOM / name, folder / name)
     assert update(folder) == 0
-    return folder
+    return folder, json.loads((folder / 'report.json').read_text())
 
 
-@pytest.fixture(scope='module')
-def report(updated):
-    return json.loads((updated / 'report.json').read_text())
+def test_all_nine_changes_are_reported_and_nothing_else(updated):
+    _, report = updated
 
-
-def test_all_nine_changes_are_reported_and_nothing_else(report):
     def names(kind):
         return {entry['landmark_id'] for entry in report[kind]}
 
@@ -399,9 +396,9 @@ def test_all_nine_changes_are_reported_and_nothing_else(report):
     assert all(entry['rivals'] == [] and entry['distance_m'] > 1.0 for entry in report['moved'])
 
 
-def test_the_map_holds_what_is_there_now(updated, report):
-    old, new = LandmarkMap.from_file(ROOM / 'map.yaml'), LandmarkMap.from_file(
-        updated / 'map.yaml')
+def test_the_map_holds_what_is_there_now(updated):
+    folder, report = updated
+    old, new = (LandmarkMap.from_file(where / 'map.yaml') for where in (ROOM, folder))
     kept = [name for name in old.landmark_ids if name not in CHANGES['removed']]
     assert new.landmark_ids[:len(kept)] == tuple(kept)
     # pairs have swapped places
@@ -418,9 +415,10 @@ def test_the_map_holds_what_is_there_now(updated, report):
     assert {entry['landmark_id'] for entry in report['new']} == set(new.landmark_ids[len(kept):])
 
 
-def test_new_landmarks_have_phrases_and_all_have_embeddings(updated, report):
-    new = LandmarkMap.from_file(updated / 'map.yaml')
-    embeddings = load_embeddings_of_map(updated / 'map.yaml', new.landmark_ids)
+def test_new_landmarks_have_phrases_and_all_have_embeddings(updated):
+    folder, report = updated
+    new = LandmarkMap.from_file(folder / 'map.yaml')
+    embeddings = load_embeddings_of_map(folder / 'map.yaml', new.landmark_ids)
     assert embeddings.is_known.all()
     old = load_embeddings_of_map(ROOM / 'map.yaml', new.landmark_ids)
     kept = old.is_known
