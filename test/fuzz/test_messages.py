@@ -116,15 +116,11 @@ def stamped(msg, nanoseconds):
 
 
 @pytest.fixture(scope='module')
-def values(tmp_path_factory):
+def loaded(tmp_path_factory):
     path = tmp_path_factory.mktemp('fuzz') / 'room.yaml'
     write_map(make_room(), path)
-    return RelocalizerParameters(map_file=str(path), matching='class')
-
-
-@pytest.fixture(scope='module')
-def localizer(values):
-    return load_localizer(None, values)  # a map from a file needs no node
+    values = RelocalizerParameters(map_file=str(path), matching='class')
+    return load_localizer(None, values), values  # a map from a file needs no node
 
 
 def localize(localizer, values, image, info, found):
@@ -139,13 +135,13 @@ def localize(localizer, values, image, info, found):
 
 @given(images() | compressed_images(), infos(), detections())
 @CASES
-def test_images_raw_and_compressed(localizer, values, image, info, found):
-    result = localize(localizer, values, image, info, found)
+def test_images_raw_and_compressed(loaded, image, info, found):
+    result = localize(*loaded, image, info, found)
     assert result is None or not result.accepted
 
 
 @given(likely_detections())
 @CASES
-def test_likely_boxes(localizer, values, found):
-    result = localize(localizer, values, sound_image(), sound_info(), found)
+def test_likely_boxes(loaded, found):
+    result = localize(*loaded, sound_image(), sound_info(), found)
     assert result is not None and not result.accepted

@@ -193,6 +193,7 @@ def test_ultralytics_stays_off_network_home_and_pip(weights, tmp_path):
     assert [*temporary.glob('cliploc_ros*')] == []
 
 
+NOISE_RGB = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
 THREE = protocols.prompts_of_names('mug, office chair, potted plant')
 
 
@@ -205,11 +206,6 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.fixture(scope='session')
-def noise_rgb():
-    return np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
-
-
 def options_of(folder, model='world.pt', prompts=THREE, **changes) -> protocols.DetectorOptions:
     return protocols.DetectorOptions(**{
         'model': str(folder / model), 'conf': 0.0, 'imgsz': 320, 'prompts': prompts,
@@ -217,7 +213,7 @@ def options_of(folder, model='world.pt', prompts=THREE, **changes) -> protocols.
 
 
 @pytest.mark.parametrize('name', ['world.pt', 'yoloe.pt'])
-def test_it_detects_the_texts_as_ultralytics_does(folder, noise_rgb, name):
+def test_it_detects_the_texts_as_ultralytics_does(folder, name):
     exported = load_detector(options_of(folder, name, iou=1.0))
     model = load_yolo(folder / name)
     texts = [text for text, _ in THREE]
@@ -230,8 +226,8 @@ def test_it_detects_the_texts_as_ultralytics_does(folder, noise_rgb, name):
         else:
             model.model.get_text_pe = lambda *_, **__: rows  # its own tower is another package
             model.set_classes(texts)
-    found = exported.detect(noise_rgb)
-    rows, classes = by_ultralytics(model, noise_rgb, conf=0.0, imgsz=320, iou=1.0)
+    found = exported.detect(NOISE_RGB)
+    rows, classes = by_ultralytics(model, NOISE_RGB, conf=0.0, imgsz=320, iou=1.0)
     # random weights give nearly equal scores: rounding decides the order, and which box is dropped
     equal = (np.abs(found.bboxes_xyxy[:50, None] - rows[:, :4]).max(axis=2) < 0.5) & (
         np.array(found.class_ids[:50])[:, None] == classes) & (
@@ -240,11 +236,11 @@ def test_it_detects_the_texts_as_ultralytics_does(folder, noise_rgb, name):
     assert equal.any(axis=1).mean() > 0.7
 
 
-def test_two_texts_of_a_class_find_an_object_once(folder, noise_rgb):
+def test_two_texts_of_a_class_find_an_object_once(folder):
     apart = load_detector(options_of(folder, prompts=(('mug', 'mug'), ('red', 'red'))))
     joined = load_detector(options_of(folder, prompts=(('mug', 'mug'), ('red', 'mug'))))
     assert joined.class_names == ('mug',)
-    both, once = apart.detect(noise_rgb), joined.detect(noise_rgb)
+    both, once = apart.detect(NOISE_RGB), joined.detect(NOISE_RGB)
     assert set(both.class_ids) == {'mug', 'red'} and set(once.class_ids) == {'mug'}
     overlaps = box_iou(*(torch.from_numpy(one.bboxes_xyxy) for one in (both, once))).numpy()
     assert (overlaps.max(axis=1) > 0.7).all(), 'each is represented'
