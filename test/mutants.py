@@ -189,8 +189,7 @@ def _changes(node: ast.AST, parent: ast.AST, field: str  # noqa: C901
 
 def _with(node: ast.AST, **fields: Any) -> ast.AST:
     changed = copy.copy(node)
-    for name, value in fields.items():
-        setattr(changed, name, value)
+    vars(changed).update(fields)
     return changed
 
 

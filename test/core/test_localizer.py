@@ -15,9 +15,10 @@ from cliploc_ros.core.acceptance.confidence import Setting, none_right
 from cliploc_ros.core.acceptance.contenders import join_frames
 from cliploc_ros.core.acceptance.depth_check import DepthCheck
 from cliploc_ros.core.acceptance.links import weakest_link
-from cliploc_ros.core.acceptance.looks import Look, Looks
+from cliploc_ros.core.acceptance.looks import EarlierLook, Look, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence
 from cliploc_ros.core.calibration import CALIBRATION
+from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import SIFT
@@ -347,6 +348,14 @@ def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room, verif
     assert four >= 0.95 * one
 
 
+def test_the_deviations_of_odometry_grow_with_the_way_and_the_turn():
+    assert not odometry_deviations(np.eye(4)).any(), 'did not move'
+    for degrees, metres in ((10.0, 0.0), (10.0, 0.5)):
+        deviations = odometry_deviations(pose(degrees, metres))
+        assert deviations[:3] == pytest.approx(0.005 + 0.03 * metres)
+        assert deviations[3:] == pytest.approx(np.radians(0.25 + 0.03 * degrees + 0.15 * metres))
+
+
 def test_bad_odometry_is_named(room, walk):
     first, last = see(room, walk[0]), see(room, walk[1])
     scaled, mirrored = first.odom_from_camera.copy(), first.odom_from_camera.copy()
@@ -448,16 +457,10 @@ def link_of(room, walk, shown, stamps_s=(0, 1, 2, 3), met=(), seen=None):
     return weakest_link(join_frames(room, BY_CLASS, frames), walk[-1], seen, lambda _: others)
 
 
-def test_any_link_may_be_broken(room, walk):
-    """The first frame contradicts the others, and the last one shows nothing."""
-    found = link_of(room, walk, 'bggn')
-    assert found.kept == 3 and found.holds < found.chance
-    assert found.chance == link_of(room, walk, 'gggn').chance
-
-
-def test_keyframes_and_inexact_odometry_hold_a_link(room, walk):
+def test_any_link_may_be_broken_and_keyframes_and_inexact_odometry_hold_it(room, walk):
+    last, first = (link_of(room, walk, shown) for shown in ('gggn', 'bggn'))
+    assert last.holds < 0.8 and first.kept == 3 and first.holds < first.chance == last.chance
     place = RecognizedPlace(walk[-1], np.eye(6) * 1e-4, np.eye(6) * 1e-4, 200, 0.9, 0.9)
-    assert link_of(room, walk, 'gggn').holds < 0.8
     assert link_of(room, walk, 'gggn', seen=Recognition((place,))).holds > 0.99
     first, last = see(room, walk[0]), see(room, walk[1])
     last = replace(last, odom_from_camera=last.odom_from_camera @ moved(np.eye(4), 0.2, 0.0))
@@ -482,6 +485,14 @@ def test_frames_before_a_carry_are_dropped(room, walk):
         given = session.covariance_for_filter(found)
     assert found.frames == 1
     np.testing.assert_array_equal(given, found.covariance, 'a filter starts again')
+
+
+@pytest.mark.parametrize(('doubted', 'same_view', 'looks'), [
+    (0.95, 1.0, 1.0), (0.0, 1.0, 2.0), (0.5, 1.0, 2.0), (0.0, 0.25, 1.25), (0.0, 0.0, 1.0)])
+def test_the_same_view_again_is_judged_by_its_mean_evidence(doubted, same_view, looks):
+    """A look that is not sure is no evidence; another view does not count."""
+    found = Evidence(5, 0.95, earlier=(EarlierLook(1.0, doubted, same_view),))
+    assert found.confidence_of_view == pytest.approx(1.0 / (1.0 + 19.0 ** (-1.0 / looks)))
 
 
 @pytest.mark.parametrize(('degrees', 'metres', 'same'), [

@@ -215,6 +215,16 @@ def test_a_standing_robot_learns_little_from_more_of_the_same():
     assert 0.05 < belief.probability < 0.5
 
 
+@pytest.mark.parametrize(('odom', 'odds', 'time_s', 'away'), [
+    (np.eye(4), 3.0, 0, 0.0), (np.eye(4), -3.0, 0, 6.0 / TERMS.most),
+    (None, 3.0, 5, 5.0 / TERMS.correlated_s)])
+def test_looks_share_errors_unless_they_disagree_or_time_passes(odom, odds, time_s, away):
+    belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=odom)
+    assert belief.add(seen, 3.0, is_full=True) == 1.0
+    weight = belief.add(replace(seen, stamp_ns=time_s * NS_PER_S), odds, is_full=True)
+    assert weight == pytest.approx(1.0 - TERMS.correlated * np.exp(-away))
+
+
 @pytest.mark.parametrize(('way_m', 'time_s'), [(100.0, 0), (0.0, 100), (50.0, 200)])
 def test_the_way_and_the_time_make_a_sure_watch_unsure(way_m, time_s):
     belief, after = Belief(), moved(np.eye(4), way_m, 0.0)

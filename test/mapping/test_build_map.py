@@ -299,10 +299,3 @@ def test_joint_refinement_makes_up_for_slow_pose_errors(even):
           f'joint: {len(joint.landmark_map)}, off by {median_offset(joint):.3f} m')
     assert median_offset(joint) <= REQUIRED['joint_share'] * median_offset(plain)
     assert len(joint.landmark_map) < len(plain.landmark_map)
-
-
-@pytest.mark.full
-def test_poses_of_motion_capture_are_left_alone(even):
-    built = build_map(even[0], MappingOptions(estimate_pose_errors=True))
-    assert built.report.pose_change_m == 0.0
-    assert (built.landmark_map.centers == even[1].centers).all()

@@ -98,7 +98,6 @@ def test_no_restart_is_seen_in_a_drive_without_any(shared_data, bag, rate_hz):
     (wrong_sensors.scaled_boxes, 0.5, (50.0, 100.0, 150.0, 120.0)),
     (wrong_sensors.shifted_boxes, 0.05, (132.0, 200.0, 332.0, 240.0)),
     (wrong_sensors.turned_boxes, 90.0, (240.0, 100.0, 280.0, 300.0)),
-    (wrong_sensors.mirrored_boxes, 0.0, (340.0, 200.0, 540.0, 240.0)),
     (wrong_sensors.mirrored_boxes, 1.0, (100.0, 240.0, 300.0, 280.0)),
     (wrong_sensors.of_convention, 0.0, (200.0, 220.0, 200.0, 40.0)),
     (wrong_sensors.of_convention, 2.0, (0.15625, 5 / 12, 0.46875, 0.5)),
