@@ -138,11 +138,6 @@ def test_nav2s_example_is_of_parameters_that_there_are():
     RelocalizerParameters(**values).check()
 
 
-def published_topics():
-    return {topic.text for topic in POLICY.findall(
-        './/profile[@node="relocalizer"]/topics[@publish="ALLOW"]/topic')}
-
-
 def test_foxglove_shows_what_is_published_and_calls_what_is_served():
     tree = json.loads((PROJECT / 'config/foxglove.json').read_text())
     panels = tree['configById']
@@ -151,7 +146,8 @@ def test_foxglove_shows_what_is_published_and_calls_what_is_served():
             'landmarks', 'matches', 'hypotheses', 'pose'))}
     shown = {*panels['3D!map']['topics'], panels['Image!debug']['imageMode']['imageTopic'],
              panels['DiagnosticStatusPanel!relocalizer']['topicToRender']}
-    assert shown <= published_topics()
+    assert shown <= {topic.text for topic in POLICY.findall(
+        './/profile[@node="relocalizer"]/topics[@publish="ALLOW"]/topic')}
     served = {service.text for service in POLICY.findall('.//services[@reply="ALLOW"]/service')}
     called = {panel['serviceName'] for name, panel in panels.items() if 'CallService' in name}
     assert called <= served

@@ -68,11 +68,13 @@ def test_bf_stops_when_its_time_is_over_and_says_so(room, observation):
     assert result.reason.startswith('search stopped')
 
 
-def test_missing_or_misshaped_similarities_are_named(room, observation):
+def test_missing_or_misshaped_similarities_and_a_large_k_are_named(room, observation):
     relocalizer = Relocalizer(room, RelocalizerOptions())
     for similarities in (None, observation.similarities[:, :3]):
         with pytest.raises(OptionsError, match=r'shape \(12, 12\)'):
             relocalizer.relocalize([replace(observation, similarities=similarities)])
+    with pytest.raises(OptionsError, match='k = 13'):
+        Relocalizer(room, RelocalizerOptions(k=13))
 
 
 def test_boxes_turned_inside_out_are_left_out(room, observation):
@@ -82,11 +84,6 @@ def test_boxes_turned_inside_out_are_left_out(room, observation):
         observation, detections=replace(observation.detections, bboxes_xyxy=boxes))])
     assert result.accepted
     assert sorted(match.detection for match in result.matches) == list(range(3, 12))
-
-
-def test_k_larger_than_the_map_is_refused(room):
-    with pytest.raises(OptionsError, match='k = 13'):
-        Relocalizer(room, RelocalizerOptions(k=13))
 
 
 @pytest.mark.parametrize('change', [

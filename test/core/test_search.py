@@ -53,6 +53,19 @@ def test_ransac_draws_all_candidates_alike():
     assert np.abs(counts - 9_000).max() < 400
 
 
+def test_the_range_holds_every_distance(rng):
+    for _ in range(200):
+        a, b = rng.uniform(1, 10, 2)
+        cosine = rng.uniform(0.3, 1.0)
+        low, high = strategies._distance_range(a, b, cosine)
+        u, v = np.meshgrid(*(np.linspace(strategies.NEAREST, strategies.FARTHEST, 60) * depth
+                             for depth in (a, b)))
+        distances = np.sqrt(np.maximum(0, u**2 + v**2 - 2 * u * v * cosine))
+        assert low <= distances.min() + 1e-9
+        assert high == pytest.approx(distances.max())
+        assert low == pytest.approx(distances.min(), abs=0.05 * max(a, b))
+
+
 def test_all_that_is_within_reach_is_found(room, rng):
     """With landmarks along a corridor, the sweep skips only samples that no distance allows."""
     seen = see_room(room)

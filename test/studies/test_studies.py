@@ -123,8 +123,8 @@ def test_the_table_counts_each_request_once(capsys):
 
 
 @pytest.fixture(scope='module')
-def asked(tmp_path_factory):
-    """Run the study on the demo's room and images without poses; return folder and output."""
+def outcomes(tmp_path_factory):
+    """Run the study on the demo's room and images without poses; return the outcomes."""
     folder = tmp_path_factory.mktemp('rooms')
     shutil.copytree(ASSETS / 'sequence', folder / 'demo')
     (folder / 'elsewhere' / 'images').mkdir(parents=True)
@@ -138,11 +138,10 @@ def asked(tmp_path_factory):
          ASSETS / 'yolo.onnx', '--kinds', 'in turn', 'phone to robot', '--images', '3',
          '--elsewhere', '2', '--out', folder / 'out'], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    return folder / 'out', done.stdout
+    return json.loads((folder / 'out/outcomes.json').read_text())
 
 
-def test_images_between_the_mapped_ones_are_found(asked):
-    outcomes = json.loads((asked[0] / 'outcomes.json').read_text())
+def test_images_between_the_mapped_ones_are_found(outcomes):
     for way, least in (('objects', 0.4), ('both', 0.75)):  # half of the images are mapped
         errors = [outcome['error_m'] for outcome in outcomes
                   if outcome['way'] == way and outcome['known'] == '-'
@@ -154,8 +153,7 @@ def test_images_between_the_mapped_ones_are_found(asked):
     assert np.mean(np.array(robot) < 0.5) > 0.5
 
 
-def test_nothing_is_accepted_elsewhere(asked):
-    outcomes = json.loads((asked[0] / 'outcomes.json').read_text())
+def test_nothing_is_accepted_elsewhere(outcomes):
     elsewhere = [outcome for outcome in outcomes if outcome['asked'] == 'elsewhere']
     assert len(elsewhere) == 4 * 2 * 3  # parts, images, ways
     assert not any(outcome['accepted'] for outcome in elsewhere)
