@@ -264,7 +264,7 @@ def test_what_was_never_detected_is_never_simulated(detections):
     false = moved(TABLE, {4: TABLE.centers[4] + (0.0, 0.0, 1.0)})
     views, witness = witness_of(false, detections)
     model = relocalization.measure_detector(false, detections, views, witness)
-    assert all(4 not in model.in_level(pose)[0] for pose in detections.map_from_camera)
+    assert all(4 not in model.in_view(pose)[0] for pose in detections.map_from_camera)
 
 
 @pytest.mark.parametrize(('table', 'named'), [
