@@ -3,19 +3,13 @@
 """A simulated robot with four cameras among objects."""
 
 import numpy as np
-from scene import CAMERA, boxes_of, make_room
+from scene import CAMERA, boxes_of, make_room, rigid
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 
 NAMES = ('front', 'left', 'back', 'right')
-
-
-def turned(row):
-    return make_transform(Rotation.from_euler('y', 90.0 * row, degrees=True).as_matrix(),
-                          np.zeros(3))
 
 
 def make_surroundings():
@@ -23,7 +17,7 @@ def make_surroundings():
     room, rng = make_room(), np.random.default_rng(11)
     centers, quats = [], []
     for row in range(4):
-        turn = Rotation.from_matrix(turned(row)[:3, :3])
+        turn = Rotation.from_euler('y', 90.0 * row, degrees=True)
         centers.append(turn.apply(room.centers + rng.normal(0.0, 0.6, room.centers.shape)))
         quats.append((turn * Rotation.from_quat(room.quats_xyzw)).as_quat())
     ids = tuple(f'{name}_{landmark_id}' for name in NAMES for landmark_id in room.landmark_ids)
@@ -32,8 +26,7 @@ def make_surroundings():
 
 
 MAP = make_surroundings()
-MOUNTS = [make_transform(turned(row)[:3, :3], turned(row)[:3, :3] @ [0.0, 0.0, 0.15])
-          for row in range(4)]
+MOUNTS = [rigid(axis='y', degrees=90.0 * row) @ rigid((0.0, 0.0, 0.15)) for row in range(4)]
 
 
 def look(rng, map_from_robot=None, objects=3, stamp_ns=0, mounts=MOUNTS, noise_px=1.0):

@@ -72,12 +72,7 @@ class Mutant(NamedTuple):
     what: str
     lines: range  #: Lines of its statement; a test that runs one of them runs it
     names: tuple[str, ...]  #: Names that the statement defines, if it runs on import
-    is_compiled: bool  #: Whether numba compiles it
-
-    @property
-    def kernels(self) -> str:
-        """Return the kind of kernels that its tests run with."""
-        return 'plain' if self.is_compiled else 'compiled'
+    kernels: str  #: Its tests run with 'plain' kernels if numba compiles it, else 'compiled'
 
 
 # ---- faults -------------------------------------------------------------------------------------
@@ -103,10 +98,10 @@ class _Site(NamedTuple):
             names = (one.name,) if isinstance(one, ast.FunctionDef) else tuple(
                 node.id for node in ast.walk(one)
                 if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
-        return Mutant(
-            file, number, self.what, range(one.lineno, max(one.lineno, last) + 1), names,
-            around is not None and any(isinstance(each, ast.Name) and each.id == 'compiled'
-                                       for each in around.decorator_list))
+        is_compiled = around is not None and any(
+            isinstance(each, ast.Name) and each.id == 'compiled' for each in around.decorator_list)
+        return Mutant(file, number, self.what, range(one.lineno, max(one.lineno, last) + 1), names,
+                      'plain' if is_compiled else 'compiled')
 
 
 def _sites_of(file: str) -> tuple[ast.Module, list[_Site]]:
@@ -194,8 +189,7 @@ def _changes(node: ast.AST, parent: ast.AST, field: str  # noqa: C901
 
 def _with(node: ast.AST, **fields: Any) -> ast.AST:
     changed = copy.copy(node)
-    for name, value in fields.items():
-        setattr(changed, name, value)
+    vars(changed).update(fields)
     return changed
 
 
@@ -314,6 +308,7 @@ class Tests:
         self._lines = coverage.CoverageData(str(file.with_suffix('.coverage')))
         self._lines.read()
         self._by_file = cache(self._lines.contexts_by_lineno)
+        self._kernels, self._is_sound = kernels, dict[str, bool]()
 
     def of(self, mutant: Mutant) -> list[str]:
         """Return the tests that can detect a fault, fast ones first, within the time limit."""
@@ -339,10 +334,10 @@ class Tests:
         """Return the time of a test."""
         return self._tests[name][0]
 
-    def killer(self, fault: str, names: Sequence[str], kernels: str) -> str:
+    def killer(self, fault: str, names: Sequence[str]) -> str:
         """Return the first test that fails with a fault, 'time' or an exit code; '' if none."""
         environment = os.environ | {
-            _FAULT: fault, _KERNELS: kernels, 'PYTHONPATH': os.pathsep.join(
+            _FAULT: fault, _KERNELS: self._kernels, 'PYTHONPATH': os.pathsep.join(
                 [str(Path(__file__).parent), os.environ.get('PYTHONPATH', '')])}
         with tempfile.TemporaryDirectory(prefix='mutant-', ignore_cleanup_errors=True) as folder:
             process = subprocess.Popen(
@@ -363,6 +358,18 @@ class Tests:
             return f'exit code {process.returncode}'
         return failed[1] if failed else ''
 
+    def outcome(self, mutant: Mutant) -> tuple[Mutant, int, str]:
+        """Return a fault, the number of tests that could detect it, and the test that did."""
+        names = [name for name in self.of(mutant) if self._is_sound.get(name, True)]
+        while names:
+            killer = self.killer(f'{mutant.file}:{mutant.number}', names)
+            if killer in names and killer not in self._is_sound:
+                self._is_sound[killer] = not self.killer('', [killer])
+            if self._is_sound.get(killer, True):
+                return mutant, len(names), killer
+            names.remove(killer)
+        return mutant, 0, ''
+
 
 @cache
 def _sources() -> Mapping[str, list[str]]:
@@ -370,34 +377,11 @@ def _sources() -> Mapping[str, list[str]]:
             for path in sorted((PROJECT / PACKAGE).rglob('*.py'))}
 
 
-class Judge:
-    """Tries faults."""
-
-    def __init__(self) -> None:
-        self._tests = {kernels: Tests(kernels) for kernels in ('compiled', 'plain')}
-        self._is_sound: dict[str, bool] = {}
-
-    def outcome(self, mutant: Mutant) -> tuple[Mutant, int, str]:
-        """Return a fault, the number of tests that could detect it, and the test that did."""
-        tests = self._tests[mutant.kernels]
-        names = [name for name in tests.of(mutant) if self._is_sound.get(name, True)]
-        while names:
-            killer = tests.killer(f'{mutant.file}:{mutant.number}', names, mutant.kernels)
-            if killer in names and killer not in self._is_sound:
-                self._is_sound[killer] = not tests.killer('', [killer], mutant.kernels)
-            if self._is_sound.get(killer, True):
-                return mutant, len(names), killer
-            names.remove(killer)
-        return mutant, 0, ''
-
-
 def report(outcomes: Sequence[tuple[Mutant, int, str]]) -> str:
     """Return a table by folder, and the faults that no test detected."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for mutant, tests, killer in outcomes:
-        folder = str(Path(mutant.file).parent.relative_to(PACKAGE))
-        for row in {folder, f'{folder.split("/")[0]}, all', 'all',
-                    'kernels' if mutant.is_compiled else 'Python'}:
+        for row in str(Path(mutant.file).parent.relative_to(PACKAGE)), mutant.kernels, 'all':
             counts[row]['killed' if killer else 'survived' if tests else 'not run'] += 1
     text = f'{"folder":28}{"killed":>8}{"survived":>10}{"not run":>9}{"share":>7}\n'
     for row, its in sorted(counts.items()):
@@ -413,9 +397,9 @@ def run(arguments: argparse.Namespace) -> None:
     """Plant faults, and print the table."""
     mutants = [one for one in draw(arguments.folders, arguments.count, arguments.seed)
                if arguments.only in f'{one.file}:{one.lines[0]}']
-    start = time.monotonic()
+    start, tests = time.monotonic(), {kernels: Tests(kernels) for kernels in ('compiled', 'plain')}
     with ThreadPoolExecutor(arguments.workers) as pool:
-        text = report(list(pool.map(Judge().outcome, mutants)))
+        text = report(list(pool.map(lambda one: tests[one.kernels].outcome(one), mutants)))
     text += f'\n{len(mutants)} faults in {time.monotonic() - start:.0f} s'
     (RECORDS / 'report.txt').write_text(text)
     print(text)

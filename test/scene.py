@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import (
@@ -13,12 +14,18 @@ from cliploc_ros.core.geometry.ellipsoid import (
     ellipses_in_pixels,
     project_ellipsoids,
 )
-from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    transform_from_pose,
+)
 from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, nearest_words, save_layer
 from cliploc_ros.core.map import map_file
+from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections
+from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.offline.recording.keyframe_layer import learn_words
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
@@ -30,6 +37,27 @@ MAP_FROM_CAMERA = transform_from_pose(np.array([0.3, -0.2, -0.5]),
 def unit_rows(rows):
     """Return the rows (n, d), each divided by its length."""
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def rigid(position=(0.0, 0.0, 0.0), axis='z', degrees=0.0):
+    """Return a transform (4, 4): a turn about an axis, then a shift [m]."""
+    return make_transform(Rotation.from_euler(axis, degrees, degrees=True).as_matrix(),
+                          np.array(position, dtype=float))
+
+
+def level(x=0.0, y=0.0, yaw_deg=0.0, z=1.0):
+    """Return the pose of a level camera; with yaw 0 it looks along the x axis."""
+    axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    return rigid((x, y, z), degrees=yaw_deg) @ make_transform(axes, np.zeros(3))
+
+
+def map_of(class_ids, centers, semi_axes=0.2) -> LandmarkMap:
+    """Return a map of upright objects; ids are thing_0, thing_1, ..., labels the classes."""
+    count = len(centers)
+    return LandmarkMap(
+        'map', tuple(f'thing_{row}' for row in range(count)), tuple(class_ids), tuple(class_ids),
+        np.array(centers, dtype=float), np.array(np.broadcast_to(semi_axes, (count, 3))),
+        np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
 
 
 def make_room() -> LandmarkMap:
@@ -46,13 +74,16 @@ def make_room() -> LandmarkMap:
 
 def doubled_room(offset) -> LandmarkMap:
     """Return the room and a copy of it at an offset (3,) [m]."""
-    room = make_room()
-    return replace(room, landmark_ids=(*room.landmark_ids, *(f'{landmark_id}_2' for landmark_id in
-                                                            room.landmark_ids)),
-                   labels=room.labels * 2, class_ids=room.class_ids * 2,
-                   centers=np.concatenate([room.centers, room.centers + offset]),
-                   semi_axes=np.tile(room.semi_axes, (2, 1)),
-                   quats_xyzw=np.tile(room.quats_xyzw, (2, 1)))
+    return ROOM.with_more(replace(ROOM, centers=ROOM.centers + offset, landmark_ids=tuple(
+        f'{landmark_id}_2' for landmark_id in ROOM.landmark_ids)))
+
+
+def with_others(landmark_map: LandmarkMap, count: int) -> LandmarkMap:
+    """Return the map with landmarks of another class far away, count in all."""
+    count -= len(landmark_map)
+    others = map_of(['far'] * count, np.random.default_rng(5).uniform(60, 90, (count, 3)))
+    return landmark_map.with_more(replace(others, landmark_ids=tuple(
+        f'far_{row}' for row in range(count))))
 
 
 def boxes_of(landmarks: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, camera=CAMERA):
@@ -65,6 +96,26 @@ def boxes_of(landmarks: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, camera=CAM
 def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:
     """Return a perfect observation of the room, one box for each landmark in order."""
     return Detections(boxes_of(room, map_from_camera), room.class_ids, np.full(len(room), 0.9))
+
+
+def with_boxes(seen: Detections, bboxes_xyxy, class_ids) -> Detections:
+    """Return detections with further boxes (m, 4) of some classes."""
+    return Detections(np.concatenate([seen.bboxes_xyxy, bboxes_xyxy]),
+                      (*seen.class_ids, *class_ids), np.full(len(seen) + len(class_ids), 0.9))
+
+
+ROOM = make_room()
+SEEN = see_room(ROOM)
+#: Options with which boxes need no similarities.
+BY_CLASS = RelocalizerOptions(matching='class')
+
+
+def observe(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, rows=None, **known
+            ) -> Observation:
+    """Return a perfect observation of some landmarks, in the order of their rows."""
+    seen = see_room(room, map_from_camera)
+    rows = np.arange(len(room)) if rows is None else np.array(rows, dtype=np.int64)
+    return Observation(CAMERA, seen.select(rows), **known)
 
 
 def depth_image(room: LandmarkMap, map_from_camera, bboxes_xyxy):
@@ -81,6 +132,12 @@ def depth_image(room: LandmarkMap, map_from_camera, bboxes_xyxy):
     for depth_m, left, top, right, bottom in sorted(seen, reverse=True):
         depths_m[top:bottom, left:right] = depth_m
     return depths_m
+
+
+def embeddings_of(landmark_ids, means, key='key') -> LandmarkEmbeddings:
+    """Return image embeddings (L, d) of landmarks, without medoids."""
+    return LandmarkEmbeddings(key, tuple(landmark_ids), means.astype(np.float16), np.empty(
+        (0, means.shape[1]), np.float16), np.zeros(len(means) + 1, np.int64))
 
 
 def make_layer(room: LandmarkMap, keyframes=6, points=40) -> KeyframeLayer:

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The programs accept every command in the documents; the cheap ones are run."""
+"""The programs accept every command in the documents, and the nodes what launch files pass."""
 
 import argparse
+import ast
 import importlib
 import re
 import runpy
@@ -11,23 +12,21 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from textwrap import dedent
+from typing import NamedTuple
 
 import pytest
 import yaml
 
+from cliploc_ros.cli.wake_up import make_parser
 from cliploc_ros.command import split_ros_args
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 PROJECT = Path(__file__).resolve().parents[1]
 PAGES = [PROJECT / 'README.md', PROJECT / 'CONTRIBUTING.md', PROJECT / 'SECURITY.md',
          PROJECT / 'studies/README.md', *sorted((PROJECT / 'doc').glob('*.md'))]
-# Programs of other packages, and keywords of the shell. An unlisted program fails the test.
-FOREIGN = {'bloom-release', 'cd', 'cp', 'dask', 'docker', 'done', 'export', 'git', 'grep', 'pip',
-           'rosdep', 'rosdoc2', 'rsync', 'rviz2', 'sleep', 'source', 'sudo', 'touch'}
 _BEGINS_SHELL = re.compile(r'(ros2|script/|python3? -|install/lib/cliploc_ros/|cliploc_\w+ |'
                            r'source |pip |sudo |\w+=\$|until |rviz2 |(evaluate|build_map) -)')
 _FENCE = re.compile(r'^```(\w*)\n(.*?)^```$', re.MULTILINE | re.DOTALL)
@@ -40,23 +39,15 @@ pytestmark = pytest.mark.full
 NODES = {'detector': DetectorParameters.rows(), 'relocalizer': RelocalizerParameters.rows()}
 EXECUTABLES = {path.stem for path in (PROJECT / 'cliploc_ros/cli').glob('*.py')
                if 'def make_parser' in path.read_text()}
-# These need a robot, a person, or a sourced ROS; only their arguments are checked.
-OF_ROS = {'bag', 'pkg', 'security', 'topic'}
-OTHER_PACKAGES = {'robot_localization', 'tf2_ros'}
 OF_STUDIES = ('studies.speed.',)
 MODULES = re.compile(r'(cliploc_ros|demo|studies)\.')
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """A program with its arguments, and the page that contains it."""
 
     page: str
     words: tuple[str, ...]
-
-    def __str__(self) -> str:
-        """Return the command as a line, for the name of a test."""
-        return f'{self.page}: {shlex.join(self.words)}'
 
 
 def commands() -> list[Command]:
@@ -109,32 +100,22 @@ def inline_commands() -> list[Command]:
     return list(dict.fromkeys(found))
 
 
-class _CaughtError(Exception):
-    """Raised with the parser that a program uses for its command line."""
-
-    def __init__(self, parser):
-        super().__init__()
-        self.parser = parser
-
-
 @cache
 def parser_of(module: str) -> argparse.ArgumentParser:
     """Return the parser of a program, by its module."""
     if module.startswith(('cliploc_ros.cli.', 'demo.__', 'studies.reproduce')):
         return importlib.import_module(module).make_parser()
 
-    def caught(parser, *_):
-        raise _CaughtError(parser)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(argparse.ArgumentParser, 'parse_args', caught)
+    found: list[argparse.ArgumentParser] = []
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(argparse.ArgumentParser, 'parse_args',
+                      lambda parser, *_: sys.exit(found.append(parser)))
         patch.setattr(sys, 'argv', [module])
-        with pytest.raises(_CaughtError) as found:
-            if module.startswith(OF_STUDIES):
-                importlib.import_module(module).run([])
-            else:
-                runpy.run_module(module, run_name='__main__')
-    return found.value.parser
+        if module.startswith(OF_STUDIES):
+            importlib.import_module(module).run([])
+        else:
+            runpy.run_module(module, run_name='__main__')
+    return found[0]
 
 
 def program_of(command: Command) -> tuple[str, list[str]]:
@@ -176,10 +157,6 @@ def test_a_command_is_accepted(command, capsys):
             pytest.fail(capsys.readouterr().err)
     elif command.words[0] == 'ros2':
         check_ros2(command.words[1:])
-    elif command.words[0].startswith('script/'):
-        check_script(*command.words)
-    else:
-        assert command.words[0] in FOREIGN | {'python', 'python3'}
 
 
 def check_node(node: str, ros_args: list[str]) -> None:
@@ -199,10 +176,15 @@ def check_node(node: str, ros_args: list[str]) -> None:
 
 
 @cache
-def names_of_interface() -> set[str]:
-    """Return topics and services, absolute and relative; a test compares them with the graph."""
+def names_of_policy() -> set[str]:
+    """Return the names of topics and services; a test compares them with the graph."""
     policy = ElementTree.parse(PROJECT / 'config/security_policy.xml')
-    names = {entry.text for entry in policy.iter() if entry.tag in ('topic', 'service')}
+    return {entry.text or '' for entry in policy.iter() if entry.tag in ('topic', 'service')}
+
+
+def names_of_interface() -> set[str]:
+    """Return topics and services, absolute and relative."""
+    names = names_of_policy()
     return names | {name.removeprefix('/') for name in names} | {'image/compressed'}
 
 
@@ -212,7 +194,7 @@ def check_ros2(words: tuple[str, ...]) -> None:
     if verb == 'launch':
         package, file, *_ = rest
         assert package == 'cliploc_ros'
-        assert (PROJECT / 'launch' / file).is_file()  # test/test_launch.py checks the arguments
+        assert (PROJECT / 'launch' / file).is_file()  # the arguments are checked below
     elif verb == 'service':
         assert rest[0] == 'call'
         assert rest[1] in names_of_interface()
@@ -221,15 +203,6 @@ def check_ros2(words: tuple[str, ...]) -> None:
         row = {row.name: row for row in NODES[node.removeprefix('/')]}[name]
         assert len(value) == {'get': 0, 'set': 1}[action]
         assert not value or row.validated(yaml.safe_load(value[0])) is not None
-    else:
-        assert verb in OF_ROS or (verb == 'run' and rest[0] in OTHER_PACKAGES), verb
-
-
-def check_script(script: str, *arguments: str) -> None:
-    """Check a script, and the tests that script/test would run."""
-    assert (PROJECT / script).is_file()
-    for word in arguments:
-        assert not word.startswith('test/') or (PROJECT / word).exists(), word
 
 
 @AS_MAIN
@@ -259,3 +232,92 @@ def test_pages_have_commands():
     """Otherwise a change of the pages' layout could hide all of them from these tests."""
     pages = {command.page for command in commands()}
     assert {'README.md', 'install.md', 'nav2.md', 'your_robot.md', 'SECURITY.md'} <= pages
+
+
+# ---- launch files pass on only existing arguments, and produce their descriptions
+LAUNCH = PROJECT / 'launch'
+# names in the private namespaces of both nodes, and ROS's names at the root
+OWN = re.compile('/(detector|relocalizer|wake_up|diagnostics|clock|parameter_events|rosout|'
+                 'tf(_static)?)(/.*)?$')
+
+
+def literals(name: str) -> dict:
+    """Return the literals assigned in a launch file, which cannot be imported without ROS."""
+    return {statement.targets[0].id: ast.literal_eval(statement.value)
+            for statement in ast.parse((LAUNCH / name).read_text()).body
+            if isinstance(statement, ast.Assign)}
+
+
+PASSED = literals('relocalization.launch.py')
+#: Arguments of wake_up.launch.py: defaults and descriptions.
+OF_WAKE_UP = literals('wake_up.launch.py')['ARGUMENTS']
+
+
+@pytest.mark.parametrize('node', ['detector', 'relocalizer'])
+def test_arguments_are_parameters(node):
+    passed = PASSED[f'{node.upper()}_PARAMETERS'].keys()
+    assert len(passed) > 3
+    declared = {row.name for row in NODES[node]} | {'use_sim_time'}
+    assert passed <= declared
+
+
+def test_every_topic_and_service_can_be_remapped():
+    """The policy names them all; a test compares it with the graph."""
+    relative = {name[1:] for name in names_of_policy() if not OWN.match(name)}
+    assert set(PASSED['NAMES']) | {'image/compressed', 'depth/compressedDepth'} == relative
+
+
+def test_a_wake_up_is_launched_with_its_own_options():
+    text = (LAUNCH / 'wake_up.launch.py').read_text()
+    options = make_parser().parse_args([])
+    assert set(re.findall(r"'--([a-z-]+)', LaunchConfiguration", text)) - {'log-level'} == {
+        name.replace('_', '-') for name in vars(options)}
+    assert OF_WAKE_UP['relocalizer'][0] == options.relocalizer
+    assert float(OF_WAKE_UP['wake_up_timeout'][0]) == options.timeout
+    assert float(OF_WAKE_UP['wake_up_turn_deg'][0]) == options.turn_deg
+
+
+def test_the_documents_give_arguments_that_exist():
+    given = set()
+    for path in (PROJECT / 'README.md', *(PROJECT / 'doc').glob('*.md')):
+        # node arguments are written `-p name:=value` and `-r name:=name`
+        given |= set(re.findall(r'(?<!-[pr] )\b([a-z]\w*):=', path.read_text()))
+    assert len(given) > 10
+    assert given <= OF_WAKE_UP.keys() | set().union(*(PASSED[group] for group in (
+        'NAMES', 'OTHERS', 'DETECTOR_PARAMETERS', 'RELOCALIZER_PARAMETERS')))
+
+
+def test_nav2_calls_our_service_and_waits_long_enough():
+    text = (PROJECT / 'doc/nav2.md').read_text()
+    tree = re.search(r'    <Parallel.*</Parallel>', text, re.DOTALL).group()
+    call = ElementTree.fromstring(tree).find('ReinitializeGlobalLocalization')
+    (name,) = set(re.findall(r'reinitialize_global_localization:=(\w+)', text))
+    assert call.get('service_name') == name != 'reinitialize_global_localization'
+    timeout_s = RelocalizerParameters().timeout_s
+    assert int(call.get('server_timeout')) > 1000 * (timeout_s + 2.0)
+
+
+def made(name: str, **given: str) -> list:
+    """Return the nodes that a launch file makes."""
+    from launch import LaunchContext
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+    description = runpy.run_path(str(LAUNCH / name))['generate_launch_description']()
+    context, nodes = LaunchContext(), []
+    context.launch_configurations.update(given)
+    for entity in description.entities:
+        if isinstance(entity, DeclareLaunchArgument | OpaqueFunction):
+            nodes += entity.visit(context) or []
+    return nodes
+
+
+@pytest.mark.needs('launch_ros')
+@pytest.mark.parametrize(('name', 'nodes'), [
+    ('relocalization.launch.py', 2), ('wake_up.launch.py', 0)])
+def test_descriptions_are_made(name, nodes):
+    assert len(made(name)) == nodes
+
+
+@pytest.mark.needs('launch_ros')
+def test_a_missing_parameter_file_stops_the_launch(tmp_path):
+    with pytest.raises(RuntimeError, match='no such file'):
+        made('relocalization.launch.py', parameters=str(tmp_path / 'robot.yaml'))

@@ -5,30 +5,23 @@
 from dataclasses import replace
 
 import numpy as np
-from scene import CAMERA, make_room
+from scene import CAMERA, ROOM, embeddings_of
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
-from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.offline.datasets.map_recording import MapRecording
 from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
-
-ROOM = make_room()
 
 
 def made_map(number):
     """Return a map whose files all contain its number, by which the room is also moved."""
     landmark_map = replace(ROOM, centers=ROOM.centers + np.array([0.01, 0.0, 0.0]) * number)
-    count = len(ROOM)
-    row = np.zeros((1, 8), dtype=np.float16)
-    row[0, number % 8] = 1.0
+    means = np.tile(np.eye(8)[number % 8], (len(ROOM), 1))
     layer = KeyframeLayer(
         'map', ROOM.landmark_ids, landmark_map.centers.astype(np.float32), (CAMERA,),
         np.tile(np.eye(4), (1, 1, 1)), np.array([0, 5]), np.zeros((5, 2), np.uint16),
         np.full((5, 3), number, dtype=np.float32), np.zeros((5, 128), np.uint8),
         np.zeros(5, np.uint16), np.ones((1, 128), np.uint8))
-    return MadeMap(landmark_map, None, LandmarkEmbeddings(
-        'key', ROOM.landmark_ids, np.repeat(row, count, axis=0), np.empty((0, 8), np.float16),
-        np.zeros(count + 1, dtype=np.int64)), layer)
+    return MadeMap(landmark_map, None, embeddings_of(ROOM.landmark_ids, means), layer)
 
 
 def write_set(path, number):

@@ -73,29 +73,6 @@ def sample_pose(scene: Scene, sample: NDArray[np.int64]) -> tuple[Pose | None, f
     return best, best_total
 
 
-def score(scene: Scene, potential: NDArray[np.bool_], pose: Pose
-          ) -> tuple[float, NDArray[np.int64]]:
-    """Return the score of a pose, and the landmark (n,) of each detection or -1.
-
-    Parameters
-    ----------
-    scene : Scene
-    potential : ndarray (n, L) of bool
-        Which landmarks each detection may show.
-    pose : Pose
-    """
-    outlines = outlines_of(scene, np.arange(len(scene.centers)), pose)
-    total, landmarks = 0.0, np.full(len(potential), -1)
-    for detection, mask in enumerate(potential):
-        best = scene.iou_threshold
-        for landmark in np.nonzero(mask)[0]:
-            iou = pair_iou(scene, detection, outlines[landmark])
-            if iou > best:  # always false for NaN
-                best, landmarks[detection] = iou, landmark
-        total += best if landmarks[detection] >= 0 else 0.0
-    return total, landmarks
-
-
 def outlines_of(scene: Scene, landmarks: NDArray[np.int64], pose: Pose) -> NDArray[np.float64]:
     """Return the outlines (m, 5) of landmarks (m,); NaN for those not wholly in front."""
     return project_ellipsoids(make_transform(*pose), scene.centers[landmarks],

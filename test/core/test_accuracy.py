@@ -9,14 +9,9 @@ import pytest
 from scipy.stats import chi2
 
 from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.offline.evaluation import trials
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.offline.evaluation.summary import summarize
-from cliploc_ros.offline.evaluation.trials import (
-    make_queries,
-    run_trial,
-    with_neighbours,
-    with_vertical,
-)
 
 pytestmark = pytest.mark.full
 
@@ -30,7 +25,7 @@ def judge(office_map):
     """Return the results of queries by seed, and the share within their 95 % ellipsoids."""
     def run(options, *queries):
         results = [result for trial, its in enumerate(queries)
-                   for result in run_trial(office_map, Method('auto', options), trial, its)]
+                   for result in trials.run_trial(office_map, Method('auto', options), trial, its)]
         found, = summarize(results)
         within = float(np.mean([result.nees < chi2.ppf(0.95, 6) for result in results
                                 if result.accepted and result.error_m < 1.0]))
@@ -45,7 +40,7 @@ def test_accepted_poses_are_right_and_their_covariances_true(iterations, office_
                                                              judge, thresholds):
     limits = thresholds['trust'][iterations]
     found, within = judge(replace(OPTIONS, iterations=iterations),
-                          make_queries(queries, office_map, every_frame=True))
+                          trials.make_queries(queries, office_map, every_frame=True))
     assert found.precision() >= limits['precision']
     assert found.recall() >= limits['recall']
     low, high = limits['within_95']
@@ -55,10 +50,11 @@ def test_accepted_poses_are_right_and_their_covariances_true(iterations, office_
 @pytest.mark.parametrize('case', ['nothing', 'height', 'vertical_0_deg', 'vertical_1_deg',
                                   'vertical_3_deg'])
 def test_success_with_what_is_known(case, office_map, queries, judge, thresholds):
-    least, asked = thresholds['known'][case], [make_queries(queries, office_map)]
+    least, asked = thresholds['known'][case], [trials.make_queries(queries, office_map)]
     if case.startswith('vertical'):
         error_deg = float(case.split('_')[1])
-        asked = [with_vertical(asked[0], error_deg, seed) for seed in range(3 if error_deg else 1)]
+        asked = [trials.with_vertical(asked[0], error_deg, seed)
+                 for seed in range(3 if error_deg else 1)]
     found, _ = judge(OPTIONS if case == 'nothing' else HEIGHTS, *asked)
     assert all(found.success(limit) >= one
                for limit, one in zip(LIMITS_M, least['success'], strict=True))
@@ -69,10 +65,11 @@ def test_success_with_what_is_known(case, office_map, queries, judge, thresholds
 @pytest.mark.parametrize('case', ['nothing', 'vertical_1_deg'])
 def test_five_frames_joined_by_odometry(case, office_map, queries, judge, thresholds):
     """The 52 queries have neighbours; a step has noise of 1 cm and 0.5 degrees on each axis."""
-    least, frames = thresholds['fused'][case], make_queries(queries, office_map, every_frame=True)
+    least = thresholds['fused'][case]
+    frames = trials.make_queries(queries, office_map, every_frame=True)
     if case != 'nothing':
-        frames = with_vertical(frames, 1.0, 0)
-    frames = with_neighbours(frames, [frame.group for frame in queries], 0.01, 0.5, 0)
+        frames = trials.with_vertical(frames, 1.0, 0)
+    frames = trials.with_neighbours(frames, [frame.group for frame in queries], 0.01, 0.5, 0)
     asked = [frame for frame in frames if queries[frame.number].is_main]
     found, within = judge(OPTIONS if case == 'nothing' else HEIGHTS, asked)
     assert all(found.success(limit) >= one

@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps, their embeddings and several maps in one: reading, writing and refusing."""
 
-import os
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room, unit_rows
+from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, see_room, unit_rows
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.joined_map import MAX_MAPS, join_maps, parts_of, place_of
@@ -41,10 +40,9 @@ def read(fields):
 
 
 def test_a_written_map_is_read_back(tmp_path):
-    room = make_room()
     odd = ('yes: "quoted" \\ #1: [\U0001f600]', 'tab\tand\nline', '\x7f', '\\ud83d', 'a\u2028"\\')
-    room = replace(room, labels=(*odd, *room.labels[len(odd):]),
-                   details=(FULL,) + (LandmarkDetails(support=3),) * (len(room) - 1))
+    room = replace(ROOM, labels=(*odd, *ROOM.labels[len(odd):]),
+                   details=(FULL,) + (LandmarkDetails(support=3),) * (len(ROOM) - 1))
     write_map(tmp_path / 'map.yaml', room, ['two\nlines become one'])
     loaded = LandmarkMap.from_file(tmp_path / 'map.yaml')
     assert (loaded.frame_id, loaded.landmark_ids, loaded.labels, loaded.class_ids,
@@ -56,7 +54,7 @@ def test_a_written_map_is_read_back(tmp_path):
 
 
 def test_image_embeddings_belong_to_one_map(tmp_path):
-    path, room = tmp_path / 'map.yaml', make_room()
+    path, room = tmp_path / 'map.yaml', ROOM
     rows = np.eye(12, 16, dtype=np.float16)
     seen = LandmarkEmbeddings('key', room.landmark_ids, rows, rows, np.arange(13))
     write_map(path, room, embeddings=seen)
@@ -74,7 +72,6 @@ def test_labels_may_stand_in_place_of_a_label():
     assert landmark_map.labels == ('a red cup',)
     assert landmark_map.details[0].labels == (('a mug', 0.25), ('a red cup', 0.75))
     rows = [{'text': 'a mug', 'weight': 0.25}, {'text': 'a red cup', 'weight': 0.75}]
-    assert read(CUP | {'labels': rows, 'label': 'mine'}).labels == ('mine',)
     assert read(CUP | {'labels': rows}).details == landmark_map.details
     assert read(CUP | {'labels': rows, 'label': 'mine'}).weighted_labels == (
         (('mine', 0.75), ('a mug', 0.25), ('a red cup', 0.75)),)
@@ -102,30 +99,22 @@ def write(tmp_path, content):
     return path
 
 
-def test_reads_every_field(tmp_path):
-    others = {'/x': {'ros__parameters': {'k': 3}}, 'y': 1}
-    loaded = LandmarkMap.from_file(write(tmp_path, others | file_of({'cup_1': WITH_LABEL})))
-    assert (loaded.frame_id, loaded.landmark_ids, loaded.labels, loaded.class_ids) == (
-        'map', ('cup_1',), ('a red cup',), ('cup',))
-    assert loaded.centers.tolist() == [[1.0, 2.0, 3.0]]
-    assert loaded.semi_axes.tolist() == [[0.1, 0.2, 0.3]]
-    assert loaded.shapes[0] == pytest.approx([0.01, 0, 0, 0.04, 0, 0.09])
-
-
 def test_a_nearly_unit_quaternion_is_normalized(tmp_path):
     tilted = WITH_LABEL | {'orientation': [0.0, 0.0, 0.7071, 0.7071]}
-    loaded = LandmarkMap.from_file(write(tmp_path, file_of({'cup_1': tilted})))
+    others = {'/x': {'ros__parameters': {'k': 3}}, 'y': 1}
+    loaded = LandmarkMap.from_file(write(tmp_path, others | file_of({'cup_1': tilted})))
+    assert loaded.centers.tolist() == [[1.0, 2.0, 3.0]]
+    assert loaded.semi_axes.tolist() == [[0.1, 0.2, 0.3]]
     assert np.linalg.norm(loaded.quats_xyzw) == pytest.approx(1.0, abs=1e-12)
     assert loaded.shapes[0] == pytest.approx([0.04, 0, 0, 0.01, 0, 0.09])
 
 
 @pytest.mark.parametrize(('change', 'message'), [
     ({'center': [float('nan'), 0.0, 0.0]}, 'center: .*finite'),
-    ({'center': [1e300, 0.0, 0.0]}, 'center: .*beyond'), ({'center': [0.0, 0.0]}, 'center: .*3'),
+    ({'center': [1e300, 0.0, 0.0]}, 'center: .*beyond'),
     ({'center': [True, 0.0, 0.0]}, 'center: .*3'), ({'semi_axes': [0.1, -1.0, 0.1]}, 'semi_axes'),
     ({'orientation': [0.0] * 4}, 'orientation: .*0'), ({'class_id': None}, 'class_id'),
     ({'colour': 'red'}, '.*colour'),
-    ({'labels': []}, 'labels: is empty'),
     ({'labels': {'text': ['a'], 'weight': [1.0, 2.0]}}, 'labels: .*equal length'),
     ({'labels': [{'text': 'a', 'weight': 0.0}]}, 'labels: .*above 0'),
     ({'class_weights': ['cup']}, 'class_weights'), ({'seen_ratio': -0.5}, 'seen_ratio: -0.5'),
@@ -140,7 +129,6 @@ def test_bad_fields_are_named_with_file_and_landmark(change, message):
     ('a: &x [1]\nb: *x\n', 'an alias'), ('a: 1\na: 2\n', "'a' is repeated"),
     ('[' * 1_000_000, 'nest'),
     (b'\x7fELF\xff\xfe\x00', 'not a text file'),
-    ('/**:\n  ros__parameters:\n    map:\n', 'frame_id, landmarks'),
     (file_of(None), 'the map is empty'), (file_of({'a.b': WITH_LABEL}), 'without dots'),
     (file_of({'a': {'centre': 0, **WITH_LABEL}}), "mean 'center'"),
     (file_of({'a': WITH_LABEL}) | {'/x': {'ros__parameters': {'map': {}}}}, 'more than one map'),
@@ -148,14 +136,6 @@ def test_bad_fields_are_named_with_file_and_landmark(change, message):
 def test_broken_and_hostile_files_are_refused(tmp_path, content, message):
     with pytest.raises(MapError, match=message):
         LandmarkMap.from_file(write(tmp_path, content))
-
-
-def test_what_has_no_end_is_not_read(tmp_path):
-    pipe = tmp_path / 'pipe'
-    os.mkfifo(pipe)
-    for path in ('/dev/zero', '/proc/kmsg', pipe, tmp_path):
-        with pytest.raises(MapError, match='regular file'):
-            LandmarkMap.from_file(path)
 
 
 @pytest.mark.parametrize('name', ['a\0b', '\ud800', 'x' * 5000])
@@ -175,10 +155,6 @@ def embeddings():
     means[1] = 0.0
     return LandmarkEmbeddings('tiny:gelu:1234', ('mug_1', 'mug_2', 'book_1'), means,
                               looks(3, 1), np.array([0, 2, 2, 3]))
-
-
-def arrays_of(embeddings):
-    return {name: np.array(value) for name, value in vars(embeddings).items()}
 
 
 def test_rows_take_the_order_of_a_map(embeddings):
@@ -204,30 +180,26 @@ def test_a_map_finds_the_file_next_to_it(tmp_path, embeddings):
         load_embeddings_of_map(map_path, ['chair_1'])
 
 
-WRONG = {
-    'wrong rows': ('means', looks(2, 0), r'means has shape \(2, 8\)'),
-    'repeated id': ('landmark_ids', np.array(['a', 'b', 'a']), 'repeats an id'),
-    'NaN': ('means', np.full((3, 8), np.nan), 'unit length in row 0'),
-    'end': ('medoid_offsets', np.array([0, 1, 2, 2]), 'medoid_offsets ranges from 0 to 2'),
-    'falling': ('medoid_offsets', np.array([0, 3, 2, 3]), 'medoid_offsets decreases')}
-
-
-@pytest.mark.parametrize(('name', 'value', 'message'), WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize(('name', 'value', 'message'), [
+    ('means', looks(2, 0), r'means has shape \(2, 8\)'),
+    ('landmark_ids', np.array(['a', 'b', 'a']), 'repeats an id'),
+    ('means', np.full((3, 8), np.nan), 'unit length in row 0'),
+    ('medoid_offsets', np.array([0, 1, 2, 2]), 'medoid_offsets ranges from 0 to 2'),
+    ('medoid_offsets', np.array([0, 3, 2, 3]), 'medoid_offsets decreases')])
 def test_a_malformed_array_is_refused(tmp_path, embeddings, name, value, message):
-    arrays = arrays_of(embeddings) | {name: value}
     path = tmp_path / 'wrong.npz'
-    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    np.savez(path, **{key: np.array(array) for key, array in vars(embeddings).items()} | {
+        name: value})
     with pytest.raises(MapError, match=message):
         load_landmark_embeddings(path)
 
 
-OPTIONS = RelocalizerOptions(matching='class')
 
 
 def floor(name, seed=0):
     """Return a map with this name of twelve objects near the camera, placed by seed."""
     rng = np.random.default_rng(seed)
-    return replace(make_room(), frame_id=name, centers=np.c_[
+    return replace(ROOM, frame_id=name, centers=np.c_[
         rng.uniform(-1.2, 1.2, (12, 2)), rng.uniform(1.5, 4, 12)])
 
 
@@ -235,7 +207,7 @@ def join(*maps):
     return join_maps(maps, [f'{landmark_map.frame_id}.yaml' for landmark_map in maps])
 
 
-def localize(landmark_map, seen, options=OPTIONS, similarities=None):
+def localize(landmark_map, seen, options=BY_CLASS, similarities=None):
     found = Relocalizer(landmark_map, options).relocalize(
         [Observation(CAMERA, see_room(seen), similarities)])
     return in_its_map(found, landmark_map)

@@ -9,20 +9,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scene import CAMERA, MAP_FROM_CAMERA, doubled_room, make_room, see_room
+from scene import BY_CLASS, MAP_FROM_CAMERA, ROOM, doubled_room, level, observe
 from scipy.spatial.transform import Rotation
 from test_map_file import floor, join
 
 from cliploc_ros.core.acceptance.confidence import confidences, region_odds
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.observation import OPTICAL_FROM_BODY, Observation, Region
+from cliploc_ros.core.observation import Region
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import OptionsError
 
 TERMS = CALIBRATION.prior
-OPTIONS = RelocalizerOptions(matching='class')
 TWINS = doubled_room(np.array([10.0, 0.0, 0.0]))
 LACKING = TWINS.select(range(21))
 ANY_YAW = 100.0
@@ -34,17 +33,14 @@ def region(x=0.0, y=0.0, sigma_m=0.5, probability=0.95, frame_id='map', yaw=0.0,
                   np.diag([sigma_m, sigma_m, yaw_deviation]) ** 2, probability)
 
 
-def ask(landmark_map=TWINS, objects=12, options=OPTIONS, **known):
-    seen = Observation(CAMERA, see_room(make_room()).select(np.arange(objects)), **known)
-    return Relocalizer(landmark_map, options).relocalize([seen])
+def ask(landmark_map=TWINS, objects=12, options=BY_CLASS, **known):
+    return Relocalizer(landmark_map, options).relocalize(
+        [observe(ROOM, rows=range(objects), **known)])
 
 
 def looking(yaw, x=0.0, y=0.0):
     """Return a level camera pose."""
-    body = np.eye(4)
-    body[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    body[:2, 3] = x, y
-    return (body @ np.linalg.inv(OPTICAL_FROM_BODY))[None]
+    return level(x, y, math.degrees(yaw), 0.0)[None]
 
 
 AREA = np.prod(np.ptp(TWINS.centers[:, :2], axis=0) + 2.0)
@@ -56,7 +52,7 @@ SURE, AHEAD = region(sigma_m=1e-6, probability=1.0), region(yaw=math.pi - 0.05, 
 @pytest.mark.parametrize(('known', 'pose', 'odds'), [
     # the odds of the mixture
     (region(probability=0.5, sigma_m=3.0), looking(0.0, 4.0), math.log(0.5 * DENSITY + 0.5)),
-    (region(probability=0.5), looking(0.0, 9.0), math.log(0.5)), (region(), looking(0.0), 0.0),
+    (region(probability=0.5), looking(0.0, 9.0), math.log(0.5)),
     # never surer than its limits
     (SURE, looking(0.0), 0.0), (SURE, looking(0.0, 9.0), -TERMS.most),
     # a region that says nothing
@@ -100,9 +96,9 @@ def test_no_region_decides_alone_between_identical_rooms():
 
 def test_a_region_of_another_floor_decides_between_equal_floors():
     floors = join(floor('floor_1'), floor('floor_2'))
-    seen = Observation(CAMERA, see_room(floor('')))
+    seen = observe(floor(''))
     for row, name in enumerate(('floor_1', 'floor_2')):
-        found = Relocalizer(floors, OPTIONS).relocalize(
+        found = Relocalizer(floors, BY_CLASS).relocalize(
             [replace(seen, region=region(frame_id=name))])
         assert (found.map_from_camera[0, 3] > 1e3) == bool(row)
 
@@ -110,18 +106,17 @@ def test_a_region_of_another_floor_decides_between_equal_floors():
 def test_a_confident_wrong_region_accepts_nothing_and_is_named():
     wrong = region(5.0, probability=1.0)
     assert not ask(region=wrong).accepted, 'neither room is recognized'
-    refused = ask(make_room(), 3, region=wrong)
-    assert refused.confidence < ask(make_room(), 3).confidence
+    refused = ask(ROOM, 3, region=wrong)
+    assert refused.confidence < ask(ROOM, 3).confidence
     assert 'prior' in refused.reason
-    sure = ask(make_room(), region=wrong)
+    sure = ask(ROOM, region=wrong)
     assert sure.accepted and pose_error(sure.map_from_camera, MAP_FROM_CAMERA)[0] < 0.05
 
 
 @given(st.lists(st.tuples(st.floats(-5, 9), st.floats(-3, 0)), min_size=1, max_size=5))
 def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
     odds, prior = np.array(contenders).T
-    poses = np.tile(np.eye(4), (len(odds), 1, 1))
-    poses[:, 0, 3] = 5.0 * np.arange(len(odds))
+    poses = np.array([level(5.0 * row) for row in range(len(odds))])
     told = confidences(odds, poses, 2.0, prior=prior)
     alone = [confidences(odds[[row]], poses[[row]], 2.0)[0] for row in range(len(odds))]
     assert (told <= np.array(alone) + 1e-9).all()
@@ -131,12 +126,12 @@ def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
 UP_IN_CAMERA = MAP_FROM_CAMERA[2, :3]
 
 
-def with_vertical(room, up=UP_IN_CAMERA):
-    return Observation(CAMERA, see_room(room), None, up_in_camera=up)
+def with_vertical(room, up=UP_IN_CAMERA, rows=None):
+    return observe(room, rows=rows, up_in_camera=up)
 
 
 @pytest.mark.parametrize('tilt_deg', [90.0, 180.0])
-def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observe):
+def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observed):
     """As with a wrong mount: the pose from boxes without the vertical is among the rivals."""
     relocalizer, rng = Relocalizer(office_map, RelocalizerOptions()), np.random.default_rng(0)
     accepted, wrong = 0, 0
@@ -144,7 +139,7 @@ def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries,
         up = frame.map_from_camera[2, :3]
         axis = np.cross(up, rng.normal(size=3))
         up = Rotation.from_rotvec(np.radians(tilt_deg) * axis / np.linalg.norm(axis)).apply(up)
-        found = relocalizer.relocalize([replace(observe(frame), up_in_camera=up)])
+        found = relocalizer.relocalize([replace(observed(frame), up_in_camera=up)])
         if found.accepted:
             accepted += 1
             wrong += pose_error(found.map_from_camera, frame.map_from_camera)[0] > 1.0
@@ -154,22 +149,19 @@ def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries,
 
 def test_the_right_pose_is_the_rival_of_one_by_a_wrong_vertical(room):
     up = Rotation.from_euler('x', 45, degrees=True).apply(UP_IN_CAMERA)
-    found = Relocalizer(room, OPTIONS).relocalize([with_vertical(room, up)])
+    found = Relocalizer(room, BY_CLASS).relocalize([with_vertical(room, up)])
     assert not found.accepted
     assert found.evidence.rival.place == pytest.approx(MAP_FROM_CAMERA[:3, 3], abs=0.05)
 
 
 def test_two_objects_and_the_vertical_fix_a_pose(room):
     """The pose is refused, since four objects are required; without a vertical there is none."""
-    options = RelocalizerOptions(matching='class')
-    pair = np.array([0, 1])
-    observation = with_vertical(room)
-    observation = replace(observation, detections=observation.detections.select(pair))
-    found = Relocalizer(room, options).relocalize([observation])
+    relocalizer = Relocalizer(room, BY_CLASS)
+    found = relocalizer.relocalize([with_vertical(room, rows=[0, 1])])
     assert found.solved and not found.accepted
     assert len(found.matches) == 2
     assert np.linalg.eigvalsh(found.covariance).min() > 0.0
-    blind = Relocalizer(room, options).relocalize([replace(observation, up_in_camera=None)])
+    blind = relocalizer.relocalize([with_vertical(room, None, [0, 1])])
     assert not blind.solved
     assert 'fewer than 3' in blind.reason
 
@@ -197,7 +189,5 @@ def test_the_papers_algorithms_ask_for_no_vertical(room):
                                 np.array([1.0, 0.0])])
 def test_a_vertical_is_a_unit_vector(room, up):
     with pytest.raises(OptionsError, match='up_in_camera'):
-        Relocalizer(room, RelocalizerOptions(matching='class')).relocalize(
-            [with_vertical(room, up)])
-
+        Relocalizer(room, BY_CLASS).relocalize([with_vertical(room, up)])
 

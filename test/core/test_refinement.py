@@ -7,20 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reference import scene_of, verify
-from scene import CAMERA, MAP_FROM_CAMERA, boxes_of, make_room
+from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, boxes_of, observe, rigid
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from cliploc_ros.core.fit import refinement
 from cliploc_ros.core.fit.camera_fit import ERRORS
 from cliploc_ros.core.fit.covariance import normalized_square, refined_covariance
-from cliploc_ros.core.fit.refinement import (
-    LEAST_SHARE,
-    jacobian_of,
-    move,
-    refine_rig,
-    residuals_of,
-)
-from cliploc_ros.core.fit.verification import make_rig, verify_rig
+from cliploc_ros.core.fit.verification import make_rig
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
     make_transform,
@@ -28,18 +22,20 @@ from cliploc_ros.core.geometry.transforms import (
     pose_error,
 )
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.options import RelocalizerOptions
+from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.frame_search import match_frame
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, make_scene
 
 
 def refine(scene, rotation, translation, vertical):
     """A single frame is a rig of one camera."""
     rig = make_rig([scene], np.eye(4)[None], vertical[None], np.zeros(len(scene.centers)))
-    return refine_rig(rig, rotation, translation)
+    return refinement.refine_rig(rig, rotation, translation)
+
+
+def split(map_from_camera):
+    inverse = invert_transform(map_from_camera)
+    return inverse[:3, :3].copy(), inverse[:3, 3].copy()
 
 
 def shaken(rng, metres, degrees):
@@ -50,15 +46,12 @@ def shaken(rng, metres, degrees):
     shift = rng.normal(size=3)
     pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix() @ pose[:3, :3]
     pose[:3, 3] += shift * metres / np.linalg.norm(shift)
-    camera_from_map = invert_transform(pose)
-    return (np.ascontiguousarray(camera_from_map[:3, :3]),
-            np.ascontiguousarray(camera_from_map[:3, 3]))
+    return split(pose)
 
 
-def error_of(rotation, translation):
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, translation
-    return pose_error(invert_transform(pose), MAP_FROM_CAMERA)
+def error_m(found):
+    return pose_error(invert_transform(make_transform(found.rotation, found.translation)),
+                      MAP_FROM_CAMERA)[0]
 
 
 def test_a_perfect_view_leads_to_the_truth_and_a_noisy_one_near_it(room, rng):
@@ -67,11 +60,11 @@ def test_a_perfect_view_leads_to_the_truth_and_a_noisy_one_near_it(room, rng):
     for _ in range(50):
         noisy, start = scene_of(room, noise_px=3.0, rng=rng), shaken(rng, 0.15, 3.0)
         found = refine(noisy, *start, VERTICAL_UNKNOWN)
-        assert found.score >= LEAST_SHARE * verify(noisy, *start).score
+        assert found.score >= refinement.LEAST_SHARE * verify(noisy, *start).score
         assert found.score == verify(noisy, found.rotation, found.translation).score
-        errors_m.append(error_of(found.rotation, found.translation)[0])
+        errors_m.append(error_m(found))
         found = refine(scene, *shaken(rng, 0.08, 1.5), VERTICAL_UNKNOWN)
-        assert error_of(found.rotation, found.translation)[0] < 1e-4
+        assert error_m(found) < 1e-4
         assert found.score == pytest.approx(perfect, abs=1e-2)
         assert (np.linalg.eigvalsh(found.information) > 0).all()
         np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
@@ -96,96 +89,18 @@ def test_derivatives_are_those_of_differences(room, rng):
     for _ in range(20):
         rotation, translation = shaken(rng, 0.3, 5.0)
         vertical = np.r_[rotation @ [0.1, 0.2, 0.97], 0.0, 0.0, 1.0, 0.05]
-        jacobian = jacobian_of(pairs, vertical, rotation, translation)
+        jacobian = refinement.jacobian_of(pairs, vertical, rotation, translation)
         there, back = np.empty(len(jacobian)), np.empty(len(jacobian))
         for axis, step in enumerate(np.eye(6) * 1e-6):
             for sign, values in ((1, there), (-1, back)):
-                moved = move(rotation, translation, sign * step)
-                assert residuals_of(pairs, vertical, *moved, values)
+                moved = refinement.move(rotation, translation, sign * step)
+                assert refinement.residuals_of(pairs, vertical, *moved, values)
             np.testing.assert_allclose(jacobian[:, axis], (there - back) / 2e-6, rtol=1e-4,
                                        atol=1e-4)
 
 
-FRAMES = 4
 
 
-@pytest.fixture
-def walk(rng):
-    """Return poses of a camera that walks and turns; the last is the reference."""
-    poses = [MAP_FROM_CAMERA]
-    for _ in range(FRAMES - 1):
-        step = make_transform(Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix(),
-                              rng.normal(0, 0.2, 3))
-        poses.append(poses[-1] @ step)
-    return np.array(poses)
-
-
-def rig_of(room, poses):
-    camera_from_reference = np.array([*(invert_transform(pose) @ poses[-1]
-                                        for pose in poses[:-1]), np.eye(4)])
-    return make_rig([scene_of(room, pose) for pose in poses], camera_from_reference,
-                    np.tile(VERTICAL_UNKNOWN, (len(poses), 1)), np.zeros(len(room)))
-
-
-def split(map_from_camera):
-    inverse = invert_transform(map_from_camera)
-    return inverse[:3, :3].copy(), inverse[:3, 3].copy()
-
-
-def nearby(pose, rng, metres, degrees):
-    turn = Rotation.from_rotvec(np.radians(degrees) * rng.normal(size=3))
-    return make_transform(turn.as_matrix() @ pose[:3, :3], pose[:3, 3] + metres * rng.normal(
-        size=3))
-
-
-def test_the_score_is_the_sum_of_the_frames_scores(room, walk, rng):
-    rig = rig_of(room, walk)
-    shift = invert_transform(walk[-1]) @ nearby(walk[-1], rng, 0.03, 0.5)
-    alone = []
-    for pose in walk:  # the rig moves rigidly
-        moved = walk[-1] @ shift @ invert_transform(walk[-1]) @ pose
-        alone.append(verify(scene_of(room, pose), *split(moved)))
-    assert min(result.score for result in alone) > 1.0
-    found = verify_rig(rig, *split(walk[-1] @ shift))
-    assert found.score == pytest.approx(sum(result.score for result in alone), abs=1e-9)
-    np.testing.assert_array_equal(found.landmarks,
-                                  np.concatenate([result.landmarks for result in alone]))
-    np.testing.assert_allclose(found.ious, np.concatenate([one.ious for one in alone]), atol=1e-9)
-
-
-def test_frames_of_a_large_map_are_joined_with_their_groups(room, walk):
-    count = 20
-    shifts = np.repeat(np.c_[30.0 * np.arange(count), np.zeros((count, 2))], len(room), axis=0)
-    many = LandmarkMap(
-        'map', tuple(f'{i}' for i in range(count * len(room))), room.labels * count,
-        room.class_ids * count, np.tile(room.centers, (count, 1)) + shifts,
-        np.tile(room.semi_axes, (count, 1)), np.tile(room.quats_xyzw, (count, 1)))
-    scenes = []
-    for rows in ([0, 1, 2, 3, 5], [], [4, 7], [6]):  # no two frames show the same classes
-        boxes = boxes_of(room, walk[len(scenes)])[rows]
-        seen = Detections(boxes, tuple(room.class_ids[row] for row in rows), np.ones(len(rows)))
-        scenes.append(match_frame(many, Observation(CAMERA, seen),
-                                  RelocalizerOptions(matching='class'))[0])
-    assert [len(scene.groups.starts) - 1 for scene in scenes] == [3, 0, 1, 1]
-    cameras = np.array([invert_transform(pose) @ walk[-1] for pose in walk])
-    rig = make_rig(scenes, cameras, np.tile(VERTICAL_UNKNOWN, (FRAMES, 1)),
-                   many.position_sigmas)
-    place = 3
-    reference = walk[-1].copy()
-    reference[0, 3] += 30.0 * place
-    found = verify_rig(rig, *split(reference))
-    np.testing.assert_array_equal(
-        found.landmarks, place * len(room) + np.array([0, 1, 2, 3, 5, 4, 7, 6]))
-    assert found.ious.min() > 0.6
-
-
-ROOM = make_room()
-BY_CLASS = RelocalizerOptions(matching='class')
-
-
-def boxes_at(map_from_camera, noise_px=0.0, rng=None):
-    boxes = boxes_of(ROOM, map_from_camera)
-    return boxes if rng is None else boxes + rng.normal(0, noise_px, boxes.shape)
 
 
 UNSHARED, EXACT = np.zeros((len(ROOM), 2)), np.zeros(ERRORS)
@@ -194,13 +109,14 @@ UNSHARED, EXACT = np.zeros((len(ROOM), 2)), np.zeros(ERRORS)
 def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=UNSHARED,
            wrong_share=0.0, camera=CAMERA, deviations=EXACT):
     """Return the pose of the last camera in a map with these centres, and its covariance."""
-    scenes = [make_scene(camera.normalize_bboxes(boxes_at(pose, noise_px, rng)), centers,
-                         ROOM.shapes, np.eye(len(ROOM), dtype=bool), np.empty((0, 2), int), 0.05)
-              for pose in poses]
+    noise = 0.0 if rng is None else rng.normal(0, noise_px, (len(poses), len(ROOM), 4))
+    boxes = np.array([boxes_of(ROOM, pose) for pose in poses]) + noise
+    scenes = [make_scene(camera.normalize_bboxes(shown), centers, ROOM.shapes,
+                         np.eye(len(ROOM), dtype=bool), np.empty((0, 2), int), 0.05)
+              for shown in boxes]
     rig = make_rig(scenes, np.array([invert_transform(pose) @ poses[-1] for pose in poses]),
                    np.tile(VERTICAL_UNKNOWN, (len(poses), 1)), np.full(len(ROOM), sigma))
-    start = invert_transform(poses[-1])
-    found = refine_rig(rig, start[:3, :3].copy(), start[:3, 3].copy())
+    found = refinement.refine_rig(rig, *split(poses[-1]))
     stamps = np.arange(len(poses)) if stamps is None else np.array(stamps)
     return (invert_transform(make_transform(found.rotation, found.translation)),
             refined_covariance(rig, found.rotation, found.translation, stamps, shared,
@@ -208,8 +124,7 @@ def fitted(poses, centers, sigma, rng=None, noise_px=0.0, stamps=None, shared=UN
 
 
 def turning(count):
-    return [MAP_FROM_CAMERA @ make_transform(Rotation.from_euler(
-        'y', 2.0 * step, degrees=True).as_matrix(), np.zeros(3)) for step in range(count)]
+    return [MAP_FROM_CAMERA @ rigid(axis='y', degrees=2.0 * step) for step in range(count)]
 
 
 def test_odometry_errs_as_much_to_later_frames_as_to_earlier_ones():
@@ -287,10 +202,8 @@ def test_a_map_states_what_its_landmarks_share():
                                     *[LandmarkDetails()] * (len(ROOM) - 1)))
     assert stated.shared_sigmas[0] == pytest.approx([0.1, np.radians(3.0)])
     assert not stated.shared_sigmas[1:].any()
-    frame = Observation(CAMERA, Detections(boxes_at(MAP_FROM_CAMERA), ROOM.class_ids,
-                                           np.ones(len(ROOM))))
-    plain, shared = (Relocalizer(each, BY_CLASS).relocalize([frame]).covariance for each in (
-        ROOM, replace(ROOM, details=(stated.details[0],) * len(ROOM))))
+    plain, shared = (Relocalizer(each, BY_CLASS).relocalize([observe(ROOM)]).covariance
+                     for each in (ROOM, replace(ROOM, details=(stated.details[0],) * len(ROOM))))
     # the covariance does not shrink with the number of landmarks
     np.testing.assert_allclose(np.diag(shared - plain), [0.01] * 3 + [np.radians(3.0) ** 2] * 3,
                                rtol=0.1)

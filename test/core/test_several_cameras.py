@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cameras import MAP, MOUNTS, NAMES, look
+from scene import rigid
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -20,13 +21,13 @@ from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalizer
 
 OPTIONS = RelocalizerOptions(matching='class', tilt_deviation_deg=0.0)
-STEP = make_transform(Rotation.from_euler('y', 8.0, degrees=True).as_matrix(), [0.3, 0.0, 0.2])
+STEP = rigid((0.3, 0.0, 0.2), 'y', 8.0)
 
 
 def test_together_they_see_enough(rng):
     relocalizer = Relocalizer(MAP, OPTIONS)
     accepted = []
-    for _ in range(12):
+    for _ in range(6):
         *others, last = look(rng)
         alone = relocalizer.relocalize([last])
         found = Localizer(relocalizer).answer(Query((*others, last), run=None))
@@ -34,7 +35,7 @@ def test_together_they_see_enough(rng):
         if found.accepted:
             assert pose_error(found.map_from_camera, MOUNTS[-1])[0] < 0.5
     alone, together = np.sum(accepted, axis=0)
-    assert alone <= 6 < 10 <= together
+    assert alone <= 3 < 5 <= together
 
 
 def test_cameras_of_one_instant_have_no_odometry_between_them(rng):
@@ -85,11 +86,10 @@ def test_instants_are_kept_and_replaced_as_a_whole(rng):
 
 
 @pytest.mark.parametrize(('turned_deg', 'objects', 'wrong'), [
-    (0.0, 3, []), (2.0, 5, []), (5.0, 5, ['left']), (60.0, 3, ['left']), (180.0, 5, ['left'])])
+    (2.0, 5, []), (5.0, 5, ['left']), (60.0, 3, ['left'])])
 def test_a_camera_that_contradicts_the_others_is_named(rng, turned_deg, objects, wrong):
     localizer, mounts = Localizer(Relocalizer(MAP, OPTIONS)), list(MOUNTS)
-    mounts[1] = mounts[1] @ make_transform(
-        Rotation.from_euler('y', turned_deg, degrees=True).as_matrix(), np.zeros(3))
+    mounts[1] = mounts[1] @ rigid(axis='y', degrees=turned_deg)
     for number in range(8):
         assert not localizer.cameras.wrong_mounts or number >= 5
         *others, last = look(rng, objects=objects, mounts=mounts)

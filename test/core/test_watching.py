@@ -7,16 +7,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scene import boxes_of
+from scene import BY_CLASS, boxes_of, level, map_of, rigid, with_boxes
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.visibility import Expected, Missing, expect
 from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.camera import ImageFaults
 from cliploc_ros.core.watch.look import (
@@ -33,9 +31,7 @@ from cliploc_ros.units import NS_PER_S
 
 
 def poses(count, step_m=0.2):
-    found = np.tile(np.eye(4), (count, 1, 1))
-    found[:, 0, 3] = step_m * np.arange(count)
-    return found
+    return [rigid((step_m * number, 0.0, 0.0)) for number in range(count)]
 
 
 @pytest.fixture
@@ -69,20 +65,13 @@ def test_a_fault_that_lasts_is_named(images, change, word, looks):
     assert again[-1] == ''
 
 
-def test_the_same_image_is_frozen_only_for_a_robot_that_moves(images):
+def test_a_frozen_image_or_a_smooth_wall_is_a_fault_only_for_a_robot_that_moves(images):
     assert 'frozen' in faults_of([images[0]] * 6, poses(6))[-1]
     assert faults_of([images[0]] * 6, poses(6, step_m=0.0)) == [''] * 6
-
-
-def test_a_standing_robot_before_a_smooth_wall_is_no_fault(images):
+    for shape in ((1, 1, 3), (480, 3, 3)):  # an image of any shape
+        assert len(faults_of([np.zeros(shape, dtype=np.uint8)] * 4, poses(4))) == 4
     smooth = [cv2.GaussianBlur(images[0], (0, 0), 6.0) + np.uint8(row) for row in range(6)]
     assert faults_of(smooth, poses(6, step_m=0.0)) == [''] * 6
-
-
-@pytest.mark.full
-@pytest.mark.parametrize('shape', [(1, 1, 3), (480, 3, 3), (1080, 1920, 3)])
-def test_images_of_any_shape(shape):
-    faults_of([np.zeros(shape, dtype=np.uint8)] * 4, poses(4))
 
 
 CAMERA = Camera(640, 480, 400.0, 400.0, 320.0, 240.0)
@@ -106,24 +95,14 @@ def room():
     along, wall = rng.uniform(0.3, SIDE_M - 0.3, COUNT), np.arange(COUNT) % 4
     x = np.choose(wall, [along, along, 0.0 * along, 0.0 * along + SIDE_M])
     y = np.choose(wall, [0.0 * along, 0.0 * along + SIDE_M, along, along])
-    return LandmarkMap(
-        'map', tuple(f'thing_{row}' for row in range(COUNT)), ('thing',) * COUNT,
-        tuple('abcdefgh'[row] for row in rng.integers(8, size=COUNT)),
-        np.c_[x, y, rng.uniform(0.3, 1.8, COUNT)], rng.uniform(0.1, 0.25, (COUNT, 3)),
-        np.tile([0.0, 0.0, 0.0, 1.0], (COUNT, 1)))
-
-
-def pose_at(x, y, yaw_deg):
-    """Return map_from_camera of a level camera, 1 m above the floor."""
-    yaw = np.radians(yaw_deg)
-    forward, right = np.array([np.cos(yaw), np.sin(yaw), 0.0]), [np.sin(yaw), -np.cos(yaw), 0.0]
-    return make_transform(np.column_stack([right, [0.0, 0.0, -1.0], forward]), np.array([x, y, 1]))
+    return map_of(['abcdefgh'[row] for row in rng.integers(8, size=COUNT)],
+                  np.c_[x, y, rng.uniform(0.3, 1.8, COUNT)], rng.uniform(0.1, 0.25, (COUNT, 3)))
 
 
 def drive(count):
     """Return poses on a circle about the middle that look outwards, 20 degrees apart."""
     angles = np.radians(20.0 * np.arange(count))
-    return [pose_at(3.0 + np.cos(angle), 3.0 + np.sin(angle), np.degrees(angle) + 15.0)
+    return [level(3.0 + np.cos(angle), 3.0 + np.sin(angle), np.degrees(angle) + 15.0)
             for angle in angles]
 
 
@@ -144,13 +123,13 @@ def see(landmark_map, pose, number=0, odom=True, rng=None, rows=None):
 
 
 def moved(pose, x, y, yaw_deg=0.0):
-    turn = Rotation.from_euler('z', yaw_deg, degrees=True).as_matrix()
-    return make_transform(turn @ pose[:3, :3], pose[:3, 3] + [x, y, 0.0])
+    return make_transform(rigid(degrees=yaw_deg)[:3, :3] @ pose[:3, :3],
+                          pose[:3, 3] + [x, y, 0.0])
 
 
 @pytest.fixture
 def watch(room):
-    return Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
+    return Watch(Relocalizer(room, BY_CLASS))
 
 
 def follow(watch, room, poses, wrong=None, first=0, **seen):
@@ -210,7 +189,7 @@ def test_a_place_that_the_map_does_not_show_is_uncertain(watch, room):
     """The robot drives through a door to other objects of the same classes."""
     follow(watch, room, drive(10))
     annex = replace(room, centers=room.centers + np.array([30.0, 0.0, 0.0]))
-    way = [pose_at(30.0 + one[0, 3], one[1, 3], 20.0 * row) for row, one in enumerate(drive(40))]
+    way = [level(30.0 + one[0, 3], one[1, 3], 20.0 * row) for row, one in enumerate(drive(40))]
     near = [moved(way[0], x, 0.0) for x in np.linspace(-27.0, 0.0, 30)]
     follow(watch, room, near, first=10, rows=[])
     states = {watch.look(see(annex, pose, 40 + number), pose).state
@@ -219,34 +198,27 @@ def test_a_place_that_the_map_does_not_show_is_uncertain(watch, room):
     assert WatchState.UNCERTAIN in states
 
 
+NOTHING = Detections(np.empty((0, 4)), (), np.empty(0))
+
+
 def test_a_standing_robot_learns_little_from_more_of_the_same():
     belief = Belief()
     for number in range(50):
-        seen = Observation(CAMERA, Detections(np.empty((0, 4)), (), np.empty(0)),
-                           stamp_ns=2 * number * NS_PER_S, odom_from_camera=np.eye(4))
+        seen = Observation(CAMERA, NOTHING, stamp_ns=2 * number * NS_PER_S,
+                           odom_from_camera=np.eye(4))
         belief.wait(seen, np.eye(4))
         belief.add(seen, -1.0, is_full=True)
     assert 0.05 < belief.probability < 0.5
 
 
-NOTHING = Detections(np.empty((0, 4)), (), np.empty(0))
-
-
-def test_looks_that_say_the_opposite_are_no_repetitions():
-    weights = []
-    for odds in (-3.0, 3.0):
-        belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
-        assert belief.add(seen, 3.0, is_full=True) == 1.0
-        weights.append(belief.add(seen, odds, is_full=True))
-    assert weights == pytest.approx([1.0 - TERMS.correlated * np.exp(-6.0 / TERMS.most),
-                                     1.0 - TERMS.correlated])
-
-
-def test_without_odometry_looks_share_errors_for_some_seconds():
-    belief, seen = Belief(), Observation(CAMERA, NOTHING)
-    belief.add(seen, 3.0, is_full=True)
-    assert belief.add(replace(seen, stamp_ns=5 * NS_PER_S), 3.0, is_full=True) == pytest.approx(
-        1.0 - TERMS.correlated * np.exp(-5.0 / TERMS.correlated_s))
+@pytest.mark.parametrize(('odom', 'odds', 'time_s', 'away'), [
+    (np.eye(4), 3.0, 0, 0.0), (np.eye(4), -3.0, 0, 6.0 / TERMS.most),
+    (None, 3.0, 5, 5.0 / TERMS.correlated_s)])
+def test_looks_share_errors_unless_they_disagree_or_time_passes(odom, odds, time_s, away):
+    belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=odom)
+    assert belief.add(seen, 3.0, is_full=True) == 1.0
+    weight = belief.add(replace(seen, stamp_ns=time_s * NS_PER_S), odds, is_full=True)
+    assert weight == pytest.approx(1.0 - TERMS.correlated * np.exp(-away))
 
 
 @pytest.mark.parametrize(('way_m', 'time_s'), [(100.0, 0), (0.0, 100), (50.0, 200)])
@@ -274,7 +246,7 @@ def test_a_jump_in_place_or_in_heading_alone_speaks_against_the_new_pose(change)
 def test_without_odometry_the_watch_learns_more_slowly(room):
     chances = []
     for odom in (True, False):
-        watch = Watch(Relocalizer(room, RelocalizerOptions(matching='class')))
+        watch = Watch(Relocalizer(room, BY_CLASS))
         wrong = moved(np.eye(4), 2.0, 0.5)
         chances.append([report.probability for report in follow(watch, room, drive(12), wrong,
                                                           odom=odom)])
@@ -340,21 +312,17 @@ def test_invalid_inputs_are_named(watch, room):
 
 
 def test_a_pose_against_the_vertical_is_less_likely():
-    level = pose_at(0.0, 0.0, 0.0)
-    tilted = level @ make_transform(Rotation.from_euler('x', 15, degrees=True).as_matrix(),
-                                    np.zeros(3))
+    straight = level()
+    tilted = straight @ rigid(axis='x', degrees=15.0)
     up = np.array([0.0, -1.0, 0.0])
-    assert by_vertical(level, None, 1.0) == by_vertical(level, up, 1.0) == 0.0
+    assert by_vertical(straight, None, 1.0) == by_vertical(straight, up, 1.0) == 0.0
     assert by_vertical(tilted, up, 1.0) < -3.0
     upside_down = -up * (1.0 + 1e-12)  # by rounding
-    assert by_vertical(level, upside_down, 1.0) == -CALIBRATION.attitude.wrong_mount
+    assert by_vertical(straight, upside_down, 1.0) == -CALIBRATION.attitude.wrong_mount
 
 
 def things(*centers):
-    count = len(centers)
-    return LandmarkMap('map', tuple(map(str, range(count))), ('thing',) * count, ('a',) * count,
-                       np.array(centers, dtype=np.float64), np.full((count, 3), 0.2),
-                       np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+    return map_of('a' * len(centers), centers)
 
 
 def test_what_an_image_should_show():
@@ -365,18 +333,18 @@ def test_what_an_image_should_show():
                   (3, 2.35, 1),  # cut by the border
                   (30, 1, 1),  # too far
                   (3, -1, 1))  # in view
-    found = expect(some, CAMERA, pose_at(0, 0, 0), np.array([5]))
+    found = expect(some, CAMERA, level(0, 0, 0), np.array([5]))
     assert found.landmarks.tolist() == [0, 5]
     assert found.was_seen.tolist() == [False, True]
     assert found.in_sight.tolist() == [True, True]
     # no visible landmark is beside it, so a wall may hide it
-    assert not expect(some, CAMERA, pose_at(0, 0, 0), np.empty(0, dtype=int)).in_sight.any()
+    assert not expect(some, CAMERA, level(0, 0, 0), np.empty(0, dtype=int)).in_sight.any()
 
 
 @pytest.mark.parametrize(('yaw_deg', 'side'), [(0, 4), (44, 4), (46, 5), (181, 0), (-1, 3)])
 def test_the_side_of_a_landmark_is_that_from_which_the_camera_looks(yaw_deg, side):
     ahead = [2 * np.cos(np.radians(yaw_deg)), 2 * np.sin(np.radians(yaw_deg)), 1]
-    found = expect(things(ahead), CAMERA, pose_at(0, 0, yaw_deg), np.array([0]))
+    found = expect(things(ahead), CAMERA, level(0, 0, yaw_deg), np.array([0]))
     assert found.sides.tolist() == [side]
 
 
@@ -418,12 +386,11 @@ def test_what_a_detector_finds_now_and_then_is_not_missing_at_once(seen_every, m
 
 
 def test_a_look_counts_what_it_explains_and_what_it_does_not(room):
-    options, pose = RelocalizerOptions(matching='class'), drive(1)[0]
+    options, pose = BY_CLASS, drive(1)[0]
     seen = see(room, pose)
     count, others = len(seen.detections), np.array([[300.0, 5, 310, 15], [400, 5, 410, 15]])
     for known, class_ids in ((2, ('a', 'b')), (1, ('a', 'unknown')), (0, ('other', 'unknown'))):
-        more = Detections(np.concatenate([seen.detections.bboxes_xyxy, others]),
-                          (*seen.detections.class_ids, *class_ids), np.full(count + 2, 0.9))
+        more = with_boxes(seen.detections, others, class_ids)
         evidence, expected = measure(align(look_at(room, replace(seen, detections=more), options),
                                            pose))
         assert (evidence.known, evidence.matched, evidence.unexplained) == (
@@ -437,7 +404,7 @@ def test_a_look_counts_what_it_explains_and_what_it_does_not(room):
 
 
 def test_a_pose_that_is_off_is_aligned_with_what_is_seen(room):
-    options, pose = RelocalizerOptions(matching='class'), drive(1)[0]
+    options, pose = BY_CLASS, drive(1)[0]
     away = measure(align(look_at(room, see(room, pose), options), moved(pose, 0.2, 0.1)))[0]
     assert away.away_m == pytest.approx(np.hypot(0.2, 0.1), abs=0.06)
     pose = drive(5)[4]

@@ -9,7 +9,6 @@ import random
 import signal
 import stat
 import time
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -17,11 +16,7 @@ import pytest
 from whole_sets import ROOM, made_map, write_set
 
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
-from cliploc_ros.core.map.landmark_embeddings import (
-    embeddings_path,
-    load_embeddings_of_map,
-    load_landmark_embeddings,
-)
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import set_digest, write_map
 from cliploc_ros.errors import DatasetError, MapError
@@ -55,9 +50,9 @@ def write_again_and_again(path, first, begun, after):
 
 
 def test_a_kill_leaves_one_whole_set(path):
-    """The writes of build_map are killed at 60 random times."""
+    """The writes of build_map are killed at 30 random times."""
     draw, seen, fork = random.Random(0), set(), multiprocessing.get_context('fork')
-    for kill in range(60):
+    for kill in range(30):
         begun = fork.Event()
         writer = fork.Process(target=write_again_and_again,
                               args=(path, 1000 * kill + 1, begun, draw.randrange(3)), daemon=True)
@@ -69,7 +64,7 @@ def test_a_kill_leaves_one_whole_set(path):
         number, agree = read(path)
         assert agree == {True}
         seen.add(number)
-    print(f'60 kills, {len(seen)} sets')
+    print(f'30 kills, {len(seen)} sets')
     assert len(seen) > 10, 'the kills happen during writes'
 
 
@@ -132,7 +127,7 @@ def test_a_set_that_cannot_be_written_changes_nothing(path):
 def test_two_writers_at_once_leave_one_whole_set(path):
     """As with build_map in two terminals: the last one wins with all of its files."""
     fork = multiprocessing.get_context('fork')
-    for turn in range(8):
+    for turn in range(3):
         writers = [fork.Process(target=lambda numbers: [write_set(path, tag) for tag in numbers],
                                 args=(range(first, first + 10),))
                    for first in (100 * turn, 100 * turn + 10)]
@@ -183,20 +178,6 @@ def test_sets_of_keyframes_alone_are_told_apart(path):
     layer_path(path).replace(layer_path(place))
     with pytest.raises(MapError, match='is of the set'):
         load_layer_of_map(layer_path(place), LandmarkMap.from_file(place))
-
-
-def test_a_file_whose_names_have_no_ending_misses_its_arrays(path):
-    """NumPy adds .npy to each name; other programs that write zip files may not."""
-    place = embeddings_path(path)
-    with zipfile.ZipFile(place) as archive:
-        contents = {name.removesuffix('.npy'): archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(place, 'w') as archive:
-        for name, content in contents.items():
-            archive.writestr(name, content)
-    with pytest.raises(MapError, match='array encoder_key is missing'):
-        load_landmark_embeddings(place)
-    with pytest.raises(MapError, match='not a complete npz file'):
-        load_landmark_embeddings('/proc/self/mem')
 
 
 def test_a_writer_that_keeps_the_others_out_is_named(tmp_path, monkeypatch):

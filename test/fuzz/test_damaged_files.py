@@ -17,7 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from garbage import CASES
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scene import CAMERA
 from whole_sets import ROOM, write_set
 
@@ -26,7 +28,7 @@ from cliploc_ros.core.map.landmark_embeddings import load_landmark_embeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays, read_case
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.models.clip_encoder import LabelCache
 from cliploc_ros.offline.datasets.given_map import read_table
 from cliploc_ros.offline.datasets.map_recording import load_recording
@@ -34,6 +36,10 @@ from cliploc_ros.offline.datasets.observations import load_observations, save_ob
 from cliploc_ros.offline.datasets.parsing import Fields
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
+#: Default number of cases per property; CLIPLOC_FUZZ_CASES=10000 requests more.
+CASES = settings(max_examples=int(os.environ.get('CLIPLOC_FUZZ_CASES', '200')), deadline=None,
+                 derandomize=True)
+number = st.one_of(st.floats(), st.floats(-1000.0, 1000.0), st.integers(-10, 10).map(float))
 LABELS = ['a mug', 'a book']
 TABLE = 'id,class_id,x,y,z,a,b,c\n' + ''.join(
     f'cup_{row},cup,{row}.5,1,2,.1,.1,.2\n' for row in range(8))
@@ -134,7 +140,7 @@ def bomb(path, shape, compression=zipfile.ZIP_DEFLATED, declared=None):
     content = header.getvalue() + bytes(8 * int(np.prod(shape)))
     with zipfile.ZipFile(path) as archive:
         others = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, 'w', compression) as archive:
+    with zipfile.ZipFile(path, 'w', compression, compresslevel=1) as archive:
         for one, data in (others | {'boxes_xyxy.npy': content}).items():
             archive.writestr(one, data)
 
@@ -173,13 +179,9 @@ def test_a_flood_of_empty_collections_in_yaml_takes_no_time(tmp_path, text):
     assert time.monotonic() - begun_s < 1.0
 
 
-def holes(path):
-    with path.open('wb') as file:
-        file.truncate(3 * 2**30)
-
-
 @pytest.mark.parametrize('make', [
-    os.mkfifo, lambda path: path.symlink_to('/dev/zero'), Path.mkdir, holes],
+    os.mkfifo, lambda path: path.symlink_to('/dev/zero'), Path.mkdir,
+    lambda path: (path.touch(), os.truncate(path, 3 * 2**30))],
     ids=['pipe', 'device', 'folder', 'holes'])
 def test_what_is_no_file_of_any_format_is_named_at_once(sound, tmp_path, make):
     """Includes a pipe without a writer and an endless device."""
@@ -195,3 +197,34 @@ def test_what_is_no_file_of_any_format_is_named_at_once(sound, tmp_path, make):
         except CliplocError as error:
             assert name in str(error)
         assert time.monotonic() - begun_s < 1.0
+
+
+# ---- maps of a broken editor or an attacker
+scalar = st.one_of(st.none(), st.booleans(), st.integers(), number, st.text(max_size=20))
+tree = st.recursive(scalar, lambda inner: st.one_of(
+    st.lists(inner, max_size=4), st.dictionaries(st.one_of(st.text(max_size=8), scalar), inner,
+                                                 max_size=4)), max_leaves=20)
+vector = st.one_of(st.lists(number, min_size=3, max_size=4), tree)
+landmark = st.one_of(tree, st.fixed_dictionaries(
+    {'label': st.one_of(st.text(max_size=30), tree), 'class_id': st.one_of(st.text(), tree),
+     'center': vector, 'semi_axes': vector, 'orientation': vector},
+    optional={'colour': scalar}))
+landmark_map = st.one_of(tree, st.fixed_dictionaries(
+    {'frame_id': st.one_of(st.text(max_size=10), scalar),
+     'landmarks': st.one_of(tree, st.dictionaries(st.text(max_size=10), landmark, max_size=3))}))
+
+
+@given(landmark_map)
+@CASES
+def test_any_tree_is_a_valid_map_or_an_error_that_names_the_file(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / 'trees.yaml'
+    path.write_bytes(yaml.safe_dump({'/**': {'ros__parameters': {'map': content}}},
+                                    allow_unicode=True).encode('utf-8', 'surrogatepass'))
+    try:
+        found = LandmarkMap.from_file(path)
+    except MapError as error:
+        assert 'trees.yaml' in str(error) and len(str(error)) < 10_000
+        return
+    assert np.isfinite(found.centers).all() and np.isfinite(found.shapes).all()
+    assert (found.semi_axes > 0.0).all()
+    np.testing.assert_allclose(np.linalg.norm(found.quats_xyzw, axis=1), 1.0)

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene import make_layer, make_room
+from scene import ROOM, level, make_layer, map_of, rigid
 from scipy.spatial.transform import Rotation
 from walk import CAMERA, join_maps, make_table, moved, see, walk_around
 
@@ -22,25 +22,16 @@ from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.evaluation.check_page import CHECK, CHECK_DATA, write_check
+from cliploc_ros.offline.mapping.check import findings, relocalization
 from cliploc_ros.offline.mapping.check.checking import check_map, give_advice
-from cliploc_ros.offline.mapping.check.findings import (
-    LookAlike,
-    check_landmarks,
-    find_look_alikes,
-    hear_witness,
-    make_grid,
-)
-from cliploc_ros.offline.mapping.check.relocalization import (
-    make_folds,
-    measure_detector,
-    try_recording,
-)
-from cliploc_ros.offline.mapping.check.report import check_keyframes, in_reach
-from cliploc_ros.offline.mapping.landmarks import Landmarks
+from cliploc_ros.offline.mapping.check.report import BY_OBJECTS, Measure, check_keyframes, in_reach
+from cliploc_ros.offline.mapping.fitting import fit_ellipsoid
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 from cliploc_ros.offline.mapping.systematic import find_corrections
+from cliploc_ros.offline.mapping.triangulation import add_depths
 from cliploc_ros.offline.mapping.views import make_views
-from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE, LabelModel
+from cliploc_ros.offline.simulation import EDGE_SIGMA_PX, EDGE_SIGMA_SHARE
+from cliploc_ros.offline.vocabulary.vocabulary import size_of_class
 
 NOUNS = ('apple', 'brick', 'candle', 'drum', 'engine', 'flag', 'globe', 'hammer', 'iron')
 TABLE = replace(make_table(), labels=NOUNS)
@@ -50,7 +41,7 @@ QUICK = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=12, 
 
 def witness_of(table, detections):
     views = make_views(detections)
-    return views, hear_witness(views, table, detections.class_names)
+    return views, findings.hear_witness(views, table, detections.class_names)
 
 
 @pytest.fixture(scope='module')
@@ -81,7 +72,7 @@ def test_a_true_map_has_no_fault_and_its_frames_are_accepted(report):
     verdicts = Counter(trial.verdict for trial in recording.trials)
     assert len(recording.trials) == 12 and verdicts['accepted'] >= 9 and not verdicts['misled']
     assert all(trial.error_m < 0.1 for trial in recording.trials if trial.verdict == 'accepted')
-    assert len(grid.trials) == 4 * len(grid.positions)
+    assert len(grid.trials) == 4 * len(grid.positions) <= 4 * QUICK.max_positions
     assert (grid.accepted <= grid.headings).all()
     blind = [trial for trial in grid.trials if trial.landmarks == 0]
     assert {trial.verdict for trial in blind} == {'refused'}
@@ -116,7 +107,7 @@ def test_a_misspelt_class_is_named_with_the_right_one(detections, is_recorded):
     right = TABLE.class_ids[4]
     wrong = replace(TABLE, class_ids=(*TABLE.class_ids[:4], f'{right}k', *TABLE.class_ids[5:]))
     _, witness = witness_of(wrong, detections) if is_recorded else (None, None)
-    worst, *others = check_landmarks(wrong, witness, [])
+    worst, *others = findings.check_landmarks(wrong, witness, [])
     assert worst.landmark_id == 'thing_4'
     (fault,) = worst.faults
     assert f"'{right}k'" in fault and f"mean '{right}'?" in fault
@@ -131,7 +122,7 @@ def test_boxes_that_leave_a_place_open_do_not_say_that_a_landmark_moved(detectio
     boxes = detections.bboxes_xyxy.copy()
     boxes[own, 0], boxes[own, 1], boxes[own, 2] = 0.0, 0.0, 640.0
     _, witness = witness_of(TABLE, replace(detections, bboxes_xyxy=boxes))
-    (one,) = [checked for checked in check_landmarks(TABLE, witness, [])
+    (one,) = [checked for checked in findings.check_landmarks(TABLE, witness, [])
               if checked.landmark_id == 'thing_4']
     assert not any(' cm away' in fault for fault in one.faults)
 
@@ -140,31 +131,26 @@ def test_a_shifted_landmark_is_told_its_offset(detections):
     shifted = moved(TABLE, {4: TABLE.centers[4] + (0.12, 0.0, 0.0)})
     _, witness = witness_of(shifted, detections)
     assert np.linalg.norm(witness.fitted.centers[4] - TABLE.centers[4]) < 0.01
-    worst, *_ = check_landmarks(shifted, witness, [])
+    worst, *_ = findings.check_landmarks(shifted, witness, [])
     assert worst.landmark_id == 'thing_4'
     assert worst.offset_m == pytest.approx(0.12, abs=0.01)
     assert any('is 12 cm away' in fault for fault in worst.faults)
     # a map states how uncertain it is
     sure = replace(shifted, details=(LandmarkDetails(position_sigma=0.07),) * len(TABLE))
-    assert {check.position_sigma_m for check in check_landmarks(sure, witness, [])} == {0.07}
+    checked = findings.check_landmarks(sure, witness, [])
+    assert {check.position_sigma_m for check in checked} == {0.07}
 
 
 @pytest.mark.parametrize('turn_deg', [0.0, -120.0])
 def test_identical_rooms_look_alike(turn_deg):
     turn = Rotation.from_euler('z', turn_deg, degrees=True)
     other = replace(TABLE, centers=turn.apply(TABLE.centers) + np.array([10.0, -3.0, 0.0]))
-    (found,) = find_look_alikes(join_maps(TABLE, other))
+    (found,) = findings.find_look_alikes(join_maps(TABLE, other))
     assert found.share == 1.0
     assert {(first.removesuffix('_b'), second.removesuffix('_b'))
             for first, second in found.matched} == {(name, name) for name in TABLE.landmark_ids}
     assert abs(found.turn_deg) == pytest.approx(abs(turn_deg), abs=1.0)
     assert found.same_labels == 9
-
-
-def test_rooms_of_other_objects_do_not_look_alike():
-    rng = np.random.default_rng(5)
-    other = replace(TABLE, centers=rng.uniform(-1, 1, (9, 3)) + np.array([10.0, 0.0, 0.8]))
-    assert find_look_alikes(join_maps(TABLE, other)) == []
 
 
 def test_identical_rooms_fail_the_check(rooms_report):
@@ -174,12 +160,6 @@ def test_identical_rooms_fail_the_check(rooms_report):
     # more objects would not help
     assert not any('map more objects' in text for text in rooms_report.advice)
     assert sum(trial.verdict == 'accepted' for trial in rooms_report.grid.trials) == 0
-
-
-def test_a_symmetric_place_is_one_place(report):
-    pair = LookAlike((5.7, 3.5, 0.8), (5.8, 3.5, 0.8), (), 6, 1.0, 0, 180.0)
-    advice = give_advice(replace(report, look_alikes=(pair,)))
-    assert any('x 5.7, y 3.5' in hint.text and '180 degrees' in hint.text for hint in advice)
 
 
 def test_a_robot_that_is_misled_near_a_double_is_advice_on_the_double(rooms_report):
@@ -208,7 +188,7 @@ def test_limits_decide(least):
 
 
 def mount(x=0.0, roll=0.0):
-    return make_transform(Rotation.from_euler('z', roll, True).as_matrix(), np.array([x, 0, 0]))
+    return rigid((x, 0.0, 0.0), degrees=roll)
 
 
 @pytest.mark.parametrize(('spoil', 'name', 'value', 'tolerance'), [
@@ -233,22 +213,6 @@ def test_systematic_errors_are_measured(spoil, name, value, tolerance):
     assert found[name].value == pytest.approx(value, abs=tolerance)
     # a turned mount looks almost like a shifted principal point
     assert found[name].explained > 0.8 * max(result.explained for result in found.values())
-
-
-def test_frames_for_which_no_landmark_is_left_count_as_refused(detections):
-    views, witness = witness_of(TABLE, detections)
-    first, *others = make_folds(views, witness, QUICK)
-    bare = first._replace(rows=first.rows[:0], landmarks=Landmarks.none())
-    trials = try_recording(TABLE, detections, witness.shown, [bare, *others], QUICK,
-                           lambda share: None)
-    assert len(trials) == 12
-    bare_stamps = detections.stamps_s[bare.frames]
-    of_bare = [trial for trial in trials if trial.stamp_s in bare_stamps]
-    assert of_bare
-    assert {trial.verdict for trial in of_bare} == {'refused'}
-    # the other parts have no information on the map there
-    assert all(trial.is_judged == (trial.stamp_s not in bare_stamps) for trial in trials)
-    assert any(trial.verdict == 'accepted' for trial in trials)
 
 
 def test_a_walk_that_passes_each_object_once_is_judged_by_what_it_can_tell():
@@ -286,7 +250,7 @@ def test_too_few_views_are_named_as_the_cause(detections):
 def test_detector_has_the_misses_and_noise_of_the_recording():
     detections = see(TABLE, walk_around(frames=200), noise_px=4.0, missed=0.4)
     views, witness = witness_of(TABLE, detections)
-    model = measure_detector(TABLE, detections, views, witness)
+    model = relocalization.measure_detector(TABLE, detections, views, witness)
     rng, poses = np.random.default_rng(0), detections.map_from_camera
     counts = [len(model.detect(pose, rng)[1]) for pose in poses]
     assert np.mean(counts) == pytest.approx(len(detections.classes) / 200, rel=0.1)
@@ -299,31 +263,8 @@ def test_detector_has_the_misses_and_noise_of_the_recording():
 def test_what_was_never_detected_is_never_simulated(detections):
     false = moved(TABLE, {4: TABLE.centers[4] + (0.0, 0.0, 1.0)})
     views, witness = witness_of(false, detections)
-    model = measure_detector(false, detections, views, witness)
+    model = relocalization.measure_detector(false, detections, views, witness)
     assert all(4 not in model.in_view(pose)[0] for pose in detections.map_from_camera)
-
-
-def test_equal_labels_are_equally_similar():
-    twins = replace(TABLE, labels=('lamp', 'lamp', *NOUNS[2:]),
-                    class_ids=('cup', 'cup', *TABLE.class_ids[2:]))
-    boxes = np.tile([100.0, 100.0, 164.0, 164.0], (200, 1))
-    shown = np.zeros(200, dtype=np.int64)
-    found = LabelModel.of(twins).similarities(shown, ('cup',) * 200, boxes,
-                                              np.random.default_rng(0))
-    assert (found[:, 0] == found[:, 1]).all()
-    assert (found.argmax(axis=1) == 0).mean() > 0.5
-    assert (np.abs(found) <= 1.0).all()
-
-
-def test_grid_is_bounded_and_looks_around():
-    wide = moved(TABLE, {0: (300.0, 0.0, 0.8)})
-    grid = make_grid(join_maps(wide, wide), None, replace(QUICK, max_positions=20, headings=4))
-    assert len(grid.positions) <= 20
-    rotations = grid.poses[:, :3, :3]
-    assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3))
-    assert np.linalg.det(rotations) == pytest.approx(1.0)
-    assert (grid.poses[:, 2, 1] < -0.9).all()  # y of the camera is down
-    assert grid.poses[:2, :2, 2].round(2).tolist() == [[0.98, 0.0], [0.0, 0.98]]
 
 
 @pytest.mark.parametrize(('table', 'named'), [
@@ -334,8 +275,7 @@ def test_a_recording_of_another_place_is_refused(detections, table, named):
         check_map(table, detections, options=QUICK)
 
 
-@pytest.mark.parametrize(('option', 'value'), [('--folds', '1'), ('--headings', '361'),
-                                               ('--grid', '0')])
+@pytest.mark.parametrize(('option', 'value'), [('--folds', '1'), ('--headings', '361')])
 def test_options_are_checked(option, value, capsys):
     with pytest.raises(SystemExit):
         main(['map.yaml', option, value])
@@ -362,42 +302,28 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([CHECK, CHECK_DATA])
 
 
-ROOM = make_room()
-#: The camera looks along x, z is up.
-LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def layer_at(*poses):
     return replace(make_layer(ROOM, len(poses), points=5), map_from_camera=np.array(poses))
 
 
-def view(x=0.0, degrees=0.0):
-    turn = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
-    return make_transform(turn @ LEVEL, np.array([x, 0.0, 1.0]))
-
-
 @pytest.mark.parametrize(('x', 'degrees', 'reached'), [
-    (1.9, 0.0, True), (2.1, 0.0, False), (0.0, 39.0, True), (0.0, -41.0, False),
-    (0.9, 20.0, True), (1.1, 20.0, False)])
+    (1.9, 0.0, True), (2.1, 0.0, False), (0.0, -41.0, False), (0.9, 20.0, True),
+    (1.1, 20.0, False)])
 def test_reach_is_near_and_in_the_same_direction(x, degrees, reached):
-    here = view(x, degrees)
-    assert in_reach(layer_at(view()), here[None]) == [reached]
+    assert in_reach(layer_at(level()), level(x, 0.0, degrees)[None]) == [reached]
 
 
-@pytest.fixture(scope='module')
-def room_report():
-    return check_map(ROOM, options=CheckOptions(max_positions=6, headings=4))
-
-
-def test_places_without_a_keyframe_are_counted_and_named(room_report):
+def test_places_without_a_keyframe_are_counted_and_named():
+    room_report = check_map(ROOM, options=CheckOptions(max_positions=6, headings=4))
     grid = room_report.grid
-    everywhere = layer_at(*(make_transform(
-        Rotation.from_euler('z', angle, degrees=True).as_matrix() @ LEVEL, place)
-        for place in grid.positions for angle in range(0, 360, 30)))
-    full = check_keyframes(everywhere, grid, np.array([view(), view(50.0)]))
+    everywhere = layer_at(*(make_transform(level(0.0, 0.0, angle)[:3, :3], place)
+                            for place in grid.positions for angle in range(0, 360, 30)))
+    full = check_keyframes(everywhere, grid, np.array([level(), level(50.0)]))
     assert full.reached_positions == 1.0 and not len(full.without)
     assert (full.headings == grid.headings).all()
-    nowhere = check_keyframes(layer_at(view(500.0)), grid, np.array([view(), view(500.0)]))
+    nowhere = check_keyframes(layer_at(level(500.0)), grid, np.array([level(), level(500.0)]))
     assert nowhere.reached_positions == 0.0
     assert nowhere.recorded.tolist() == [False, True]
     assert len(nowhere.without) == len(grid.positions)
@@ -410,9 +336,8 @@ def test_places_without_a_keyframe_are_counted_and_named(room_report):
 
 
 def test_a_map_that_leaves_no_free_position_is_checked():
-    hall = LandmarkMap('map', ('hall',), ('hall',), ('hall',), np.zeros((1, 3)),
-                       np.array([[4.0, 4.0, 3.0]]), np.array([[0.0, 0.0, 0.0, 1.0]]))
-    report = check_map(hall, options=QUICK, layer=layer_at(view()))
+    hall = map_of(['hall'], np.zeros((1, 3)), (4.0, 4.0, 3.0))
+    report = check_map(hall, options=QUICK, layer=layer_at(level()))
     assert len(report.grid.positions) == 0
     assert report.keyframes.reached_positions == 0.0 and len(report.keyframes.headings) == 0
 
@@ -425,8 +350,87 @@ def test_the_report_has_keyframes_only_where_there_are_some(tmp_path, run_here):
     assert done.returncode == 1 and 'room.keyframes.npz:' in done.stderr
     assert run_here(main, *given).returncode == 0
     assert json.loads((tmp_path / 'out/check.json').read_text())['keyframes'] is None
-    save_layer(layer_path(tmp_path / 'room.yaml'), layer_at(view(), view(1.0)))
+    save_layer(layer_path(tmp_path / 'room.yaml'), layer_at(level(), level(1.0)))
     done = run_here(main, *given)
     assert done.returncode == 0 and 'keyframes: 2 with' in done.stdout
     assert json.loads((tmp_path / 'out/check.json').read_text())['keyframes']['points'] == 10
     assert '2 with 10 points' in (tmp_path / 'out/check.html').read_text()
+
+
+# ---- sizes of classes, the scale of a map, and verdicts that depend on objects or keyframes
+FEW = CheckOptions(max_positions=4, headings=4)
+
+
+@pytest.fixture(scope='module')
+def office(shared_data):
+    return LandmarkMap.from_file(shared_data / 'tum_fr3_office/map.yaml')
+
+
+@pytest.fixture(scope='module')
+def office_report(office):
+    return check_map(office, options=FEW)
+
+
+def scaled(landmark_map, scale):
+    return replace(landmark_map, centers=scale * landmark_map.centers,
+                   semi_axes=scale * landmark_map.semi_axes)
+
+
+@pytest.mark.parametrize('scale', [0.3, 2.6])
+def test_the_scale_of_a_map_by_the_sizes_of_its_objects(office, scale):
+    report = check_map(scaled(office, scale), options=FEW)
+    assert report.scale == pytest.approx(scale, rel=0.5)
+    assert 'times too ' + ('large' if scale > 1.0 else 'small') in report.advice[0]
+
+
+def test_right_sizes_few_classes_and_views_of_one_side_tell_no_scale(office, office_report):
+    cups = [row for row, name in enumerate(office.class_ids) if name == 'cup']
+    one_sided = replace(office, details=(LandmarkDetails(baseline_deg=5.0),) * len(office))
+    assert office_report.scale is None
+    for none in (office.select(cups), one_sided):
+        assert check_map(scaled(none, 3.0), options=FEW).scale is None
+
+
+def test_a_landmark_that_is_too_large_has_a_serious_fault(office):
+    row = office.class_ids.index('chair')
+    semi_axes = office.semi_axes.copy()
+    semi_axes[row] = np.array([0.26, 0.4, 1.61])
+    report = check_map(replace(office, semi_axes=semi_axes), options=FEW)
+    found, = (one for one in report.landmarks if one.landmark_id == office.landmark_ids[row])
+    assert found.severity >= 1.0 and 'is 3.2 m long, and no chair' in found.faults[0]
+    assert size_of_class('unknown thing') is None
+    assert size_of_class('Chair') == size_of_class('chair') is not None
+
+
+def test_a_map_whose_objects_carry_nothing_is_keyframes_only(office_report):
+    missed = Measure(BY_OBJECTS, 0.0, 0.1, False)
+    met = Measure('landmarks with a serious fault', 0.0, 0.15, True)
+    for measures, verdict in (((met,), 'passed'), ((met, missed), 'keyframes only'),
+                              ((met._replace(value=0.8), missed), 'failed')):
+        told = replace(office_report, measures=measures)
+        assert told.verdict == verdict
+        assert told.passed == (verdict == 'passed')
+    accepted = int((office_report.grid.accepted[office_report.grid.is_near] > 0).sum())
+    positions, = office_report.localized
+    assert f': {accepted} localized by objects, 0 by keyframes only, ' in positions
+
+
+def longest(views):
+    """Return the longest extent of the fit from a sphere around the table's middle [m]."""
+    fit = fit_ellipsoid(views, np.arange(len(views.frames)), make_table(2).centers[1],
+                        0.1 * np.eye(3))
+    return 2.0 * np.linalg.norm(fit.basis, axis=0).max()
+
+
+def test_the_size_of_a_class_decides_only_where_boxes_of_one_side_do_not():
+    # errors of boxes 6 degrees apart look like a bottle that is long along the rays
+    table, size = make_table(2).select([1]), size_of_class('bottle')
+    assert table.class_ids == ('bottle',)
+    table = replace(table, semi_axes=np.array([[0.8, 0.04, 0.13]]),
+                    quats_xyzw=np.array([[0.0, 0.0, 0.0, 1.0]]))
+    one_side, all_sides = (see(table, walk, noise_px=1.0) for walk in (
+        walk_around(40, turn_deg=6.0), walk_around(30)))
+    sized, sized_all = (add_depths(make_views(seen), replace(seen, depths=np.full(
+        len(seen.classes), np.nan, np.float32))) for seen in (one_side, all_sides))
+    assert longest(make_views(one_side)) > size.most_m > longest(sized)
+    assert longest(sized_all) == pytest.approx(1.6, rel=0.03)

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Labels and image embeddings of a built map, on simulated embeddings."""
+"""Labels and image embeddings of a built map, on simulated embeddings; phrases of labels."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,9 @@ import pytest
 from walk import make_table, see, walk_around
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.errors import OptionsError, misspelt_classes
 from cliploc_ros.offline.mapping.labelling import embed_landmarks, label_landmarks
+from cliploc_ros.offline.vocabulary import vocabulary
 from cliploc_ros.offline.vocabulary.vocabulary import Phrases
 
 SIZE = 32
@@ -18,11 +20,6 @@ SIZE = 32
 
 def unit(rows):
     return (rows / np.linalg.norm(rows, axis=-1, keepdims=True)).astype(np.float32)
-
-
-def make_phrases(name, count, rng):
-    return Phrases(tuple(f'{name} {number}' for number in range(count)),
-                   unit(rng.normal(size=(count, SIZE))))
 
 
 def with_crops(detections, crops):
@@ -38,36 +35,6 @@ def static():
     seen = see(make_table(1), walk_around(12, 90.0))
     assert len(seen.classes) == 12
     return replace(seen, map_from_camera=poses)
-
-
-def test_crops_of_a_built_map_name_their_phrase():
-    """The crops of each object mix its true phrase, another object's phrase, and noise."""
-    rng = np.random.default_rng(1)
-    table = make_table()
-    seen = see(table, walk_around(40))
-    phrases = {name: [make_phrases(name, 300, rng)] for name in set(table.class_ids)}
-    built = build_map(seen)
-    true_rows = np.argmin(np.linalg.norm(
-        built.landmark_map.centers[:, None] - table.centers, axis=2), axis=1)
-    meant = np.array([phrases[name][0].embeddings[7 * row]
-                      for row, name in enumerate(table.class_ids)])
-    crops = unit(rng.normal(size=(len(seen.classes), SIZE)))
-    known = built.shown >= 0
-    crops[known] = unit(0.4 * meant[true_rows[built.shown[known]]] + crops[known])
-    seen = with_crops(seen, crops)
-    ids = built.landmark_map.landmark_ids
-    embeddings = embed_landmarks(ids, seen, built.shown)
-    labelled = label_landmarks(built.landmark_map, embeddings, phrases)
-    assert len(labelled) == len(table)
-    for row, true_row in enumerate(true_rows):
-        assert labelled.labels[row] == f'{table.class_ids[true_row]} {7 * true_row}'
-        texts, weights = zip(*labelled.details[row].labels, strict=True)
-        assert texts[0] == labelled.labels[row]
-        assert len(set(texts)) == 6
-        assert list(weights) == sorted(weights, reverse=True)
-        assert sum(weights) == pytest.approx(1.0, abs=1e-3)
-        assert labelled.details[row].support == built.landmark_map.details[row].support
-    np.testing.assert_array_equal(labelled.centers, built.landmark_map.centers)
 
 
 def test_weights_are_those_of_clip():
@@ -142,3 +109,71 @@ def test_many_crops_of_one_landmark_take_bounded_memory(static):
     embeddings = embed_landmarks(['it'], with_crops(many, crops), np.zeros(count, dtype=int))
     assert embeddings.medoid_offsets.tolist() == [0, 2]
     assert embeddings.means[0, 1] > embeddings.means[0, 0] > 0.1  # later frames weigh more
+
+
+# ---- phrases of the grammar, of the shipped vocabulary for COCO, and of a user's file
+def test_a_small_grammar_written_out():
+    assert vocabulary.expand_phrases({
+        'phrases': ['a {kind}', 'a {colour} {name} {pattern}'],
+        'kind': ['mug', 'tea cup'], 'colour': ['red', 'orange'],
+        'pattern': ['with {second} dots', 'with a {second} label'],
+    }) == ('a mug', 'a tea cup',
+           'a red mug with orange dots', 'a red mug with an orange label',
+           'an orange mug with red dots', 'an orange mug with a red label')
+
+
+def test_a_symbol_has_one_value_in_a_phrase_and_phrases_are_told_once():
+    assert vocabulary.expand_phrases({'phrases': ['{size} or {size}', 'big or big'],
+                                      'size': ['big', 'tiny']}) == ('big or big', 'tiny or tiny')
+
+
+@pytest.mark.parametrize(('rules', 'message'), [
+    ({'phrases': ['a {brand}']}, 'add the rule brand'),
+    ({'phrases': ['{a}'], 'a': ['{b}'], 'b': ['{a}']}, 'rules refer to each other'),
+    ({'phrases': ['{second}'], 'colour': ['red']}, None),
+    ({'phrases': ['{colour} {second}'], 'colour': ['red']}, 'needs two colours'),
+    ({'phrases': ['{a} {b} {c} {d}'], **{name: [f'{name}{i}' for i in range(1000)]
+                                         for name in 'abcd'}}, '2000 phrases')])
+def test_rules_that_cannot_be_used(rules, message):
+    if message is None:
+        assert vocabulary.expand_phrases(rules) == ('red',)
+        return
+    with pytest.raises(OptionsError, match=message):
+        vocabulary.expand_phrases(rules)
+
+
+def test_shipped_phrases_are_english():
+    for name in (*vocabulary.shipped_classes(), 'unheard-of thing'):
+        phrases = vocabulary.shipped_phrases(name)
+        assert 40 <= len(phrases) <= 1000
+        assert len(set(phrases)) == len(phrases)
+        for phrase in phrases:
+            assert re.fullmatch(r"[a-z][a-z' -]+[a-z]", phrase)
+            assert not re.search(r'\ba [aeio]|\ban [^aeiou]|  ', phrase), phrase
+            assert len(phrase.split()) <= 14  # CLIP reads up to 75 tokens, the demo's CLIP 22
+
+
+def test_any_class_name_is_described():
+    assert 'a red tv monitor with blue stripes' in vocabulary.shipped_phrases('tv_monitor')
+    assert 'a red colour' in vocabulary.shipped_phrases('{colour}')
+    assert 'an object' in vocabulary.shipped_phrases('_')
+    with pytest.raises(OptionsError, match='200 characters'):
+        vocabulary.shipped_phrases('x' * 500)
+
+
+def test_a_users_file_adds_phrases(tmp_path):
+    file = tmp_path / 'our.yaml'
+    file.write_text("cup:\n  - our {colour} team mug\n  - the chief's cup\n"
+                    'robot:\n  grammar: device\n  kind: [robot, cleaning robot]\n'
+                    "  brand: [Alpha]\n  phrases: ['a {colour} {brand} {kind}']\n")
+    ours = vocabulary.load_vocabulary(file)
+    assert ours['cup'][0] == 'our red team mug' and ours['cup'][-1] == "the chief's cup"
+    assert 'a silver Alpha cleaning robot' in ours['robot']
+
+
+def test_classes_that_look_misspelt_have_a_hint():
+    assert misspelt_classes(['bokk', 'book', 'zebu', 'zebu'], vocabulary.shipped_classes()) == {
+        'bokk': " (did you mean 'book'?)"}
+    assert misspelt_classes(['forklft', 'cart'], ['forklift', 'cart'], all_known=True) == {
+        'forklft': " (did you mean 'forklift'?)"}
+    assert misspelt_classes([], vocabulary.shipped_classes()) == {}

@@ -10,19 +10,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scene import level, map_of, rigid
 from scipy.spatial.transform import Rotation
-from walk import CAMERA, CLASSES, measure_depth, nearest_errors, see_rows
+from walk import CAMERA, CLASSES, draw_errors, measure_depth, nearest_errors, see_rows
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import make_transform
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.relocalization import sample_frames
-from cliploc_ros.offline.mapping.joint import pose_errors
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.updating import update_map
@@ -33,26 +31,24 @@ RIG = {'front': (CAMERA, 0.0), 'left': (Camera(320, 240, 200.0, 200.0, 160.0, 12
        'back': (Camera(800, 600, 450.0, 460.0, 380.0, 310.0), 180.0), 'right': (CAMERA, 270.0)}
 _LEVER_M, _STEP_S = 0.3, 0.5
 ERRORS = PoseErrors(0.05, 1.5, 3.0)
-OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
 
 
 def mount_of(name):
-    turn = Rotation.from_euler('z', RIG[name][1], degrees=True).as_matrix()
-    return make_transform(turn @ OPTICAL, turn @ [_LEVER_M, 0.0, 0.0] + [0.0, 0.0, 1.0])
+    return rigid(degrees=RIG[name][1]) @ level(_LEVER_M)
 
 
-def room(count=20):
-    """Objects all around."""
+def make_things(count=20):
+    """Return objects all around."""
     rng = np.random.default_rng(0)
     angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
     centers = np.c_[2.6 * np.cos(angles), 2.6 * np.sin(angles), rng.uniform(0.6, 1.4, count)]
-    names = tuple(CLASSES[row % 3] for row in range(count))
-    return LandmarkMap('map', tuple(f'thing_{row}' for row in range(count)), names, names,
-                       centers, rng.uniform(0.1, 0.2, (count, 3)),
-                       Rotation.identity(count).as_quat())
+    return map_of([CLASSES[row % 3] for row in range(count)], centers,
+                  rng.uniform(0.1, 0.2, (count, 3)))
 
 
-ROOM = room()
+ROOM = make_things()
 
 
 def robot_at(stamps_s):
@@ -89,14 +85,11 @@ def drive(*names, noise_px=2.0, move=lambda stamps_s, poses: poses, seconds=50.0
 
 def wandering(seed):
     """Return a function that moves a robot by errors with a correlation time of seconds."""
-    rng, times = np.random.default_rng(seed), np.arange(-1.0, 60.0, 0.05)
-    errors, kept = rng.normal(size=(len(times), 6)), float(np.exp(-0.05 / ERRORS.correlation_s))
-    for row in range(1, len(errors)):
-        errors[row] = kept * errors[row - 1] + np.sqrt(1.0 - kept ** 2) * errors[row]
+    times = np.arange(-1.0, 60.0, 0.05)
+    errors = draw_errors(times, ERRORS, seed)
 
     def move(stamps_s, poses):
         now = np.stack([np.interp(stamps_s, times, column) for column in errors.T], axis=1)
-        now *= ERRORS.sigmas
         moved = poses.copy()
         moved[:, :3, :3] = Rotation.from_rotvec(now[:, 3:]).as_matrix() @ poses[:, :3, :3]
         moved[:, :3, 3] += now[:, :3]
@@ -118,25 +111,6 @@ def test_cameras_share_the_errors_of_the_robot(odometry):
     assert four < (1.0 if odometry else 0.6) * one
     if odometry:
         assert any(' 239 of 239 ' in note for note in built.report.notes)
-
-
-def test_a_turn_of_the_robot_is_one_error_of_all_cameras():
-    """The levers compensate the shift that a turn of the robot causes in each camera."""
-    turn = Rotation.from_rotvec([0.0, 0.0, 0.02]).as_matrix()
-
-    def move(stamps_s, poses):
-        moved = poses.copy()
-        front = poses @ mount_of('front')  # about the first camera
-        moved[:, :3, :3] = turn @ poses[:, :3, :3]
-        moved[:, :3, 3] = front[:, :3, 3] + np.einsum(
-            'ij,fj->fi', turn, poses[:, :3, 3] - front[:, :3, 3])
-        return moved
-    given, present = (make_views(drive(*RIG, move=one)[0])
-                      for one in (move, lambda stamps_s, poses: poses))
-    np.testing.assert_allclose(np.linalg.norm(given.levers[given.cameras == 2], axis=1),
-                               2.0 * _LEVER_M, atol=2e-3)
-    np.testing.assert_allclose(pose_errors(given, present),
-                               np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -0.02], (400, 1)), atol=2e-4)
 
 
 def test_viewpoints_and_samples_are_those_of_each_camera():

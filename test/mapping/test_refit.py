@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scene import map_of
 from scipy.spatial.transform import Rotation
-from walk import CLASSES, join_maps, make_table, see, see_rows, walk_around
+from walk import CLASSES, join_maps, make_table, merged, see, see_rows, walk_around
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.building import build_map, refit_map
@@ -21,15 +21,8 @@ from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.update.updating import update_map
 from cliploc_ros.offline.mapping.views import make_views
 
-
-@pytest.fixture(scope='module')
-def table():
-    return make_table()
-
-
-@pytest.fixture(scope='module')
-def boxes(table):
-    return see(table, walk_around(), noise_px=1.0, missed=0.2)
+NINE = make_table()
+BOXES = see(NINE, walk_around(), noise_px=1.0, missed=0.2)
 
 
 def disturb(table, sigma_m=0.05, stretch=1.3, seed=0):
@@ -46,80 +39,80 @@ def errors_m(found, table):
     return np.linalg.norm(found.centers - table.centers, axis=1)
 
 
-def test_landmarks_move_to_where_the_boxes_are(table, boxes):
-    given = disturb(table)
-    refit = refit_map(boxes, given)
+def test_landmarks_move_to_where_the_boxes_are():
+    given = disturb(NINE)
+    refit = refit_map(BOXES, given)
     found = refit.landmark_map
-    assert refit.reasons == (None,) * len(table)
+    assert refit.reasons == (None,) * len(NINE)
     assert (found.landmark_ids, found.labels, found.class_ids) == (
         given.landmark_ids, given.labels, given.class_ids)
     for before, after in zip(given.details, found.details, strict=True):
         assert (after.class_weights, after.source) == (before.class_weights, 'theirs')
         assert after.support > 20 and 0.0 < after.position_sigma < 0.02
-    assert np.median(errors_m(given, table)) > 0.05
-    assert errors_m(refit.landmark_map, table).max() < 0.01
-    assert np.sort(refit.landmark_map.semi_axes) == pytest.approx(np.sort(table.semi_axes),
+    assert np.median(errors_m(given, NINE)) > 0.05
+    assert errors_m(refit.landmark_map, NINE).max() < 0.01
+    assert np.sort(refit.landmark_map.semi_axes) == pytest.approx(np.sort(NINE.semi_axes),
                                                                   abs=0.02)
     assert refit.explained > 0.99 > refit.explained_before
     assert refit.iou > 0.9 > 0.7 > refit.iou_before
 
 
-def test_only_chosen_landmarks_move(table, boxes):
-    given = disturb(table)
-    chosen = np.arange(len(table)) == 4
-    found = refit_map(boxes, given, chosen).landmark_map
+def test_only_chosen_landmarks_move():
+    given = disturb(NINE)
+    chosen = np.arange(len(NINE)) == 4
+    found = refit_map(BOXES, given, chosen).landmark_map
     assert (found.centers[~chosen] == given.centers[~chosen]).all()
     assert (found.quats_xyzw[~chosen] == given.quats_xyzw[~chosen]).all()
     assert [detail.support is None for detail in found.details] == (~chosen).tolist()
-    assert errors_m(found, table)[4] < 0.01
+    assert errors_m(found, NINE)[4] < 0.01
 
 
-def test_a_landmark_without_boxes_stays_and_gets_a_reason(table, boxes):
-    given = disturb(table)
+def test_a_landmark_without_boxes_stays_and_gets_a_reason():
+    given = disturb(NINE)
     ghosts = given.select([0, 1, 2])
     ghosts = replace(ghosts, class_ids=('book', 'book', 'lamp'), details=(LandmarkDetails(),) * 3,
                      centers=np.array([[0.2, -0.3, 1.2], [60.0, 0.0, 40.0], [0.0, 0.0, 2.0]]))
-    refit = refit_map(boxes, join_maps(given, ghosts))
+    refit = refit_map(BOXES, join_maps(given, ghosts))
     assert refit.reasons[:9] == (None,) * 9
     for reason, named in zip(refit.reasons[9:], ('no box', 'in no image', 'lamp'), strict=True):
         assert named in reason
     assert (refit.landmark_map.centers[9:] == ghosts.centers).all()
-    assert errors_m(refit.landmark_map.select(range(9)), table).max() < 0.01
+    assert errors_m(refit.landmark_map.select(range(9)), NINE).max() < 0.01
 
 
-def test_one_side_is_not_enough(table):
-    boxes = see(table, walk_around(frames=12, turn_deg=12.0))
+def test_one_side_is_not_enough():
+    boxes = see(NINE, walk_around(frames=12, turn_deg=12.0))
     with pytest.raises(MappingError, match='one side only'):
-        refit_map(boxes, table)
-    refit = refit_map(boxes, table, np.arange(len(table)) < 8)
+        refit_map(boxes, NINE)
+    refit = refit_map(boxes, NINE, np.arange(len(NINE)) < 8)
     assert ['one side' in str(reason) for reason in refit.reasons] == [True] * 8 + [False]
 
 
 @pytest.mark.parametrize(('turn_deg', 'shift_m', 'scale'), [
     (0, 0.8, 1), (45, 0, 1), (0, 0, 0.5)])
-def test_a_map_in_another_coordinate_frame_is_refused(table, boxes, turn_deg, shift_m, scale):
+def test_a_map_in_another_coordinate_frame_is_refused(turn_deg, shift_m, scale):
     turn = Rotation.from_euler('z', turn_deg, degrees=True)
     elsewhere = replace(
-        table, centers=turn.apply(table.centers * scale) + np.array([shift_m, 0.0, 0.0]),
-        semi_axes=table.semi_axes * scale,
-        quats_xyzw=(turn * Rotation.from_quat(table.quats_xyzw)).as_quat())
+        NINE, centers=turn.apply(NINE.centers * scale) + np.array([shift_m, 0.0, 0.0]),
+        semi_axes=NINE.semi_axes * scale,
+        quats_xyzw=(turn * Rotation.from_quat(NINE.quats_xyzw)).as_quat())
     with pytest.raises(MappingError, match='coordinate frame'):
-        refit_map(boxes, elsewhere)
+        refit_map(BOXES, elsewhere)
 
 
-def test_a_map_of_other_classes_is_refused(table, boxes):
-    foreign = replace(table, class_ids=('tvmonitor',) * len(table))
+def test_a_map_of_other_classes_is_refused():
+    foreign = replace(NINE, class_ids=('tvmonitor',) * len(NINE))
     with pytest.raises(MappingError, match=r'tvmonitor; .*: book, bottle'):
-        refit_map(boxes, foreign)
+        refit_map(BOXES, foreign)
 
 
-def test_a_landmark_does_not_become_a_distant_object(table):
+def test_a_landmark_does_not_become_a_distant_object():
     """A landmark behind an object, seen from the front, overlaps the object's boxes."""
-    table = table.select([0, 2, 3, 4, 5, 6, 7, 8])
-    boxes = see(table, walk_around(turn_deg=50.0))
-    stray = replace(table.select([3]), centers=table.centers[[3]] + [-0.6, -0.25, -0.15],
+    eight = NINE.select([0, 2, 3, 4, 5, 6, 7, 8])
+    boxes = see(eight, walk_around(turn_deg=50.0))
+    stray = replace(eight.select([3]), centers=eight.centers[[3]] + [-0.6, -0.25, -0.15],
                     semi_axes=np.full((1, 3), 0.2))
-    refit = refit_map(boxes, join_maps(table.select([0, 1, 2, 4, 5, 6, 7]), stray))
+    refit = refit_map(boxes, join_maps(eight.select([0, 1, 2, 4, 5, 6, 7]), stray))
     assert refit.reasons[:-1] == (None,) * 7
     assert 'another object' in refit.reasons[-1]
     assert (refit.landmark_map.centers[-1] == stray.centers[0]).all()
@@ -144,24 +137,15 @@ CUP_ON_TABLE = CUP, (0.1, 0.0, 0.85), (0.06, 0.06, 0.08)
 
 def make_map(*things):
     """Return the map of some objects: class, centre and semi-axes of each."""
-    classes, centers, axes = zip(*things, strict=True)
-    return LandmarkMap('map', tuple(f'thing_{row}' for row in range(len(things))), classes,
-                       classes, np.array(centers), np.array(axes),
-                       np.tile([0.0, 0.0, 0.0, 1.0], (len(things), 1)))
+    return map_of(*zip(*things, strict=True))
 
 
-def watch(*things, noise_px=1.0):
+def watch(*things):
     """Return simulated detections of some objects: class, centre, axes, frames with a box."""
-    parts = [see(make_map(thing[:3]), POSES, noise_px, seed=row)
+    parts = [see(make_map(thing[:3]), POSES, noise_px=1.0, seed=row)
              for row, thing in enumerate(things)]
-    parts = [part.select_boxes(frames[part.frames])
-             for part, (*_, frames) in zip(parts, things, strict=True)]
-    frames = np.concatenate([part.frames for part in parts])
-    order = np.argsort(frames, kind='stable')
-    columns = {name: np.concatenate([getattr(part, name) for part in parts])[order]
-               for name in ('bboxes_xyxy', 'classes', 'scores')}
-    return replace(parts[0], frame_offsets=np.searchsorted(frames[order], np.arange(
-        len(POSES) + 1)), **columns)
+    return merged(*(part.select_boxes(frames[part.frames])
+                    for part, (*_, frames) in zip(parts, things, strict=True)))
 
 
 def under(name, thing):

@@ -5,11 +5,12 @@
 from dataclasses import replace
 
 import numpy as np
-from scene import CAMERA, boxes_of
+from scene import CAMERA, boxes_of, map_of
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.mapping.options import PoseErrors
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 CLASSES = ('book', 'bottle', 'cup')
@@ -21,19 +22,16 @@ def make_table(count=9) -> LandmarkMap:
     places = [(0.5 * x, 0.5 * y) for x in (-1, 0, 1) for y in (-1, 0, 1)][:count]
     centers = np.c_[np.array(places), np.full(count, 0.8)] + rng.uniform(-0.05, 0.05, (count, 3))
     quats = Rotation.from_euler('z', rng.uniform(0, np.pi, (count, 1))).as_quat()
-    names = tuple(CLASSES[i % 3] for i in range(count))
-    return LandmarkMap('map', tuple(f'thing_{i}' for i in range(count)), names, names, centers,
-                       rng.uniform(0.06, 0.15, (count, 3)), quats)
+    return replace(map_of([CLASSES[row % 3] for row in range(count)], centers,
+                          rng.uniform(0.06, 0.15, (count, 3))), quats_xyzw=quats)
 
 
-def join_maps(*maps: LandmarkMap) -> LandmarkMap:
+def join_maps(joined: LandmarkMap, *maps: LandmarkMap) -> LandmarkMap:
     """Join the landmarks of several maps; ids get a mark from the second map on."""
-    ids = [name + '_b' * number for number, one in enumerate(maps) for name in one.landmark_ids]
-    labels, classes, details = (sum((getattr(landmark_map, name) for landmark_map in maps), ())
-                                for name in ('labels', 'class_ids', 'details'))
-    arrays = (np.concatenate([getattr(landmark_map, name) for landmark_map in maps])
-              for name in ('centers', 'semi_axes', 'quats_xyzw'))
-    return LandmarkMap(maps[0].frame_id, tuple(ids), labels, classes, *arrays, details)
+    for number, one in enumerate(maps, start=1):
+        joined = joined.with_more(replace(one, landmark_ids=tuple(
+            name + '_b' * number for name in one.landmark_ids)))
+    return joined
 
 
 def moved(table: LandmarkMap, places) -> LandmarkMap:
@@ -92,6 +90,16 @@ def see_rows(table: LandmarkMap, poses, noise_px=0.0, missed=0.0, seed=0, camera
         CLASSES, classes[shown], np.full(len(bboxes), 0.9)), shown
 
 
+def merged(*parts: PosedDetections) -> PosedDetections:
+    """Return the boxes of several recordings of the same frames."""
+    frames = np.concatenate([part.frames for part in parts])
+    order = np.argsort(frames, kind='stable')
+    return replace(
+        parts[0], frame_offsets=np.searchsorted(frames[order], np.arange(len(parts[0]) + 1)),
+        **{name: np.concatenate([getattr(part, name) for part in parts])[order]
+           for name in ('bboxes_xyxy', 'classes', 'scores')})
+
+
 def measure_depth(detections, table, scale=1.0, holes=0.0):
     """Add the depth of the ellipsoid's surface in each box, with errors."""
     rng = np.random.default_rng(0)
@@ -116,3 +124,28 @@ def nearest_errors(built: LandmarkMap, table: LandmarkMap):
         same = np.array([class_id == name for class_id in built.class_ids])
         errors.append(np.linalg.norm(built.centers[same] - center, axis=1).min(initial=np.inf))
     return np.array(errors)
+
+
+def shape_error_m(built: LandmarkMap, table: LandmarkMap):
+    """Return the mean error of distances between landmarks, wherever the map lies [m]."""
+    rows = [np.linalg.norm(built.centers - center, axis=1).argmin() for center in table.centers]
+    found, true = (np.linalg.norm(centers[:, None] - centers[None], axis=2)
+                   for centers in (built.centers[rows], table.centers))
+    return float(np.abs(found - true).mean())
+
+
+def draw_errors(stamps_s, errors: PoseErrors, seed=1):
+    """Return errors (F, 6) of poses: x, y, z [m], rotation vector [rad]."""
+    drawn = np.random.default_rng(seed).normal(size=(len(stamps_s), 6))
+    for frame, step_s in enumerate(np.diff(stamps_s), start=1):
+        kept = np.exp(-step_s / errors.correlation_s) if errors.correlation_s else 0.0
+        drawn[frame] = kept * drawn[frame - 1] + np.sqrt(1.0 - kept ** 2) * drawn[frame]
+    return drawn * errors.sigmas
+
+
+def disturb(detections: PosedDetections, errors) -> PosedDetections:
+    """Return the detections with errors (F, 6) added to their poses, in the map's axes."""
+    poses = detections.map_from_camera.copy()
+    poses[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
+    poses[:, :3, 3] += errors[:, :3]
+    return detections.with_poses(poses)

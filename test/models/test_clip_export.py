@@ -206,8 +206,7 @@ def test_an_export_that_gives_other_results_is_refused(small_clip, tmp_path):
 
 
 @pytest.mark.parametrize(('content', 'message'), [
-    (b'', 'holds no weights'),
-    (b'just text', 'holds no weights'), (b'PK\x03\x04' + bytes(1000), 'truncated'),
+    (b'', 'holds no weights'), (b'PK\x03\x04' + bytes(1000), 'truncated'),
     (b'\x80\x02garbage', 'not a checkpoint')])
 def test_files_that_are_no_weights(small_clip, tmp_path, content, message):
     file = tmp_path / 'weights.pt'

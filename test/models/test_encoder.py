@@ -2,37 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Label embeddings and their cache; images of landmarks; crops that are encoded once."""
 
-import os
-import pickle
 import stat
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from scene import make_room
+from scene import ROOM, embeddings_of, unit_rows
 
 from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.landmark_embeddings import (
-    LandmarkEmbeddings,
-    embeddings_path,
-    save_landmark_embeddings,
-)
+from cliploc_ros.core.map.landmark_embeddings import embeddings_path, save_landmark_embeddings
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.clip_encoder import (
-    ClipEncoder,
-    LabelCache,
-    embed_map,
-    encode_labels,
-    load_encoder_for_map,
-    mixed_rows,
-)
+from cliploc_ros.models import clip_encoder
 from cliploc_ros.models.files import fingerprint_file
 from cliploc_ros.models.observer import Observer, crop_bounds
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
@@ -43,25 +27,22 @@ from demo.truth import read_frames
 
 KEY = 'ViT-B-32:gelu:0123'
 LABELS = ['a red mug', 'tasse bleue é', "it's \0 odd"]
-PROJECT = Path(__file__).resolve().parents[2]
 
 
-def unit_rows(count: int, size: int = 16) -> np.ndarray:
-    rows = np.random.default_rng(0).normal(size=(count, size)).astype(np.float32)
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+def rows_of(count: int, size: int = 16) -> np.ndarray:
+    return unit_rows(np.random.default_rng(0).normal(size=(count, size)).astype(np.float32))
 
 
 @pytest.mark.parametrize('damage', [
     lambda file: file.write_bytes(file.read_bytes()[:200]),
-    lambda file: file.write_bytes(file.read_bytes().replace(unit_rows(3)[1].tobytes(), b'x' * 64)),
-    lambda file: file.write_bytes(pickle.dumps({'embeddings': 1})),
+    lambda file: file.write_bytes(file.read_bytes().replace(rows_of(3)[1].tobytes(), b'x' * 64)),
     lambda file: np.savez(file, other=np.zeros(3)),
-    lambda file: np.savez(file, identity=np.zeros(3, np.uint8), embeddings=unit_rows(3))])
+    lambda file: np.savez(file, identity=np.zeros(3, np.uint8), embeddings=rows_of(3))])
 def test_the_cache_finds_what_it_stored_and_nothing_else(tmp_path, damage, caplog):
-    cache = LabelCache(tmp_path / 'deep' / 'labels')
+    cache = clip_encoder.LabelCache(tmp_path / 'deep' / 'labels')
     for _ in range(2):
-        cache.store(KEY, LABELS, unit_rows(3))
-        assert np.array_equal(cache.load(KEY, LABELS, 16), unit_rows(3))
+        cache.store(KEY, LABELS, rows_of(3))
+        assert np.array_equal(cache.load(KEY, LABELS, 16), rows_of(3))
         for key, labels in (('ViT-B-32:gelu:0124', LABELS), (KEY, LABELS[:2]),
                             (KEY, LABELS[::-1]), (KEY, ['a red mug', 'tasse', "it's \0 odd"])):
             assert cache.load(key, labels, 16) is None
@@ -73,19 +54,6 @@ def test_the_cache_finds_what_it_stored_and_nothing_else(tmp_path, damage, caplo
         caplog.clear()
 
 
-# ---- several labels of a landmark make one embedding
-AXES = {'a': [1.0, 0, 0], 'b': [0, 1.0, 0], 'c': [0, 0.6, 0.8]}
-
-
-def test_the_weighted_mean_in_numbers():
-    def encode(labels):
-        return np.array([AXES[label] for label in labels], dtype=np.float32)
-
-    rows = mixed_rows([(('a', 3.0), ('b', 4.0)), (('c', 0.2),), (('b', 1.0), ('c', 1.0))], encode)
-    assert rows.dtype == np.float32
-    assert rows[0] == pytest.approx([0.6, 0.8, 0.0])
-    assert np.array_equal(rows[1], encode('c')[0])  # to the last bit
-    assert rows[2] == pytest.approx(np.array([0.0, 1.6, 0.8]) / np.sqrt(3.2))
 
 
 @pytest.fixture(scope='module')
@@ -104,7 +72,8 @@ def test_each_class_is_encoded_once(clip, caplog):
     assert list(found) == [MUG, BOX]
     for texts, (own, rows) in found.items():
         assert own == texts
-        np.testing.assert_allclose(rows, encode_labels(weights, texts, clip), atol=1e-6)
+        encoded = clip_encoder.encode_labels(weights, texts, clip)
+        np.testing.assert_allclose(rows, encoded, atol=1e-6)
     assert '3 phrases in 2 groups' in caplog.text
     caplog.clear()
     more = embed_phrases(weights, clip, [MUG, BOX, CAN])
@@ -119,7 +88,6 @@ def test_each_class_is_encoded_once(clip, caplog):
 
 
 # ---- the rows of a map: labels, images, or both
-ROOM = make_room()
 
 
 @pytest.fixture
@@ -130,20 +98,17 @@ def map_file(tmp_path):
 
 def images_of(clip, ids=ROOM.landmark_ids):
     weights = resolve_clip_weights(clip)
-    size = weights.embed_dim
-    means = unit_rows(len(ids), size).astype(np.float16)
-    return LandmarkEmbeddings(weights.key, tuple(ids), means, np.zeros((0, size), np.float16),
-                              np.zeros(len(ids) + 1, np.int64))
+    return embeddings_of(ids, rows_of(len(ids), weights.embed_dim), weights.key)
 
 
 def test_labels_with_weights_are_mixed(clip):
     described = replace(ROOM, details=(
         LandmarkDetails(labels=((ROOM.labels[0], 3.0), ('a red cup', 1.0))),
         *[LandmarkDetails()] * (len(ROOM) - 1)))
-    rows = np.asarray(embed_map(clip, described, [], 'both'))
-    plain = np.asarray(embed_map(clip, ROOM, [], 'both'))
+    rows = np.asarray(clip_encoder.embed_map(clip, described, [], 'both'))
+    plain = np.asarray(clip_encoder.embed_map(clip, ROOM, [], 'both'))
     assert np.array_equal(rows[1:], plain[1:])
-    expected = np.array([3.0, 1.0]) @ encode_labels(
+    expected = np.array([3.0, 1.0]) @ clip_encoder.encode_labels(
         resolve_clip_weights(clip), [ROOM.labels[0], 'a red cup'], clip)
     assert rows[0] == pytest.approx(expected / np.linalg.norm(expected), abs=1e-5)
 
@@ -152,16 +117,16 @@ def test_labels_with_weights_are_mixed(clip):
 def test_images_of_this_encoder_are_compared(clip, map_file, compare):
     images = images_of(clip)
     save_landmark_embeddings(embeddings_path(map_file), images)
-    plain = np.asarray(embed_map(clip, ROOM, [str(map_file)], 'text'))
-    rows = np.asarray(load_encoder_for_map(clip, ROOM, [str(map_file)], compare)[1])
-    assert np.array_equal(plain, np.asarray(embed_map(clip, ROOM, [], compare)))
+    plain = np.asarray(clip_encoder.embed_map(clip, ROOM, [str(map_file)], 'text'))
+    rows = np.asarray(clip_encoder.load_encoder_for_map(clip, ROOM, [str(map_file)], compare)[1])
+    assert np.array_equal(plain, np.asarray(clip_encoder.embed_map(clip, ROOM, [], compare)))
     similar = np.sum(rows * images.means, axis=1)
     assert (similar > np.sum(plain * images.means, axis=1) + 0.2).all()
     if compare == 'image':
         assert np.array_equal(rows, images.means)
     # rows follow the map's order; added landmarks use their label
     save_landmark_embeddings(embeddings_path(map_file), images.in_order(ROOM.landmark_ids[:0:-1]))
-    again = np.asarray(embed_map(clip, ROOM, [str(map_file)], compare))
+    again = np.asarray(clip_encoder.embed_map(clip, ROOM, [str(map_file)], compare))
     assert np.isfinite(again).all()
     assert np.argmax(again[1:] @ images.means[1:].T, axis=1).tolist() == list(range(len(ROOM) - 1))
 
@@ -175,27 +140,23 @@ def test_images_of_several_maps_are_compared_together_or_not_at_all(clip, tmp_pa
     for one, file, images in zip(maps, files, expected, strict=True):
         write_map(file, one)
         save_landmark_embeddings(embeddings_path(file), images)
-    rows = embed_map(clip, both, files, 'image')
+    rows = clip_encoder.embed_map(clip, both, files, 'image')
     assert np.array_equal(np.asarray(rows), np.concatenate([each.means for each in expected]))
     caplog.clear()
     embeddings_path(files[1]).unlink()
-    plain = np.asarray(embed_map(clip, ROOM, [], 'text'))
-    rows = embed_map(clip, both, files, 'image')
+    plain = np.asarray(clip_encoder.embed_map(clip, ROOM, [], 'text'))
+    rows = clip_encoder.embed_map(clip, both, files, 'image')
     assert np.array_equal(np.asarray(rows), plain[[*range(len(ROOM)), 2, 0, 1]])
     warning, = (record for record in caplog.records if record.levelname == 'WARNING')
     assert f'{files[1]} has no image embeddings' in warning.getMessage()
 
 
 # ---- boxes and images
-nan, inf = float('nan'), float('inf')
-
-
 @pytest.mark.parametrize(('bbox', 'bounds'), [
-    ([10.0, 20.0, 30.0, 40.0], [10, 20, 30, 40]), ([10.2, 20.8, 30.1, 40.9], [10, 20, 31, 41]),
+    ([10.2, 20.8, 30.1, 40.9], [10, 20, 31, 41]),
     ([-50.0, -50.0, 1000.0, 1000.0], [0, 0, 64, 48]),
     ([63.5, 47.5, 1e300, 1e300], [63, 47, 64, 48]), ([64.0, 10.0, 80.0, 20.0], None),
-    ([30.0, 10.0, 20.0, 20.0], None), ([nan, 10.0, 20.0, 20.0], None),
-    ([0.0, 0.0, inf, 20.0], None)])
+    ([30.0, 10.0, 20.0, 20.0], None), ([np.nan, 10.0, np.inf, 20.0], None)])
 def test_box(bbox, bounds):
     bboxes = np.array([bbox])
     if bounds is not None:
@@ -234,7 +195,7 @@ def noisy(seed, deviation=3.0):
 
 @pytest.fixture(scope='module')
 def encoder(clip):
-    return ClipEncoder(resolve_clip_weights(clip), clip)
+    return clip_encoder.ClipEncoder(resolve_clip_weights(clip), clip)
 
 
 @pytest.fixture
@@ -285,14 +246,6 @@ def test_without_time_no_crop_fits_and_a_slow_moment_passes(encoder):
 
 
 # ---- the folder of the cache
-RESOLVE = """
-import logging, os, stat
-from cliploc_ros.files.storage import resolve_cache_dir
-logging.basicConfig(format='%(levelname)s %(message)s')
-folder = resolve_cache_dir('')
-assert resolve_cache_dir('') == folder
-print(folder, oct(stat.S_IMODE(folder.stat().st_mode)), folder.stat().st_uid == os.getuid())
-"""
 
 
 def test_the_default_is_the_users_cache(monkeypatch, tmp_path):
@@ -307,16 +260,13 @@ def test_the_default_is_the_users_cache(monkeypatch, tmp_path):
     assert stat.S_IMODE((tmp_path / 'xdg/cliploc_ros').stat().st_mode) == 0o700
 
 
-def test_a_cache_that_others_can_write_to_is_not_used(tmp_path):
-    shared = tmp_path / '.cache/cliploc_ros'
-    shared.mkdir(parents=True)
+def test_a_cache_that_others_can_write_to_is_not_used(monkeypatch, tmp_path, caplog):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
+    shared = tmp_path / 'cliploc_ros'
+    shared.mkdir()
     shared.chmod(0o777)
-    variables = {name: value for name, value in os.environ.items() if name != 'XDG_CACHE_HOME'}
-    done = subprocess.run([sys.executable, '-c', RESOLVE], cwd=PROJECT, text=True, check=True,
-                          env=variables | {'HOME': str(tmp_path), 'TMPDIR': str(tmp_path)},
-                          capture_output=True, timeout=300)
-    folder, mode, is_own = done.stdout.split()
-    assert Path(folder).name.startswith('cliploc_ros_cache_') and mode == '0o700'
-    assert is_own == 'True'
-    assert f'other users own {shared} or can write to it' in done.stderr
-    assert 'set cache_dir' in done.stderr
+    folder = resolve_cache_dir('')
+    assert folder.name.startswith('cliploc_ros_cache_') and resolve_cache_dir('') == folder
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert f'other users own {shared} or can write to it' in caplog.text

@@ -161,19 +161,15 @@ def test_an_interrupted_download_goes_on(hub, tmp_path):
 
 def test_weights_of_a_tag(hub, tmp_path):
     """They are downloaded once, even if they are then refused."""
-    hub.files = {'open_clip_model.safetensors': safetensors(4 * 16)}
+    header = json.dumps({'visual.proj': {'dtype': 'F32', 'shape': [16],
+                                         'data_offsets': [0, 64]}}).encode()
+    hub.files = {'open_clip_model.safetensors': (
+        len(header).to_bytes(8, 'little') + header + bytes(64))}
     text = resolve(tmp_path / 'cache', 'ViT-B-32')['error']  # asks twice
     assert "does not hold the weights of CLIP model 'ViT-B-32'" in text
     assert str(tmp_path / 'cache/weights') in text
     gets = [line for line in hub.requests if line.startswith('GET') and '/resolve/' in line]
     assert len(gets) == 1 and gets[0].endswith('open_clip_model.safetensors')
-
-
-def safetensors(size: int) -> bytes:
-    """Return a file with a tensor of a size in bytes."""
-    header = json.dumps({'visual.proj': {'dtype': 'F32', 'shape': [size // 4],
-                                         'data_offsets': [0, size]}}).encode()
-    return len(header).to_bytes(8, 'little') + header + bytes(size)
 
 
 def test_networks_that_do_not_fit_on_the_disk(hub, tmp_path):

@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 import openvino
 import pytest
+from scene import ROOM
 
 from cliploc_ros.cli.build_map import make_parser
 from cliploc_ros.cli.options import layer_options, read_layer
@@ -66,23 +67,11 @@ def image_rgb(kitchen):
 
 
 @pytest.fixture(scope='module')
-def room(shared_data):
-    """Return any map: these tests use only features."""
-    return LandmarkMap.from_file(shared_data / 'tum_fr3_office' / 'map.yaml')
-
-
-@pytest.fixture(scope='module')
-def layer_file(kitchen, room, xfeat, tmp_path_factory):
+def layer_file(kitchen, xfeat, tmp_path_factory):
     file = tmp_path_factory.mktemp('layer') / 'kitchen.keyframes.npz'
-    save_layer(file, build_layer(kitchen.select(range(0, 30, 3)), room,
+    save_layer(file, build_layer(kitchen.select(range(0, 30, 3)), ROOM,
                                  LayerOptions(0.0, 0.0, kind=xfeat)))
     return file
-
-
-@pytest.fixture
-def no_network(monkeypatch):
-    """Refuse connections at once: no server listens on the port."""
-    monkeypatch.setenv('https_proxy', 'http://127.0.0.1:9')
 
 
 def test_in_any_size_the_network_gives_the_numbers_of_the_published_one(published):
@@ -127,8 +116,8 @@ def test_an_image_of_any_shape_has_features_inside(xfeat, shape):
     assert len(xfeat.extract(np.zeros((*shape, 3), np.uint8), 100, 400).pixels) <= 100
 
 
-def test_a_layer_localizes_real_images(layer_file, room, kitchen, cache_dir):
-    layer = load_layer_of_map(layer_file, room, feature_kinds(str(cache_dir)))
+def test_a_layer_localizes_real_images(layer_file, kitchen, cache_dir):
+    layer = load_layer_of_map(layer_file, ROOM, feature_kinds(str(cache_dir)))
     assert layer.kind.name == 'xfeat-64-uint8'
     assert layer_file.stat().st_size < 60e3 * len(layer)
     localizer = KeyframeLocalizer(pickle.loads(pickle.dumps(layer)))  # as evaluate's workers do
@@ -139,30 +128,29 @@ def test_a_layer_localizes_real_images(layer_file, room, kitchen, cache_dir):
         assert best.inliers > 20
 
 
-def test_features_of_different_kinds_are_not_compared(layer_file, room, image_rgb, cache_dir,
-                                                      tmp_path):
+def test_features_of_different_kinds_are_not_compared(layer_file, image_rgb, cache_dir, tmp_path):
     kinds = feature_kinds(str(cache_dir))
-    layer = load_layer_of_map(layer_file, room, kinds)
+    layer = load_layer_of_map(layer_file, ROOM, kinds)
     with pytest.raises(MapError, match='xfeat-64-uint8: extract them with the kind of the layer'):
         KeyframeLocalizer(layer).localize_features(query_features(image_rgb), layer.cameras[0])
     with pytest.raises(MapError, match=f'expected {SIFT.name}; make the layer again'):
-        load_layer_of_map(layer_file, room)
+        load_layer_of_map(layer_file, ROOM)
     mixed = tmp_path / 'mixed.npz'
     save_layer(mixed, replace(layer, kind=SIFT))
     with pytest.raises(MapError, match=r'of 64 dimensions, expected 128 for kind'):
-        load_layer_of_map(mixed, room, kinds)
+        load_layer_of_map(mixed, ROOM, kinds)
 
 
-@pytest.mark.usefixtures('no_network')
-def test_a_missing_or_another_file_is_named_with_what_to_do(layer_file, room, cache_dir, tmp_path,
-                                                            caplog):
+def test_a_missing_or_another_file_is_named_with_what_to_do(layer_file, cache_dir, tmp_path,
+                                                            caplog, monkeypatch):
+    monkeypatch.setenv('https_proxy', 'http://127.0.0.1:9')  # no server listens on the port
     with pytest.raises(ModelError, match=r'Without a network: download https.*keyframe-features'):
         load_xfeat(str(tmp_path))
     parameters = RelocalizerParameters(keyframes_file=str(layer_file), cache_dir=str(cache_dir))
-    assert len(load_keyframes(parameters, room).localizer.layer) == 10
+    assert len(load_keyframes(parameters, ROOM).localizer.layer) == 10
     parameters = replace(parameters, cache_dir=str(tmp_path))
     with caplog.at_level(logging.ERROR):
-        assert load_keyframes(parameters, room) is None
+        assert load_keyframes(parameters, ROOM) is None
     assert 'without keyframes: cannot download xfeat.onnx' in caplog.text
     assert list((tmp_path / 'weights').iterdir()) == []
     (tmp_path / 'weights' / FILE_NAME).write_bytes(b'<html>')

@@ -19,23 +19,16 @@ import torch
 from open_weights import TextTower, write_open_yolo, write_tower
 from scene import make_room
 from torchvision.ops import box_iou
+from without_pytorch import hide_pytorch
 
 from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models import protocols
 from cliploc_ros.models.files import is_hub_name
 from cliploc_ros.models.onnx_detector import load_detector
-from cliploc_ros.models.protocols import (
-    PROFILES,
-    ClipOptions,
-    DetectorOptions,
-    ObjectDetector,
-    prompts_of_map,
-    prompts_of_names,
-    with_detector,
-    with_encoder,
-)
 from cliploc_ros.models.yolo_weights import import_ultralytics, load_yolo
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions, describe
+from demo import ASSETS
 
 pytestmark = pytest.mark.full
 
@@ -58,8 +51,8 @@ def office_rgb(shared_data) -> list[np.ndarray]:
             for file in sorted((shared_data / 'tum_fr3_office/rgb').iterdir())[::4]]
 
 
-def detector(model: object, cache: Path, **changes) -> ObjectDetector:
-    return load_detector(DetectorOptions(str(model), cache_dir=str(cache), **changes))
+def detector(model: object, cache: Path, **changes) -> protocols.ObjectDetector:
+    return load_detector(protocols.DetectorOptions(str(model), cache_dir=str(cache), **changes))
 
 
 def by_ultralytics(model, image_rgb, **changes):
@@ -200,7 +193,8 @@ def test_ultralytics_stays_off_network_home_and_pip(weights, tmp_path):
     assert [*temporary.glob('cliploc_ros*')] == []
 
 
-THREE = prompts_of_names('mug, office chair, potted plant')
+NOISE_RGB = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+THREE = protocols.prompts_of_names('mug, office chair, potted plant')
 
 
 @pytest.fixture(scope='session')
@@ -212,19 +206,14 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.fixture(scope='session')
-def noise_rgb():
-    return np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
-
-
-def options_of(folder, model='world.pt', prompts=THREE, **changes) -> DetectorOptions:
-    return DetectorOptions(**{
+def options_of(folder, model='world.pt', prompts=THREE, **changes) -> protocols.DetectorOptions:
+    return protocols.DetectorOptions(**{
         'model': str(folder / model), 'conf': 0.0, 'imgsz': 320, 'prompts': prompts,
         'cache_dir': str(folder / 'cache'), 'text_model': str(folder / 'tower.ts'), **changes})
 
 
 @pytest.mark.parametrize('name', ['world.pt', 'yoloe.pt'])
-def test_it_detects_the_texts_as_ultralytics_does(folder, noise_rgb, name):
+def test_it_detects_the_texts_as_ultralytics_does(folder, name):
     exported = load_detector(options_of(folder, name, iou=1.0))
     model = load_yolo(folder / name)
     texts = [text for text, _ in THREE]
@@ -237,8 +226,8 @@ def test_it_detects_the_texts_as_ultralytics_does(folder, noise_rgb, name):
         else:
             model.model.get_text_pe = lambda *_, **__: rows  # its own tower is another package
             model.set_classes(texts)
-    found = exported.detect(noise_rgb)
-    rows, classes = by_ultralytics(model, noise_rgb, conf=0.0, imgsz=320, iou=1.0)
+    found = exported.detect(NOISE_RGB)
+    rows, classes = by_ultralytics(model, NOISE_RGB, conf=0.0, imgsz=320, iou=1.0)
     # random weights give nearly equal scores: rounding decides the order, and which box is dropped
     equal = (np.abs(found.bboxes_xyxy[:50, None] - rows[:, :4]).max(axis=2) < 0.5) & (
         np.array(found.class_ids[:50])[:, None] == classes) & (
@@ -247,11 +236,11 @@ def test_it_detects_the_texts_as_ultralytics_does(folder, noise_rgb, name):
     assert equal.any(axis=1).mean() > 0.7
 
 
-def test_two_texts_of_a_class_find_an_object_once(folder, noise_rgb):
+def test_two_texts_of_a_class_find_an_object_once(folder):
     apart = load_detector(options_of(folder, prompts=(('mug', 'mug'), ('red', 'red'))))
     joined = load_detector(options_of(folder, prompts=(('mug', 'mug'), ('red', 'mug'))))
     assert joined.class_names == ('mug',)
-    both, once = apart.detect(noise_rgb), joined.detect(noise_rgb)
+    both, once = apart.detect(NOISE_RGB), joined.detect(NOISE_RGB)
     assert set(both.class_ids) == {'mug', 'red'} and set(once.class_ids) == {'mug'}
     overlaps = box_iou(*(torch.from_numpy(one.bboxes_xyxy) for one in (both, once))).numpy()
     assert (overlaps.max(axis=1) > 0.7).all(), 'each is represented'
@@ -268,7 +257,7 @@ def test_a_vocabulary_needs_a_network_that_takes_texts_and_its_tower(weights, fo
 
 def test_the_texts_of_a_map():
     room = replace(make_room(), labels=(*['red mug'] * 4, *['white mug'] * 7, 'a'))
-    prompts = prompts_of_map(room, 'map.yaml')
+    prompts = protocols.prompts_of_map(room, 'map.yaml')
     assert prompts[:3] == (('a', 'a'), ('b', 'b'), ('c', 'c'))
     # two of four red mugs are of class a; 'a' is a class, and no other text
     assert prompts[3] == ('red mug', 'a') and prompts[4][0] == 'white mug' and len(prompts) == 5
@@ -286,16 +275,17 @@ def test_profiles_name_published_networks():
     import_ultralytics()
     from ultralytics.utils.downloads import GITHUB_ASSETS_NAMES
 
-    unnamed = ClipOptions(model='', pretrained='')
-    for name, profile in PROFILES.items():
+    unnamed = protocols.ClipOptions(model='', pretrained='')
+    for name, profile in protocols.PROFILES.items():
         assert profile.detector in GITHUB_ASSETS_NAMES or is_hub_name(profile.detector)
         # an entry of the model hub can be stored for a start without a network
         assert is_hub_name(profile.clip_pretrained) or open_clip.get_pretrained_cfg(
             profile.clip_model, profile.clip_pretrained)['hf_hub']
-        assert with_encoder(unnamed, name).pretrained == profile.clip_pretrained
-        assert with_detector(DetectorOptions(''), name).model == profile.detector
+        assert protocols.with_encoder(unnamed, name).pretrained == profile.clip_pretrained
+        unset = protocols.DetectorOptions('')
+        assert protocols.with_detector(unset, name).model == profile.detector
     with pytest.raises(OptionsError, match="profile 'auto' is not one of accurate, balanced"):
-        with_encoder(unnamed, 'auto')
+        protocols.with_encoder(unnamed, 'auto')
 
 
 @pytest.mark.parametrize(('model', 'pretrained', 'path', 'named'), [
@@ -304,6 +294,55 @@ def test_profiles_name_published_networks():
     ('', '', 'weights.pt', ('ViT-L-14', 'openai')),
     ('RN50', 'cc12m', '', ('RN50', 'cc12m'))])
 def test_names_override_a_profile(model, pretrained, path, named):
-    encoder = with_encoder(ClipOptions(model, pretrained, path), 'fast')
+    encoder = protocols.with_encoder(protocols.ClipOptions(model, pretrained, path), 'fast')
     assert (encoder.model, encoder.pretrained) == named
     assert encoder.checkpoint_path == path
+
+
+# ---- weights localize the demo, also without PyTorch once they are exported
+ONNX = (ASSETS / 'yolo.onnx', '', ASSETS / 'clip')
+WEIGHTS = (ASSETS / 'yolo.pt', ASSETS / 'clip.json', ASSETS / 'clip.safetensors')
+
+
+def localize(networks, cache, out, environment):
+    """Run evaluate on some images of the demo."""
+    model, clip_model, pretrained = networks
+    named = ['--clip-model', clip_model] if clip_model else []
+    return subprocess.run(
+        [sys.executable, '-m', 'cliploc_ros.cli.evaluate', '--tum', ASSETS / 'sequence', '--map',
+         ASSETS / 'map.yaml', '--every', '10', '--methods', 'auto', '--trials', '1', '--sweep',
+         '--no-figures', '--workers', '1', '--model', model, *named, '--clip-pretrained',
+         pretrained, '--out', out], env=environment | {'XDG_CACHE_HOME': str(cache)},
+        capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture
+def hidden(tmp_path):
+    (tmp_path / 'hidden').mkdir()
+    return hide_pytorch(tmp_path / 'hidden')
+
+
+@pytest.mark.parametrize(('networks', 'named'), [
+    (WEIGHTS, '--no-clip'), ((WEIGHTS[0], *ONNX[1:]), 'yolo.pt')])
+def test_without_pytorch_weights_are_refused_with_what_to_do(networks, named, hidden, tmp_path):
+    done = localize(networks, tmp_path / 'empty', tmp_path / 'out', hidden)
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    assert 'is not installed' in done.stderr and 'export_network' in done.stderr
+    assert 'script/setup models' in done.stderr and named in done.stderr
+
+
+def test_weights_are_exported_once_and_then_need_no_pytorch(hidden, tmp_path):
+    found = []
+    for networks, environment in ((ONNX, hidden), (WEIGHTS, dict(os.environ)), (WEIGHTS, hidden)):
+        out = tmp_path / str(len(found))
+        done = localize(networks, tmp_path / 'cache', out, environment)
+        assert done.returncode == 0, done.stderr
+        found.append([(row['accepted'], row['error_m'])
+                      for row in json.loads((out / 'results.json').read_text())])
+    onnx, exported, again = found
+    assert exported == again
+    assert [accepted for accepted, _ in onnx] == [accepted for accepted, _ in exported]
+    off = [abs(one - other) for (accepted, one), (_, other) in zip(onnx, exported, strict=True)
+           if accepted]
+    print(f'\n{len(off)} of {len(onnx)} poses accepted, errors differ by {1e3 * max(off):.2f} mm')
+    assert len(off) >= len(onnx) // 2 and max(off) < 0.01

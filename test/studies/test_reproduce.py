@@ -29,6 +29,7 @@ pytestmark = pytest.mark.full
 
 PROJECT = Path(__file__).resolve().parents[2]
 SHIPPED = yaml.safe_load((PROJECT / 'studies/reproduce.yaml').read_text())
+NETWORKS = ('yolo.onnx', 'clip.json', 'clip.safetensors')
 ARCHIVE = 'rgbd_dataset_freiburg3_demo.tgz'
 
 
@@ -61,56 +62,28 @@ class Handler(BaseHTTPRequestHandler):
 def server():
     """Serves the demo's networks, and one of its walks as a sequence of TUM RGB-D."""
     with ThreadingHTTPServer(('127.0.0.1', 0), Handler) as serving:
-        serving.files = {name: (ASSETS / name).read_bytes()
-                         for name in ('yolo.onnx', 'clip.json', 'clip.safetensors')}
-        serving.files[ARCHIVE] = archive_of_walk()
+        serving.files = {name: (ASSETS / name).read_bytes() for name in NETWORKS}
+        content = io.BytesIO()
+        with tarfile.open(fileobj=content, mode='w:gz', compresslevel=1) as archive:
+            archive.add(ASSETS / 'mapping', 'rgbd_dataset_freiburg3_demo')
+        serving.files[ARCHIVE] = content.getvalue()
         serving.asked = []
-        thread = threading.Thread(target=serving.serve_forever, args=(0.05,))
-        thread.start()
+        threading.Thread(target=serving.serve_forever, args=(0.05,), daemon=True).start()
         yield serving
         serving.shutdown()
-        thread.join()
-
-
-def archive_of_walk():
-    """Return a walk as an archive of TUM RGB-D."""
-    content = io.BytesIO()
-    with tarfile.open(fileobj=content, mode='w:gz', compresslevel=1) as archive:
-        archive.add(ASSETS / 'mapping', 'rgbd_dataset_freiburg3_demo')
-    return content.getvalue()
-
-
-def sources_of(address, **changes):
-    """Return sources on a server; few classes are mapped to keep the test short."""
-    sequence = {'name': 'the demo', 'url': f'{address}/{ARCHIVE}', 'megabytes': 4.3,
-                'licence': 'Apache-2.0', 'unpacked': 9, 'queries': 4,
-                'paper': SHIPPED['sequences']['fr3']['paper']}
-    return {
-        'networks': [{'name': name, 'url': f'{address}/{name}', 'megabytes': 2, 'option': option,
-                      'licence': 'Apache-2.0'} for name, option in (
-            ('yolo.onnx', '--model'), ('clip.json', '--clip-model'),
-            ('clip.safetensors', '--clip-pretrained'))],
-        'options': [], 'remarks': ['No frame of this is real.'], 'asking': [
-            '--sweep', '50', '--workers', '1'],
-        'mapping': ['--no-joint', '--moving', 'book, bowl, mug, bottle, can, clock'],
-        'sequences': {'fr3': sequence | changes}}
 
 
 @pytest.fixture
 def write_sources(server, tmp_path):
-    """Write sources for the server with changes of the sequence; return the file."""
+    """Write sources on the server with changes of the sequence; return the file."""
     def write(**changes):
+        sources = yaml.safe_load(Path(__file__).with_name('sources.yaml').read_text().replace(
+            'ADDRESS', f'http://127.0.0.1:{server.server_port}'))
+        sources['sequences']['fr3'] |= {'paper': SHIPPED['sequences']['fr3']['paper'], **changes}
         file = tmp_path / 'sources.yaml'
-        file.write_text(yaml.safe_dump(sources_of(
-            f'http://127.0.0.1:{server.server_port}', **changes), allow_unicode=True))
+        file.write_text(yaml.safe_dump(sources, allow_unicode=True))
         return file
     return write
-
-
-@pytest.fixture
-def cache(tmp_path, monkeypatch):
-    """Set an empty cache of the user, except for the demo's converted networks."""
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
 
 
 @pytest.fixture
@@ -162,7 +135,7 @@ def check_results(out, printed):
     assert names == [f'reproduction/{name}' for name in (
         'table.txt', 'table.csv', 'table.tex', 'page.html', 'about.json', 'fr3/map.yaml',
         'fr3/evaluation/results.json', 'fr3/evaluation/summary.csv')]
-    assert set(about['digests']) == {ARCHIVE, 'yolo.onnx', 'clip.json', 'clip.safetensors'}
+    assert set(about['digests']) == {ARCHIVE, *NETWORKS}
 
 
 def test_it_says_what_it_downloads_and_asks(server, write_sources, run_here, tmp_path,
@@ -214,12 +187,12 @@ def test_a_disk_that_is_too_small_and_another_run(write_sources, refused, tmp_pa
         assert 'another run is at work' in refused(*given, write_sources())
 
 
-def test_sources_that_lack_something(refused, tmp_path):
-    file = tmp_path / 'sources.yaml'
+def test_sources_that_lack_something(write_sources, refused):
+    file = write_sources()
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {'sequences': {}}))
+    assert 'has no sequence fr3' in refused('--sources', file)
     file.write_text('networks: []\nsequences: {fr2: {name: a}}\n')
     assert 'is not like reproduce.yaml' in refused('--sources', file)
-    file.write_text(yaml.safe_dump(sources_of('http://127.0.0.1:9') | {'sequences': {}}))
-    assert 'has no sequence fr3' in refused('--sources', file)
 
 
 def test_seven_scenes_is_an_archive_in_an_archive(shared_data, tmp_path):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Detectors in ONNX files: small ones with constant outputs, invalid and damaged files."""
+"""Detectors and CLIPs in ONNX files: small ones with known outputs, invalid and damaged files."""
 
 import json
 import shutil
@@ -11,11 +11,16 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
+from scene import unit_rows
+from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
 from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
+from cliploc_ros.models.exports import describe_export
 from cliploc_ros.models.files import is_hub_name
+from cliploc_ros.models.onnx_clip import names_onnx, resolve_clip_weights
 from cliploc_ros.models.onnx_detector import load_detector
-from cliploc_ros.models.protocols import DetectorOptions
+from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from demo import ASSETS
 
 
@@ -101,20 +106,19 @@ def write_probe(file, kind=TensorProto.FLOAT, layout='classes'):
                       numpy_helper.from_array(place + 1, f'{name}_to')]
         nodes.append(helper.make_node('Slice', ['float', f'{name}_from', f'{name}_to'], [name]))
     constants.append(numpy_helper.from_array(np.array([1, 2, 1], np.int64), 'column'))
+    nodes += [helper.make_node('Concat', names, ['pair'], axis=1),
+              helper.make_node('Reshape', ['pair', 'column'], ['scores'])]
     if layout == 'classes':  # (1, 4 + classes, boxes): each box has one class
         constants.append(numpy_helper.from_array(rows.T[None], 'boxes'))
-        nodes += [helper.make_node('Concat', names, ['pair'], axis=1),
-                  helper.make_node('Reshape', ['pair', 'column'], ['scores']),
-                  helper.make_node('Mul', ['scores', 'eye'], ['each']),
+        nodes += [helper.make_node('Mul', ['scores', 'eye'], ['each']),
                   helper.make_node('Concat', ['boxes', 'each'], ['output0'], axis=1)]
         shape = (1, 6, 2)
     else:  # (1, boxes, 6): corners, score, class
         edges = np.array([[[22, 27, 42, 37], [22, 27, 42, 37]]], np.float32)
         constants += [numpy_helper.from_array(edges, 'boxes'), numpy_helper.from_array(
             np.array([[[0], [1]]], np.float32), 'numbers')]
-        nodes += [helper.make_node('Concat', names, ['pair'], axis=1),
-                  helper.make_node('Reshape', ['pair', 'column'], ['scores']),
-                  helper.make_node('Concat', ['boxes', 'scores', 'numbers'], ['output0'], axis=2)]
+        nodes.append(helper.make_node('Concat', ['boxes', 'scores', 'numbers'], ['output0'],
+                                      axis=2))
         shape = (1, 2, 6)
     save(file, nodes, constants, [helper.make_tensor_value_info('output0', TensorProto.FLOAT,
                                                                 shape)], TWO, kind)
@@ -184,11 +188,9 @@ def refusal(load, model) -> str:
     ({'logits': np.zeros((1, 1000), np.float32)}, TWO, {}, 'is not a detector: its outputs are'),
     (YOLO, {**TWO, 'task': 'classify'}, {}, "for the task 'classify'"),
     (YOLO, {}, {}, 'config.json is missing; .* has no class names'),
-    (YOLO, {'names': 'what('}, {}, 'class names in its metadata cannot be read'),
     (YOLO, {'names': "{0: 'mug', 2: 'box'}"}, {}, 'with the keys 0, 1'),
     ({'output0': np.zeros((1, 9, 84), np.float32)}, TWO, {}, r'of 2 classes: .*\(9, 84\)'),
     (YOLO, TWO, {'kind': TensorProto.UINT8}, 'images of integers'),
-    (YOLO, TWO, {'shape': (4, 3, 64, 64)}, 'takes no single colour image'),
     (YOLO, TWO, {'shape': (1, 1, 64, 64)}, 'takes no single colour image'),
     (DETR, {}, {}, 'config.json is missing')])
 def test_files_that_are_no_detector(load, tmp_path, outputs, metadata, changes, message):
@@ -205,10 +207,6 @@ def test_configurations_that_do_not_fit(load, tmp_path):
     assert 'not from the same network' in refusal(load, tmp_path)
     write_configs(tmp_path, ('mug', 'box'), size=64)
     assert "'size' has neither" in refusal(load, tmp_path)
-    write_configs(tmp_path, ('mug', 'box'), do_normalize=True)
-    assert "'image_mean'" in refusal(load, tmp_path)
-    (tmp_path / 'preprocessor_config.json').unlink()
-    assert 'preprocessor_config.json is missing' in refusal(load, tmp_path)
     (tmp_path / 'preprocessor_config.json').write_text('[1')
     assert 'cannot be read' in refusal(load, tmp_path)
 
@@ -217,13 +215,10 @@ YOLO_FILE = ASSETS / 'yolo.onnx'
 
 
 def test_damaged_files(load, tmp_path):
-    content = YOLO_FILE.read_bytes()
-    (tmp_path / 'cut.onnx').write_bytes(content[:len(content) // 2])
-    assert 'OpenVINO cannot read' in refusal(load, tmp_path / 'cut.onnx')
-    (tmp_path / 'text.onnx').write_text('hello')
-    assert 'OpenVINO cannot read' in refusal(load, tmp_path / 'text.onnx')
-    (tmp_path / 'empty.onnx').touch()
-    assert 'OpenVINO cannot read' in refusal(load, tmp_path / 'empty.onnx')
+    content, file = YOLO_FILE.read_bytes(), tmp_path / 'file.onnx'
+    for damaged in (content[:len(content) // 2], b'', b'hello'):
+        file.write_bytes(damaged)
+        assert 'OpenVINO cannot read' in refusal(load, file)
     assert 'No such file' in refusal(load, tmp_path / 'gone.onnx')
     network = onnx.load(YOLO_FILE)
     onnx.save(network, tmp_path / 'apart.onnx', save_as_external_data=True,
@@ -246,7 +241,6 @@ def test_a_damaged_compiled_network_is_compiled_again(tmp_path, caplog):
 
     before = boxes()
     blob, = tmp_path.rglob('*.blob')
-    moved = Path(shutil.copytree(tmp_path, tmp_path.with_name('moved')))
     whole = blob.read_bytes()
     half = len(whole) // 2
     for damaged in (whole[:half] + bytes(3000) + whole[half + 3000:], whole[:1000], b''):
@@ -257,10 +251,6 @@ def test_a_damaged_compiled_network_is_compiled_again(tmp_path, caplog):
         caplog.clear()
         assert np.array_equal(boxes(), before) and not caplog.records
         assert [*blob.parent.iterdir()] == [blob]
-    # on a robot, file and cache are in other places
-    copied = shutil.copy(YOLO_FILE, moved / YOLO_FILE.name)
-    load_detector(DetectorOptions(str(copied), cache_dir=str(moved)))
-    assert len(list(moved.rglob('*.blob'))) == 1
 
 
 def test_a_vocabulary_is_refused(load):
@@ -269,8 +259,148 @@ def test_a_vocabulary_is_refused(load):
 
 
 @pytest.mark.parametrize(('model', 'expected'), [
-    ('someone/d-fine.s-coco', True), ('someone/d-fine@v1.0', True), ('yolov8n.pt', False),
-    ('someone/d-fine@main:onnx/model_fp16.onnx', True), ('weights/mine.pt', False),
-    ('/weights/mine', False), ('some/where/mine', False), ('../mine', False), ('', False)])
+    ('someone/d-fine@main:onnx/model_fp16.onnx', True), ('someone/d-fine.s-coco', True),
+    ('yolov8n.pt', False), ('weights/mine.pt', False), ('some/where/mine', False), ('', False)])
 def test_names_of_the_hub(model, expected):
     assert is_hub_name(model) == expected
+
+
+# ---- CLIP in files of transformers and open_clip. The towers are small: an embedding is a linear
+# function of the mean colour, or the mean of the rows of the tokens in a table.
+DIM, WORDS, CONTEXT = 8, 49_408, 77
+RNG = np.random.default_rng(0)
+OF_COLOUR = RNG.normal(size=(3, DIM)).astype(np.float32)
+OF_TOKEN = RNG.normal(size=(WORDS, DIM)).astype(np.float32)
+MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.3, 0.25)
+#: Labels with their tokens, as open_clip and transformers have them.
+TOKENS = {
+    'a red mug': [320, 736, 9722],
+    'Dining-table, 2.5m wide!!': [8658, 268, 2175, 267, 273, 269, 276, 332, 3184, 748],
+    "the dog's bowls, don't": [518, 1929, 568, 17787, 267, 847, 713], 'Büro': [38706, 2795],
+    'ﬁne ﬂoor': [3797, 4125], 'Ｗｉｄｅ': [3184], '&amp; &lt;b&gt;': [261, 283, 321, 285],
+    'cafe\u0301': [15304], '': [], 'very ' * 90: [1070] * (CONTEXT - 2)}
+START, END = 49406, 49407
+
+
+def write_tower(file, given, nodes, constants, shape, kind, output):
+    file.parent.mkdir(exist_ok=True)
+    graph = helper.make_graph(
+        nodes, 'tower', [helper.make_tensor_value_info(given, kind, ('n', *shape))],
+        [helper.make_tensor_value_info(output, TensorProto.FLOAT, ('n', DIM))],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid('', 17)], ir_version=9),
+              file)
+
+
+@pytest.fixture(scope='module')
+def published(tmp_path_factory) -> Path:
+    """Return a folder in the published layout of transformers."""
+    folder = tmp_path_factory.mktemp('published')
+    write_tower(folder / 'onnx/vision_model.onnx', 'pixel_values', [
+        helper.make_node('ReduceMean', ['pixel_values'], ['mean'], axes=[2, 3], keepdims=0),
+        helper.make_node('MatMul', ['mean', 'of_colour'], ['image_embeds'])],
+        {'of_colour': OF_COLOUR}, (3, 224, 224), TensorProto.FLOAT, 'image_embeds')
+    write_tower(folder / 'onnx/text_model.onnx', 'input_ids', [
+        helper.make_node('Gather', ['of_token', 'input_ids'], ['rows']),
+        helper.make_node('ReduceMean', ['rows'], ['text_embeds'], axes=[1], keepdims=0)],
+        {'of_token': OF_TOKEN}, (CONTEXT,), TensorProto.INT64, 'text_embeds')
+    (folder / 'config.json').write_text(json.dumps(
+        {'model_type': 'clip', 'projection_dim': DIM, 'text_config': {}}))
+    (folder / 'preprocessor_config.json').write_text(json.dumps({
+        'crop_size': 224, 'size': {'shortest_edge': 224}, 'image_mean': MEAN, 'image_std': STD,
+        'do_center_crop': True, 'do_normalize': True, 'resample': 3}))
+    shutil.copy(ASSETS / 'clip/textual/tokenizer.json', folder)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def exported(published, tmp_path_factory) -> Path:
+    """Return the same CLIP in the layout of export_network."""
+    folder = tmp_path_factory.mktemp('exported')
+    for name, tower in (('visual', 'vision'), ('textual', 'text')):
+        (folder / name).mkdir()
+        shutil.copy(published / f'onnx/{tower}_model.onnx', folder / name / 'model.onnx')
+    shutil.copy(published / 'tokenizer.json', folder / 'textual')
+    (folder / 'config.json').write_text(json.dumps({'embed_dim': DIM, 'text_cfg': {}}))
+    (folder / 'visual/preprocess_cfg.json').write_text(json.dumps({
+        'size': 224, 'mean': MEAN, 'std': STD, 'interpolation': 'bicubic',
+        'resize_mode': 'shortest'}))
+    describe_export(folder, 'clip:small')
+    return folder
+
+
+def load_clip(folder: Path, cache: Path) -> ClipEncoder:
+    options = ClipOptions(pretrained=str(folder), cache_dir=str(cache))
+    return ClipEncoder(resolve_clip_weights(options), options)
+
+
+@pytest.mark.parametrize('layout', ['published', 'exported'])
+def test_both_layouts_give_the_embeddings_of_their_towers(layout, cache, request):
+    encoder = load_clip(request.getfixturevalue(layout), cache)
+    colours = np.array([[10, 200, 90], [250, 0, 30]], np.uint8)  # RGB
+    image = np.repeat(np.repeat(colours[None], 300, axis=0), 200, axis=1)
+    crops = encoder.encode_crops(image, np.array([[20.0, 10, 180, 290], [210, 100, 390, 140]]))
+    expected = unit_rows((colours / 255 - MEAN) / STD @ OF_COLOUR)
+    np.testing.assert_allclose(crops, expected, atol=1e-2)  # may be encoded in bf16
+    rows = [[START, *tokens, END] + [0] * (CONTEXT - 2 - len(tokens))
+            for tokens in TOKENS.values()]
+    clip = ClipOptions(pretrained=str(request.getfixturevalue(layout)), cache_dir=str(cache))
+    labels = encode_labels(resolve_clip_weights(clip), list(TOKENS), clip)
+    np.testing.assert_allclose(labels, unit_rows(OF_TOKEN[rows].mean(axis=1)), atol=1e-4)
+
+
+def test_a_changed_export_has_another_key(exported, cache, tmp_path):
+    changed = Path(shutil.copytree(exported, tmp_path / 'changed'))
+    network = onnx.load(changed / 'visual/model.onnx')
+    network.producer_name = 'someone'
+    onnx.save(network, changed / 'visual/model.onnx')
+    def key(folder):
+        return resolve_clip_weights(ClipOptions(pretrained=str(folder), cache_dir=str(cache))).key
+
+    assert key(exported) == 'clip:small' and key(changed).startswith('onnx:')
+    for content in ('{"files": 3, "key": "x"}', '[]', '{"files": {"gone": 0}, "key": "x"}'):
+        (changed / 'export.json').write_text(content)
+        assert key(changed).startswith('onnx:')
+
+
+def text_of(file: Path, **changes) -> None:
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+
+def other_words(file: Path) -> None:
+    """Write the tokenizer of another model."""
+    tokenizer = Tokenizer(models.WordLevel({'[UNK]': 0, '[CLS]': 1, '[SEP]': 2} | {
+        f'word{number}': number for number in range(3, 30)}, '[UNK]'))
+    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single='[CLS] $0 [SEP]', special_tokens=[('[CLS]', 1), ('[SEP]', 2)])
+    tokenizer.save(str(file))
+
+
+@pytest.mark.parametrize(('change', 'named'), [
+    (lambda folder: (folder / 'config.json').unlink(), 'config.json is missing'),
+    (lambda folder: text_of(folder / 'config.json', projection_dim=99), 'expected one output'),
+    (lambda folder: text_of(folder / 'preprocessor_config.json', crop_size=256), '256 x 256'),
+    (lambda folder: text_of(folder / 'preprocessor_config.json', image_std=[0, 1, 1]), 'deviat'),
+    (lambda folder: (folder / 'tokenizer.json').unlink(), 'tokenizer.json is missing'),
+    (lambda folder: (folder / 'tokenizer.json').write_text('{}'), 'not a tokenizer of a CLIP'),
+    (lambda folder: other_words(folder / 'tokenizer.json'), 'it has 30 tokens, but the text'),
+    (lambda folder: shutil.copy(ASSETS / 'yolo.onnx', folder / 'onnx/text_model.onnx'),
+     'takes no tokens'),
+])
+def test_what_is_no_clip(published, cache, tmp_path, change, named):
+    folder = Path(shutil.copytree(published, tmp_path / 'clip'))
+    change(folder)
+    clip = ClipOptions(pretrained=str(folder), cache_dir=str(cache))
+    with pytest.raises(ModelError) as caught:
+        ClipEncoder(resolve_clip_weights(clip), clip)
+        encode_labels(resolve_clip_weights(clip), ['a cup'], clip)
+    assert named in str(caught.value) and str(folder) in str(caught.value)
+
+
+def test_a_folder_may_have_the_name_of_a_tag(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'openai').mkdir()
+    assert not names_onnx(ClipOptions('ViT-B-32', 'openai'))
+    assert not names_onnx(ClipOptions('ViT-B-32', ''))
+    assert names_onnx(ClipOptions('', './openai')) and names_onnx(ClipOptions('', 'some/one'))
