@@ -1,10 +1,19 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
+import copy
+import math
+
 import pytest
+from builtin_interfaces.msg import Time
 from hypothesis import given
 from hypothesis import strategies as st
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+from vision_msgs.msg import Detection2DArray
 
+from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.stamps import ExactPairing
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 TOPICS = ('image', 'camera_info', 'detections')
 LIMITS = {'image': 100, 'camera_info': 30, 'detections': 50}
@@ -87,3 +96,39 @@ def test_how_late_detections_of_forgotten_images_are():
     pairing.clear()
     assert pairing.received == {'image': 0, 'detections': 0} and pairing.last_stamp_ns == {}
     assert pairing.add('image', 3, 3, 100) is None
+
+
+# ---- with real messages of depth ----------------------------------------------------------------
+
+PERIOD_NS = 33_333_333
+
+
+def stamped(msg, number):
+    found, ns = copy.copy(msg), (number + 1) * PERIOD_NS  # all share the same pixels
+    found.header = Header(stamp=Time(sec=ns // 10**9, nanosec=ns % 10**9), frame_id='camera')
+    return found
+
+
+@pytest.mark.parametrize(('late', 'depth_bytes', 'share'), [
+    (3, 2 * 1280 * 720, 1.0), (45, 2 * 1280 * 720, 0.45), (45, 4 * 1920 * 1080, 0.1)])
+def test_depth_waits_as_long_as_its_image_does(make_node, late, depth_bytes, share):
+    """A camera at 30 Hz, whose detections arrive some images late.
+
+    More images than fit into memory: some are left out, but not all.
+    """
+    frames, depth = [], Image(data=bytes(depth_bytes))
+    source = FrameSource(make_node(), RelocalizerParameters(depth_transport='raw'), math.inf,
+                         frames.append)
+    source.open()
+    for number in range(3 * late + 30):
+        for name, msg in (('depth', depth), ('image', Image(data=[number % 256])),
+                          ('camera_info', CameraInfo())):
+            source._receive(name, stamped(msg, number))
+        if number >= late:
+            source._receive('detections', stamped(Detection2DArray(), number - late))
+    source.close('the end')
+    depths = [frame.depth for frame in frames]
+    assert len(frames) > 20
+    assert sum(depth is not None for depth in depths) >= share * len(frames)
+    for frame in frames:
+        assert frame.depth is None or frame.depth.header.stamp == frame.image.header.stamp
