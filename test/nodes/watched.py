@@ -7,9 +7,9 @@ import time
 import numpy as np
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import MAP_FROM_CAMERA, make_room, see_room
 from std_msgs.msg import Header
-from tester import RELIABLE, make_frame, transform_of
+from tester import PIXELS, RELIABLE, make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import (
     invert_transform,
@@ -19,7 +19,6 @@ from cliploc_ros.core.geometry.transforms import (
 from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg
 
 ROOM = make_room()
-NOISE = np.random.default_rng(0).integers(0, 256, 3 * CAMERA.width * CAMERA.height, np.uint8)
 # The camera looks along the base's x axis.
 MOUNT = [0.0, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5]
 BASE_FROM_CAMERA = transform_from_pose(np.array(MOUNT[:3]), np.array(MOUNT[3:]))
@@ -81,7 +80,7 @@ class Robot:
         if self._tick % 2 == 0:
             seen = see_room(ROOM, self.map_from_base @ BASE_FROM_CAMERA)
             image, *others = make_frame(self.sees(seen), now_s)
-            image.data = np.roll(NOISE, self._tick).tobytes()  # a frozen image is a fault
+            image.data = np.roll(PIXELS, self._tick).tobytes()  # a frozen image is a fault
             self._tester.publish((image, *others))
         if self._tester.initial_poses:  # as AMCL accepts it at rest
             given = transform_of(self._tester.initial_poses.pop().pose.pose)
