@@ -14,12 +14,11 @@ import time
 import cv2
 import numpy as np
 import rclpy
+from processes import wait_for
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scene import MAP_FROM_CAMERA, make_room, see_room
 from sensor_msgs.msg import CompressedImage
 from tester import Tester, make_frame
-
-_PERIOD_S = 0.2
 
 
 def frames(count):
@@ -36,21 +35,17 @@ def frames(count):
 
 
 def ask(camera, frame):
-    """Request a pose and publish a frame, each time with a new stamp; return the results."""
-    began_at, shown_at, answers = time.monotonic(), -1.0, []
-    future = camera.ask()
-    future.add_done_callback(answers.append)
-    while not future.done() and time.monotonic() - began_at < 60.0:
-        if time.monotonic() - shown_at > _PERIOD_S:
-            shown_at = time.monotonic()
-            frame[0].header.stamp.nanosec += 1_000_000  # the stamp of all three messages
-            camera.publish(frame)
-        camera.spin()
-    took_s = time.monotonic() - began_at
-    while time.monotonic() - began_at < took_s + 0.5:  # wait for an unwanted second answer
-        camera.spin()
+    """Request a pose and publish a frame, each time with a new stamp; return the result."""
+    began_at, future = time.monotonic(), camera.ask()
+
+    def publish():
+        frame[0].header.stamp.nanosec += 1_000_000  # the stamp of all three messages
+        camera.publish(frame)
+        for _ in range(10):
+            camera.spin()
+    wait_for(future.done, 'an answer', work=publish)
     answer = future.result()
-    return {'seconds': round(took_s, 3), 'answers': len(answers), 'message': answer.message,
+    return {'seconds': round(time.monotonic() - began_at, 3), 'message': answer.message,
             'success': answer.success}
 
 
