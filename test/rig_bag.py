@@ -93,6 +93,25 @@ def depth_message(stamp, values, frame='camera'):
         data=np.frombuffer(values.tobytes(), dtype=np.uint8))
 
 
+def camera_messages(at, pixels, camera, frame='camera', stamp=None):
+    """Return an image and its camera_info for `write_messages`; `stamp`: other than the time."""
+    stamp = at if stamp is None else stamp
+    return [(at, '/image', bag_messages.IMAGE, bag_messages.image_message(stamp, frame, pixels)),
+            (at, '/camera_info', bag_messages.CAMERA_INFO,
+             bag_messages.camera_info_message(stamp, frame, camera))]
+
+
+def pose_messages(poses, topic='/pose', late_ns=0):
+    """Return poses of the camera, given with their times, for `write_messages`."""
+    return [(at, topic, bag_messages.POSE, bag_messages.pose_message(at + late_ns, 'map', pose))
+            for at, pose in poses]
+
+
+def tf_messages(poses, parent='map', child='camera', topic='/tf'):
+    """Return poses as transforms, given with their times, for `write_messages`."""
+    return [(at, topic, TF, transform(at, parent, child, pose)) for at, pose in poses]
+
+
 def write_messages(path, recorded):
     """Write messages, given by time of recording [ns], topic, type and message, in any order."""
     with BagWriter(path) as bag:
