@@ -31,15 +31,9 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.cli.tum_to_bag import main
 from cliploc_ros.messages import image_from_msg
-from cliploc_ros.offline.datasets import bag_messages
+from cliploc_ros.offline.datasets import bag_messages, tum
 from cliploc_ros.offline.datasets.bags import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter
 from cliploc_ros.offline.datasets.parsing import PRESETS
-from cliploc_ros.offline.datasets.tum import (
-    ConversionOptions,
-    convert_tum,
-    read_recorded_detections,
-    read_tum,
-)
 
 PROJECT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 120.0  # only to stop hangs, on a machine under load
@@ -160,8 +154,8 @@ def offset_ms(data):
 
 def test_real_frames_arrive_byte_identical(shared_data, tmp_path, listener):
     folder, bag, expected = shared_data / 'tum_fr3_office', tmp_path / 'bag', defaultdict(list)
-    detections = read_recorded_detections(folder / 'detections.json')
-    convert_tum(read_tum(folder), PRESETS['fr3'], bag, ConversionOptions(), detections)
+    detections = tum.read_recorded_detections(folder / 'detections.json')
+    tum.convert_tum(tum.read_tum(folder), PRESETS['fr3'], bag, tum.ConversionOptions(), detections)
     with BagReader(bag) as reader:
         for message in reader.messages():
             expected[message.topic].append(message.data)

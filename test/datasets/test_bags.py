@@ -13,38 +13,32 @@ from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.messages import camera_from_msg, detections_from_msg, image_from_msg
-from cliploc_ros.offline.datasets import bag_messages
-from cliploc_ros.offline.datasets.bags import (
-    LATCHED_QOS,
-    RELIABLE_QOS,
-    STORAGES,
-    BagMessage,
-    BagReader,
-    BagWriter,
-    typestore,
-)
+from cliploc_ros.offline.datasets import bag_messages, bags
 from cliploc_ros.ros.conversions import pose_from_msg
 
 STRING = 'std_msgs/msg/String'
 # Hashes from ROS's generator, not computed here.
 STRING_HASH = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
-QOS = {'/chatter': RELIABLE_QOS, '/robot_description': LATCHED_QOS, '/status': RELIABLE_QOS}
+QOS = {'/chatter': bags.RELIABLE_QOS, '/robot_description': bags.LATCHED_QOS,
+       '/status': bags.RELIABLE_QOS}
 
 
 def make_messages(count):
     """Yield messages of three topics in turn, the third with the stamp of the second."""
-    text = typestore().types[STRING]
-    return [BagMessage([*QOS][number % 3], 10**18 + (number - (number % 3 == 2)) * 100_000_001,
-                       bytes(typestore().serialize_cdr(text(f'message {number}'), STRING)))
+    store = bags.typestore()
+    text = store.types[STRING]
+    return [bags.BagMessage([*QOS][number % 3],
+                            10**18 + (number - (number % 3 == 2)) * 100_000_001,
+                            bytes(store.serialize_cdr(text(f'message {number}'), STRING)))
             for number in range(count)]
 
 
 def write_bag(path, storage, messages, compression='NONE'):
     """Write a recording as `ros2 bag record` does; a user has edited the QoS of /status."""
-    writer = Writer(path, version=9, storage_plugin=STORAGES[storage])
+    writer = Writer(path, version=9, storage_plugin=bags.STORAGES[storage])
     writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
     with writer:
-        topics = {name: writer.add_connection(name, STRING, typestore=typestore(),
+        topics = {name: writer.add_connection(name, STRING, typestore=bags.typestore(),
                                               offered_qos_profiles=[qos])
                   for name, qos in QOS.items()}
         for message in messages:
@@ -56,12 +50,12 @@ def write_bag(path, storage, messages, compression='NONE'):
     return path
 
 
-@pytest.mark.parametrize('storage', STORAGES)
+@pytest.mark.parametrize('storage', bags.STORAGES)
 @pytest.mark.parametrize('compression', ['NONE', 'FILE', 'MESSAGE'])
 def test_reads_what_jazzy_records(tmp_path, storage, compression):
     messages = make_messages(18)
     bag = write_bag(tmp_path / 'bag', storage, messages, compression)
-    with BagReader(bag) as reader:
+    with bags.BagReader(bag) as reader:
         assert list(reader.messages()) == messages
         assert reader.message_count == 18
         assert (reader.start_ns, reader.end_ns) == (messages[0].stamp_ns, messages[-1].stamp_ns)
@@ -88,7 +82,7 @@ def truncate(path, size):
 def test_broken_recordings_are_refused(tmp_path, damage, reason):
     bag = write_bag(tmp_path / 'bag', 'mcap', make_messages(30))
     damage(bag)
-    with pytest.raises(DatasetError, match=reason), BagReader(bag) as reader:
+    with pytest.raises(DatasetError, match=reason), bags.BagReader(bag) as reader:
         list(reader.messages())
 
 
@@ -107,11 +101,11 @@ def test_messages_come_back(tmp_path):
         bag_messages.CAMERA_INFO: bag_messages.camera_info_message(STAMP_NS, 'camera', CAMERA),
         bag_messages.DETECTIONS: bag_messages.detections_message(STAMP_NS, 'camera', detections),
         bag_messages.POSE: bag_messages.pose_message(STAMP_NS, 'world', map_from_camera)}
-    with BagWriter(tmp_path / 'bag') as bag:
+    with bags.BagWriter(tmp_path / 'bag') as bag:
         for number, (msgtype, message) in enumerate(written.items()):
             bag.add_topic(f'/topic_{number}', msgtype)
             bag.write(f'/topic_{number}', STAMP_NS, message)
-    with BagReader(tmp_path / 'bag') as reader:
+    with bags.BagReader(tmp_path / 'bag') as reader:
         raws = sorted(reader.messages(), key=lambda one: one.topic)
         image, info, array, pose = map(reader.deserialize, raws)
     assert {raw.stamp_ns for raw in raws} == {bag_messages.stamp_ns(image)} == {STAMP_NS}
@@ -129,11 +123,11 @@ def test_messages_come_back(tmp_path):
     np.testing.assert_allclose(pose_from_msg(pose.pose), map_from_camera, atol=1e-15)
 
 
-@pytest.mark.parametrize('plugin', STORAGES)
+@pytest.mark.parametrize('plugin', bags.STORAGES)
 def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
-    with BagWriter(tmp_path / 'office', plugin) as bag:
-        bag.add_topic('/pose', bag_messages.POSE, RELIABLE_QOS)
-        bag.add_topic('/map', bag_messages.DETECTIONS, LATCHED_QOS)
+    with bags.BagWriter(tmp_path / 'office', plugin) as bag:
+        bag.add_topic('/pose', bag_messages.POSE, bags.RELIABLE_QOS)
+        bag.add_topic('/map', bag_messages.DETECTIONS, bags.LATCHED_QOS)
         for index in range(3):
             message = bag_messages.pose_message(STAMP_NS + index, 'world', np.eye(4))
             bag.write('/pose', STAMP_NS + index, message)
@@ -161,14 +155,14 @@ def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
 def test_existing_output_is_kept(tmp_path):
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / 'precious').write_text('data')
-    with pytest.raises(DatasetError, match='already exists'), BagWriter(tmp_path / 'bag'):
+    with pytest.raises(DatasetError, match='already exists'), bags.BagWriter(tmp_path / 'bag'):
         pass
     assert [path.name for path in tmp_path.rglob('*')] == ['bag', 'precious']
 
 
-@pytest.mark.parametrize('plugin', STORAGES)
+@pytest.mark.parametrize('plugin', bags.STORAGES)
 def test_failure_leaves_nothing(tmp_path, plugin):
-    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', plugin) as bag:
+    with pytest.raises(ZeroDivisionError), bags.BagWriter(tmp_path / 'bag', plugin) as bag:
         bag.add_topic('/pose', bag_messages.POSE)
         bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
         assert not (tmp_path / 'bag').exists()  # written beside its final path

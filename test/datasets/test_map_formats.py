@@ -4,18 +4,9 @@
 
 import json
 
+import foreign_maps as written
 import numpy as np
 import pytest
-from foreign_maps import (
-    dual_quadric,
-    goreloc_file,
-    goreloc_object,
-    msgloc_text,
-    oaslam_files,
-    oaslam_text,
-    table_text,
-    varint,
-)
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
@@ -26,7 +17,7 @@ from studies.foreign_maps import COCO, main, read_goreloc, read_msgloc, read_oas
 
 HERE = ('map', 1.0, np.eye(4))
 CUP = COCO.index('cup')
-SPHERE = dual_quadric([1, 2, 3], [0.1, 0.2, 0.3], [0, 0, 0, 1])
+SPHERE = written.dual_quadric([1, 2, 3], [0.1, 0.2, 0.3], [0, 0, 0, 1])
 
 
 @pytest.fixture
@@ -57,18 +48,18 @@ VASE = (('book', 0.75), ('vase', 0.25))
 
 
 @pytest.mark.parametrize(('read', 'name', 'content', 'weights', 'support', 'note'), [
-    (read_goreloc, 'm.objects', goreloc_file, VASE, None, ''),
-    (read_oaslam, 'm.txt', oaslam_text, None, None, 'a monocular map of OA-SLAM has no metric'),
-    (read_oaslam, 'map_m.mapobjects', lambda given: oaslam_files(given)[0], None, 4,
+    (read_goreloc, 'm.objects', written.goreloc_file, VASE, None, ''),
+    (read_oaslam, 'm.txt', written.oaslam_text, None, None, 'a monocular map of OA-SLAM'),
+    (read_oaslam, 'map_m.mapobjects', lambda given: written.oaslam_files(given)[0], None, 4,
      'a monocular map'),
     # quaternions are w, x, y, z; signs of radii mean nothing; shares are not likelihoods
-    (read_msgloc, 'm.json', msgloc_text, VASE, None, '4 landmarks')])
+    (read_msgloc, 'm.json', written.msgloc_text, VASE, None, '4 landmarks')])
 def test_maps_of_other_systems(true_map, tmp_path, read, name, content, weights, support, note):
     path = write(tmp_path / name, content(true_map))
     if support:
         with pytest.raises(DatasetError, match='objecttracks'):
             read(path, COCO)
-        write(path.with_suffix('.objecttracks'), oaslam_files(true_map)[1])
+        write(path.with_suffix('.objecttracks'), written.oaslam_files(true_map)[1])
     given = read(path, COCO)
     found, left_out = import_all(given)
     assert left_out == [] and ''.join(given.notes).startswith(note)
@@ -102,7 +93,7 @@ def test_scale_and_transform(true_map, tmp_path):
     turn = Rotation.from_euler('xyz', [0.3, -1.0, 2.0])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn.as_matrix(), [5.0, 6.0, 7.0]
-    path = write(tmp_path / 'm.csv', table_text(true_map))
+    path = write(tmp_path / 'm.csv', written.table_text(true_map))
     given = read_table(path)
     given.landmarks[0] = given.landmarks[0]._replace(details=LandmarkDetails(position_sigma=0.2))
     found, _ = import_all(given, ('world', 2.0, pose))
@@ -116,8 +107,8 @@ def test_scale_and_transform(true_map, tmp_path):
 
 @pytest.mark.parametrize(('read', 'content', 'message'), [
     (read_msgloc, b'[' * 100_000, 'is not JSON'),
-    (read_goreloc, goreloc_object(0, SPHERE, [(CUP, 1)])[:-1], r'byte \d+'),
-    (read_goreloc, b'\x0a' + varint(2**60), f'{2**60} bytes'),
+    (read_goreloc, written.goreloc_object(0, SPHERE, [(CUP, 1)])[:-1], r'byte \d+'),
+    (read_goreloc, b'\x0a' + written.varint(2**60), f'{2**60} bytes'),
     (read_oaslam, b'1 41 0.1 0.2', 'line 1: expected')])
 def test_broken_files_are_refused(tmp_path, read, content, message):
     path = write(tmp_path / 'broken', content)
@@ -130,7 +121,7 @@ def test_what_is_no_ellipsoid_is_left_out_with_the_reason(tmp_path):
     quadrics = [(np.diag([0.04, -0.04, 0.01, -1.0]), 'not an ellipsoid: squared semi-axes'),
                 (SPHERE * np.nan, 'not finite'), (SPHERE.ravel()[:9], 'has 9 numbers, not 16')]
     path = write(tmp_path / 'm.objects', b''.join(
-        goreloc_object(row, quadric, [(CUP, 1)])
+        written.goreloc_object(row, quadric, [(CUP, 1)])
         for row, quadric in enumerate([*(one for one, _ in quadrics), SPHERE])))
     found, left_out = import_all(read_goreloc(path, COCO))
     assert found.landmark_ids == ('cup_3',)

@@ -7,12 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-    shape_matrices,
-)
+from cliploc_ros.core.geometry import ellipsoid
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.parsing import find_camera
@@ -58,11 +53,11 @@ def test_boxes_are_where_the_ellipsoids_project(room, renderer):
             if seen['visibility'] < 0.9:
                 continue
             entry = next(o for o in room.objects if o.name == seen['object']).landmark()
-            shape = shape_matrices(np.array([entry['semi_axes']]),
+            shape = ellipsoid.shape_matrices(np.array([entry['semi_axes']]),
                                    np.array([entry['orientation']]))
             centers = np.array([entry['center']])
-            outline = project_ellipsoids(invert_transform(pose), centers, shape)
-            box = ellipse_bboxes(ellipses_in_pixels(outline, CAMERA))[0]
+            outline = ellipsoid.project_ellipsoids(invert_transform(pose), centers, shape)
+            box = ellipsoid.ellipse_bboxes(ellipsoid.ellipses_in_pixels(outline, CAMERA))[0]
             overlaps.append(_iou(box, np.array(seen['bbox_xyxy'])))
     print(f'{len(overlaps)} whole objects: box IoU median {np.median(overlaps):.2f}, '
           f'least {min(overlaps):.2f}')

@@ -28,12 +28,7 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
 from cliploc_ros.offline.datasets.observations import load_observations
-from cliploc_ros.offline.recording.recorder import (
-    KeyframeFilter,
-    KeyframeOptions,
-    RecordingOptions,
-    record_once,
-)
+from cliploc_ros.offline.recording import recorder
 
 PROJECT = Path(__file__).resolve().parents[2]
 ASSETS = PROJECT / 'demo/assets'
@@ -142,15 +137,16 @@ def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen):
         for place in range(seen):
             yield RawFrame(place, place, np.eye(4), lambda: (image, camera), None)
         raise DatasetError('ends here')
-    options = RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx')), None)
+    frames = Frames(tmp_path / 'walk', 3, read)
+    options = recorder.RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx')), None)
     with pytest.raises(DatasetError, match='ends here'):
-        record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
+        recorder.record_once(frames, options, tmp_path / 'seen.npz')
     left = list(tmp_path.iterdir())
     assert len(left) == bool(seen)
     for path in left:  # while another run has it open
         with path.open('ab') as other, pytest.raises(DatasetError, match='ends here'):
             fcntl.flock(other, fcntl.LOCK_EX)
-            record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
+            recorder.record_once(frames, options, tmp_path / 'seen.npz')
         assert len(list(tmp_path.iterdir())) == 1
     assert all(str(path) in caplog.text for path in left)
 
@@ -244,7 +240,7 @@ def pose(x=0.0, turn_deg=0.0):
 
 
 def test_keyframes_by_distance_angle_and_pose():
-    is_keyframe = KeyframeFilter(KeyframeOptions(0.1, 5.0))
+    is_keyframe = recorder.KeyframeFilter(recorder.KeyframeOptions(0.1, 5.0))
     walk = [None, pose(), pose(0.06), pose(0.11), None, pose(0.11, 4.0), pose(0.11, 6.0),
             pose(0.205, 6.0), pose(0.215, 6.0)]
     assert [is_keyframe(place, place, one) for place, one in enumerate(walk)] == [

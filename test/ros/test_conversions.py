@@ -11,12 +11,7 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 from std_msgs.msg import Header
-from vision_msgs.msg import (
-    Detection2D,
-    Detection2DArray,
-    ObjectHypothesis,
-    ObjectHypothesisWithPose,
-)
+from vision_msgs import msg as vision
 
 from cliploc_ros.core.geometry.transforms import pose_error, transform_from_pose
 from cliploc_ros.core.observation import Detections
@@ -151,7 +146,7 @@ def test_detections_come_back_over_the_wire(found):
     sent = Detections(boxes, tuple(name for _, name, _ in found),
                       np.array([score for _, _, score in found], dtype=np.float64))
     msg = deserialize_message(serialize_message(detections_to_msg(sent, HEADER)),
-                              Detection2DArray)
+                              vision.Detection2DArray)
     assert msg.header == HEADER
     assert all(detection.header == HEADER for detection in msg.detections)
     received = detections_from_msg(msg)
@@ -168,14 +163,14 @@ def test_detections_come_back_over_the_wire(found):
 
 
 def classified(*hypotheses):
-    return Detection2D(results=[
-        ObjectHypothesisWithPose(hypothesis=ObjectHypothesis(class_id=class_id, score=score))
-        for class_id, score in hypotheses])
+    return vision.Detection2D(results=[
+        vision.ObjectHypothesisWithPose(hypothesis=vision.ObjectHypothesis(
+            class_id=class_id, score=score)) for class_id, score in hypotheses])
 
 
 def test_the_most_confident_class_counts():
     nan = float('nan')  # does not hide another class
-    msg = Detection2DArray(detections=[
+    msg = vision.Detection2DArray(detections=[
         classified(('cup', 0.2), ('vase', 0.7), ('bowl', 0.1)), classified(),
         classified(('chair', 0.5)), classified(('cup', 0.9), ('vase', nan)),
         classified(('vase', nan), ('cup', 0.9))])

@@ -10,13 +10,7 @@ from handing_over import stamp
 from rclpy.parameter import Parameter
 from rclpy.time import Time as RosTime
 
-from cliploc_ros.ros.inputs.stamps import (
-    MessageStamps,
-    StampOrder,
-    TimeJumpError,
-    TimeJumps,
-    stamp_problem,
-)
+from cliploc_ros.ros.inputs import stamps as times
 
 S = 1_000_000_000
 
@@ -35,20 +29,20 @@ def set_time(node, *moments_s):
 def is_refused(jumps, stamp_s, received_at):
     try:
         jumps.check(stamp(stamp_s), received_at)
-    except TimeJumpError:
+    except times.TimeJumpError:
         return True
     return False
 
 
 def test_messages_from_before_a_jump_are_refused(node):
     forgot = []
-    jumps = TimeJumps(node, lambda: forgot.append(node.get_clock().now().nanoseconds))
+    jumps = times.TimeJumps(node, lambda: forgot.append(node.get_clock().now().nanoseconds))
     set_time(node, *(3 * (100.0, 101.0)), 102.0)
     assert forgot == [100 * S, 100 * S], 'a bag that loops jumps back once a round'
     before = time.monotonic()
     set_time(node, 97.0)
     after = time.monotonic()
-    with pytest.raises(TimeJumpError, match=r' 5\.000 s'):
+    with pytest.raises(times.TimeJumpError, match=r' 5\.000 s'):
         jumps.check(stamp(101.9), before)
     assert is_refused(jumps, 97.0, before), 'its counterparts may be from before the jump'
     assert is_refused(jumps, 101.9, after + 60.0), 'it waited in the middleware'
@@ -56,13 +50,13 @@ def test_messages_from_before_a_jump_are_refused(node):
     set_time(node, 101.9)
     assert not is_refused(jumps, 101.9, after), 'time went on'
     node.set_parameters([Parameter('use_sim_time', value=False)])
-    with pytest.raises(TimeJumpError, match='use_sim_time'):
+    with pytest.raises(times.TimeJumpError, match='use_sim_time'):
         jumps.check(stamp(101.9), after)
     assert len(forgot) == 4
 
 
 def test_stamps_of_a_stream_that_go_back_end_all_streams():
-    order = StampOrder()
+    order = times.StampOrder()
 
     def goes_back(*stamps_s, stream='odom'):
         return [order.goes_back(stream, round(stamp_s * S)) for stamp_s in stamps_s]
@@ -78,12 +72,13 @@ def test_stamps_of_a_stream_that_go_back_end_all_streams():
     (Time(), 'is 0'), (Time(sec=-1, nanosec=5), 'is -1 s'),
     (Time(sec=1, nanosec=2**32 - 1), 'has 4294967295 nanoseconds'), (Time(sec=9, nanosec=S), '')])
 def test_a_stamp_that_is_no_time(given, problem):
-    assert stamp_problem(given).startswith(problem) and bool(stamp_problem(given)) == bool(problem)
+    found = times.stamp_problem(given)
+    assert found.startswith(problem) and bool(found) == bool(problem)
 
 
 def named(*messages, stamps=None):
     """Feed stamps and contents, .1 s apart; return the reported ones, and the stamps."""
-    stamps = stamps or MessageStamps()
+    stamps = stamps or times.MessageStamps()
     return [stamps.add(stamp(one), content, 500.0 + 0.1 * number)
             for number, (one, content) in enumerate(messages)], stamps
 

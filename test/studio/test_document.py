@@ -15,13 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from studio_map import TEXT
 
-from cliploc_ros.core.map.landmark_embeddings import (
-    LandmarkEmbeddings,
-    embeddings_path,
-    load_embeddings_of_map,
-    load_landmark_embeddings,
-    save_landmark_embeddings,
-)
+from cliploc_ros.core.map import landmark_embeddings as images_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import CliplocError, DatasetError, MapError
@@ -263,14 +257,15 @@ def rows(path):
     """Write embeddings next to the map; return the original mean and medoids by landmark."""
     path.write_text(TEXT.replace('position_sigma: 0.01', 'support: 3'))
     rng = np.random.default_rng(0)
-    save_landmark_embeddings(embeddings_path(path), LandmarkEmbeddings(
+    given = images_of.LandmarkEmbeddings(
         'demo:key', IDS, unit(rng.normal(size=(4, SIZE))), unit(rng.normal(size=(16, SIZE))),
-        np.array([0, 5, 7, 12, 16])))
+        np.array([0, 5, 7, 12, 16]))
+    images_of.save_landmark_embeddings(images_of.embeddings_path(path), given)
     return rows_of(path)
 
 
 def rows_of(path):
-    found = load_landmark_embeddings(embeddings_path(path))
+    found = images_of.load_landmark_embeddings(images_of.embeddings_path(path))
     return {key: (found.means[row], found.medoids[slice(*found.medoid_offsets[row:row + 2])])
             for row, key in enumerate(found.landmark_ids)}
 
@@ -297,7 +292,7 @@ def check_all(path, rows):
     assert is_equal(found['plant_1'], rows['plant_1'])
     assert is_equal(found['plant_2'], rows['plant_1'])
     assert not found['book_1'][0].any() and not len(found['book_1'][1]), 'not the old book'
-    known = load_embeddings_of_map(path, sorted(found)).is_known
+    known = images_of.load_embeddings_of_map(path, sorted(found)).is_known
     assert known.tolist() == [False, True, True, True]
 
 
@@ -321,13 +316,13 @@ def test_rows_follow_their_landmarks(path, rows):
 
 
 def test_an_unusable_file_stays(path):
-    embeddings_path(path).write_bytes(b'of another program')
+    images_of.embeddings_path(path).write_bytes(b'of another program')
     document = Document(path)
     assert any('npz file' in note for note in document.notes)
     document.edit(edits.delete, ['book_1'])
     document.save()
     document.close()
-    assert embeddings_path(path).read_bytes() == b'of another program'
+    assert images_of.embeddings_path(path).read_bytes() == b'of another program'
 
 
 # ---- the journal of a session that was killed
