@@ -5,12 +5,11 @@
 import signal
 
 import pytest
-from processes import PROJECT
 from tester import Tester, class_matching, make_frame
 
-pytestmark = pytest.mark.full
+from demo import ASSETS
 
-ASSETS = PROJECT / 'demo/assets'
+pytestmark = pytest.mark.full
 
 
 def test_a_detector_that_is_killed_and_restarted_while_a_request_waits(start, tester, room_map):

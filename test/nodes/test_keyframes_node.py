@@ -3,7 +3,6 @@
 """The relocalizer as a process with a keyframe layer next to its map, in the demo's room."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +18,8 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
+from demo import ASSETS
 
-ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 ROOM = make_room()  # its objects are nowhere in the images
 # image 2 of the walk shows what these of the mapping walk do
 QUERY, LIKE_QUERY = 2, range(2, 8)

@@ -3,18 +3,17 @@
 """Observations of the demo's walk with its real networks: complete, resumed, by two workers."""
 
 import fcntl
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from contextlib import redirect_stdout
 from io import StringIO
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from capture_folders import ASSETS, copy_walk
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.cli import check_map
@@ -30,8 +29,6 @@ from cliploc_ros.offline.datasets.frames import Frames, RawFrame
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.recording import recorder
 
-PROJECT = Path(__file__).resolve().parents[2]
-ASSETS = PROJECT / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.onnx')
 CLIP = ('--clip-pretrained', ASSETS / 'clip')
 COLOURS = ('red', 'orange', 'yellow', 'green', 'blue', 'purple', 'pink', 'brown', 'black', 'white')
@@ -48,14 +45,7 @@ def arguments(*parts):
 def walk(tmp_path_factory):
     """Return a third of the demo's walk with flat depth, and poses for all but the last image."""
     folder = tmp_path_factory.mktemp('walk') / 'tum'
-    shutil.copytree(ASSETS / 'sequence', folder)
-    rows = [line for line in (folder / 'rgb.txt').read_text().splitlines()
-            if not line.startswith('#')][::3]
-    (folder / 'rgb.txt').write_text('\n'.join(rows) + '\n')
-    last = float(rows[-1].split()[0])
-    truth = (folder / 'groundtruth.txt').read_text().splitlines()
-    (folder / 'groundtruth.txt').write_text('\n'.join(
-        line for line in truth if line.startswith('#') or float(line.split()[0]) < last - 0.25))
+    rows = copy_walk(ASSETS / 'sequence', folder, 3, with_last=False)
     (folder / 'depth').mkdir()
     cv2.imwrite(str(folder / 'depth/flat.png'), np.full((480, 640), 10000, dtype=np.uint16))
     (folder / 'depth.txt').write_text(''.join(f'{row.split()[0]} depth/flat.png\n'
@@ -157,7 +147,8 @@ def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
     command = arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--record-to', file, '--out',
                         tmp_path / 'map.yaml')
     process = subprocess.Popen([sys.executable, '-m', 'cliploc_ros.cli.build_map', *command],
-                               cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+                               cwd=ASSETS.parents[1], stdout=subprocess.DEVNULL,
+                               stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + TIMEOUT_S
     while not any(path.stat().st_size > 15_000 for path in tmp_path.glob('.*.outputs')):
         assert process.poll() is None and time.monotonic() < deadline
