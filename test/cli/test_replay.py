@@ -396,19 +396,3 @@ def test_accelerations_become_an_imu(sequence, tmp_path, run_here):
     done = run_here(main, sequence, tmp_path / 'other')
     assert 'accelerometer.txt:1' in done.stderr
     assert not (tmp_path / 'other').exists()
-
-
-def test_interruption_leaves_nothing(sequence, tmp_path, start):
-    image = sequence / 'rgb' / f'{STAMPS[0]}.png'
-    with (sequence / 'rgb.txt').open('a') as file:
-        for index in range(5_000):  # many links to one image: too many to finish before the signal
-            os.link(image, sequence / 'rgb' / f'{index}.png')
-            file.write(f'{200 + index} rgb/{index}.png\n')
-    process = start('tum_to_bag', sequence, tmp_path / 'bag')
-    wait_until(lambda: any(tmp_path.glob('.bag.*.partial/bag/bag.db3')))
-    process.send_signal(signal.SIGTERM)
-    _, errors = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert 'interrupted' in errors
-    assert 'Traceback' not in errors
-    assert [path.name for path in tmp_path.iterdir()] == ['sequence']

@@ -9,12 +9,10 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.messages import camera_from_msg, detections_from_msg, image_from_msg
+from cliploc_ros.messages import camera_from_msg, detections_from_msg
 from cliploc_ros.offline.datasets import bag_messages, bags
-from cliploc_ros.ros.conversions import pose_from_msg
 
 STRING = 'std_msgs/msg/String'
 # Hashes from ROS's generator, not computed here.
@@ -91,36 +89,27 @@ CAMERA = Camera(64, 48, 53.5, 53.9, 32.0, 24.7, 'plumb_bob', (0.1, -0.2, 0.001, 
 
 
 def test_messages_come_back(tmp_path):
-    pixels_rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    """Those that other tests of bags do not read: a lens, detections."""
     detections = Detections(np.array([[1.5, 2.0, 30.25, 40.0], [0.0, 0.0, 63.0, 47.0]]),
                             ('teddy bear', 'tv'), np.array([0.5, 0.25]))
-    map_from_camera = transform_from_pose(np.array([1.0, -2.0, 3.0]),
-                                          np.array([0.5, 0.5, -0.5, 0.5]))
-    written = {
-        bag_messages.IMAGE: bag_messages.image_message(STAMP_NS, 'camera', pixels_rgb),
-        bag_messages.CAMERA_INFO: bag_messages.camera_info_message(STAMP_NS, 'camera', CAMERA),
-        bag_messages.DETECTIONS: bag_messages.detections_message(STAMP_NS, 'camera', detections),
-        bag_messages.POSE: bag_messages.pose_message(STAMP_NS, 'world', map_from_camera)}
     with bags.BagWriter(tmp_path / 'bag') as bag:
-        for number, (msgtype, message) in enumerate(written.items()):
-            bag.add_topic(f'/topic_{number}', msgtype)
-            bag.write(f'/topic_{number}', STAMP_NS, message)
+        for topic, msgtype, message in (
+                ('/a', bag_messages.CAMERA_INFO,
+                 bag_messages.camera_info_message(STAMP_NS, 'camera', CAMERA)),
+                ('/b', bag_messages.DETECTIONS,
+                 bag_messages.detections_message(STAMP_NS, 'camera', detections))):
+            bag.add_topic(topic, msgtype)
+            bag.write(topic, STAMP_NS, message)
     with bags.BagReader(tmp_path / 'bag') as reader:
-        raws = sorted(reader.messages(), key=lambda one: one.topic)
-        image, info, array, pose = map(reader.deserialize, raws)
-    assert {raw.stamp_ns for raw in raws} == {bag_messages.stamp_ns(image)} == {STAMP_NS}
-    assert image.header.frame_id == 'camera'
-    np.testing.assert_array_equal(image_from_msg(image), pixels_rgb)
+        info, array = map(reader.deserialize, sorted(reader.messages(), key=lambda one: one.topic))
     assert camera_from_msg(info, (64, 48), False) == CAMERA
     assert list(info.p) == [53.5, 0, 32.0, 0, 0, 53.9, 24.7, 0, 0, 0, 1, 0]
-    stamps_ns = [bag_messages.stamp_ns(message) for message in (array, *array.detections)]
-    assert stamps_ns == [STAMP_NS] * 3
+    stamps_ns = [bag_messages.stamp_ns(message) for message in (info, array, *array.detections)]
+    assert stamps_ns == [STAMP_NS] * 4
     again = detections_from_msg(array)
     np.testing.assert_array_equal(again.bboxes_xyxy, detections.bboxes_xyxy)
     np.testing.assert_array_equal(again.scores, detections.scores)
     assert again.class_ids == detections.class_ids
-    assert pose.header.frame_id == 'world'
-    np.testing.assert_allclose(pose_from_msg(pose.pose), map_from_camera, atol=1e-15)
 
 
 @pytest.mark.parametrize('plugin', bags.STORAGES)
@@ -162,10 +151,10 @@ def test_existing_output_is_kept(tmp_path):
 
 @pytest.mark.parametrize('plugin', bags.STORAGES)
 def test_failure_leaves_nothing(tmp_path, plugin):
-    with pytest.raises(ZeroDivisionError), bags.BagWriter(tmp_path / 'bag', plugin) as bag:
+    with pytest.raises(KeyboardInterrupt), bags.BagWriter(tmp_path / 'bag', plugin) as bag:
         bag.add_topic('/pose', bag_messages.POSE)
         bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
         assert not (tmp_path / 'bag').exists()  # written beside its final path
         assert len(list(tmp_path.iterdir())) == 1
-        _ = 1 / 0
+        raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []

@@ -149,7 +149,7 @@ def test_odometry_is_read_back_in_the_order_of_time(tmp_path):
     np.testing.assert_array_equal(again.odom_from_camera, loaded.odom_from_camera)
 
 
-def test_embeddings_come_back_and_their_checksum_is_verified(tmp_path):
+def test_embeddings_come_back(tmp_path):
     rows = np.random.default_rng(0).normal(size=(3, 300_000)).astype(np.float16)
     plain = observations.load_observations(save(tmp_path / 'o.npz', observation_arrays()))
     given = replace(plain, embeddings=rows)
@@ -158,12 +158,6 @@ def test_embeddings_come_back_and_their_checksum_is_verified(tmp_path):
     assert (loaded.embeddings == rows).all()
     save(tmp_path / 'compressed.npz', observation_arrays() | {'embeddings': rows})
     assert (observations.load_observations(tmp_path / 'compressed.npz').embeddings == rows).all()
-
-    content = bytearray((tmp_path / 'large.npz').read_bytes())
-    content[content.index(rows[1].tobytes()[:50]) + 20] ^= 1  # as on a failing disk
-    (tmp_path / 'large.npz').write_bytes(content)
-    with pytest.raises(DatasetError, match=r'embeddings.*CRC'):
-        observations.load_observations(tmp_path / 'large.npz')
 
 
 @pytest.fixture
