@@ -12,6 +12,10 @@ from cliploc_ros.ros.conversions import detections_to_msg
 from cliploc_ros.ros.inputs.frame_source import Frame
 
 
+def stamp(seconds):
+    return header_of(round(seconds * 1e9)).stamp
+
+
 def header_of(stamp_ns, frame_id='camera'):
     return Header(frame_id=frame_id, stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9))
 

@@ -6,12 +6,13 @@ from itertools import count
 
 import numpy as np
 import pytest
+from frames import stamp
 from processes import wait_for
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from tester import RELIABLE, ask_until, transform_of
-from watched import MOUNT, TICK_S, Robot, stamp
+from watched import MOUNT, TICK_S, Robot
 
 from cliploc_ros.core.geometry.transforms import pose_error
 

@@ -9,7 +9,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from frames import header_of, messages_of
 from scene import make_room, write_bare_map, write_map
-from tester import class_matching, make_frame, transform_of
+from tester import make_frame, transform_of
 
 from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.core.geometry.transforms import pose_error
@@ -52,11 +52,9 @@ def query_frame():
 
 
 def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
-        start, tester, layer, room_map, tmp_path):
-    process = start('nodes.relocalizer', parameters=class_matching(room_map))
-    process.wait_for_output('ready after')
+        own_relocalizer, tester, layer, room_map, tmp_path):
+    process = own_relocalizer()
     assert f'{len(layer)} keyframes' in process.output()
-    tester.connect()
     seen, (image, info, detections) = query_frame()
     answer = tester.relocalize((image, info, detections))
     assert answer.success, answer.message

@@ -5,7 +5,7 @@
 import time
 
 import numpy as np
-from builtin_interfaces.msg import Time
+from frames import stamp
 from nav_msgs.msg import Odometry
 from scene import MAP_FROM_CAMERA, make_room, see_room
 from std_msgs.msg import Header
@@ -26,10 +26,6 @@ REACH_M = 0.5
 def aside(metres):
     """Return a move (4, 4) along the image's rows."""
     return transforms.make_transform(np.eye(3), np.array([metres, 0.0, 0.0]))
-
-
-def stamp(seconds):
-    return Time(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
 
 
 class Robot:

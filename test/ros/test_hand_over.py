@@ -3,17 +3,146 @@
 """Handing a pose over: real subscribers, odometry, and services that answer or never do."""
 
 import math
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
+from dataclasses import replace
 
 import pytest
+from builtin_interfaces.msg import Time as Stamp
+from frames import stamp
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from handing_over import ONE_HZ, PARAMETERS, TEN_HZ, Robot, make_pose, stamp, stand, tell
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.parameter import Parameter
 from rclpy.time import Time
+from std_srvs.srv import Empty
 
-from cliploc_ros.ros.handoff import HandOffError, NoLocalizerError, difference, usable_pose
-from cliploc_ros.ros.inputs.stamps import TimeJumpError
+from cliploc_ros.ros.handoff import (
+    HandOff,
+    HandOffError,
+    NoLocalizerError,
+    difference,
+    usable_pose,
+)
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
+from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.parameters import RelocalizerParameters
+
+PARAMETERS = RelocalizerParameters(base_frame='base_link')
+
+# Times of odometry since the image [s].
+ONE_HZ, TEN_HZ = (0.0, 1.0, 2.0), tuple(tick / 10 for tick in range(10))
+
+
+def make_pose():
+    pose = PoseWithCovarianceStamped()
+    pose.header.frame_id, pose.header.stamp = 'map', Stamp(sec=100)
+    return pose
+
+
+class Localizer:
+    """Replaces AMCL: receives initial poses, and answers update requests while it may."""
+
+    def __init__(self, node):
+        self.node = node
+        self.poses, self.updates = [], []
+        self.may_answer = threading.Event()
+        self.may_answer.set()
+        self._group = ReentrantCallbackGroup()
+
+    def subscribe(self):
+        self.node.create_subscription(PoseWithCovarianceStamped, 'initialpose',
+                                      self.poses.append, 10)
+
+    def serve(self):
+        def update(_, response):
+            self.updates.append(time.monotonic())
+            self.may_answer.wait()
+            return response
+        self.node.create_service(Empty, 'request_nomotion_update', update,
+                                 callback_group=self._group)
+
+
+class Robot:
+    """A relocalizer's hand-over and a localizer, whose callbacks are all executed."""
+
+    def __init__(self, make_node, wait):
+        self.node, self.wait = make_node('relocalizer'), wait
+        self.localizer = Localizer(make_node('amcl'))
+        self.odometry = OdometrySource(self.node)
+        self.handoff = HandOff(self.node, self.odometry, CoordinateFrames(self.node))
+        self.jumps = TimeJumps(self.node, self.odometry.forget)
+
+    def hand_over(self, timeout_s=10.0, **changes):
+        """Hand a pose over; return the elapsed time [s]."""
+        start = time.monotonic()
+        self.handoff.hand_over(make_pose(), replace(PARAMETERS, **changes), start + timeout_s,
+                               start, self.jumps)
+        return time.monotonic() - start
+
+    def jump(self):
+        """Make the relocalizer's clock jump: to simulated time, and back."""
+        for is_simulated in (True, False):
+            self.node.set_parameters([Parameter('use_sim_time', value=is_simulated)])
+
+    def meet(self):
+        """Wait until the relocalizer has discovered the localizer."""
+        self.wait(lambda: self.handoff._publisher.get_subscription_count(), 'the subscriber')
+
+    def meet_service(self):
+        self.wait(self.handoff._updater.service_is_ready, 'the service')
+
+
+def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
+    """Publish odometry at times since the image, and wait until the last is received."""
+    stand(robot, wheels, {moment_s: speed_m_s * moment_s for moment_s in moments_s}, twist_m_s)
+
+
+def stand(robot, wheels, places, twist_m_s=0.0, rad_per_m=0.0, body=''):
+    """Publish poses of the robot at times since the image, and wait until they are received."""
+    for moment_s, x_m in places.items():
+        odometry = Odometry(child_frame_id=body)
+        odometry.header.stamp = stamp(100.0 + moment_s)
+        odometry.pose.pose.position.x, odometry.twist.twist.linear.x = x_m, twist_m_s
+        odometry.pose.pose.orientation.z = math.sin(rad_per_m * x_m / 2)
+        odometry.pose.pose.orientation.w = math.cos(rad_per_m * x_m / 2)
+        wheels.publish(odometry)
+    robot.wait(lambda: (newest := robot.odometry.recent(60.0, 0.0)) is not None
+               and newest == odometry, 'odometry')
+
+
+@pytest.fixture
+def robot(context, make_node, wait):
+    robot = Robot(make_node, wait)
+    executor = MultiThreadedExecutor(4, context=context)
+    for node in (robot.node, robot.localizer.node):
+        executor.add_node(node)
+
+    def spin():
+        with suppress(InvalidHandle):  # the shutdown below may happen while it waits
+            executor.spin()
+    spinning = threading.Thread(target=spin)
+    spinning.start()
+    yield robot
+    robot.localizer.may_answer.set()
+    executor.shutdown()
+    spinning.join()
+
+
+@pytest.fixture
+def wheels(robot, make_node):
+    """Create a silent publisher of odometry that the robot subscribes to."""
+    wheels = make_node('wheels').create_publisher(Odometry, 'odom', 10)
+    robot.odometry.open()
+    robot.wait(lambda: wheels.get_subscription_count() and robot.odometry.is_published,
+               'the discovery of the odometry')
+    yield wheels
+    robot.odometry.close()
 
 
 def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):

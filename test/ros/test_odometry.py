@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from frames import stamp
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion
-from handing_over import stamp
 from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header

@@ -6,7 +6,7 @@ import time
 
 import pytest
 from builtin_interfaces.msg import Time
-from handing_over import stamp
+from frames import stamp
 from rclpy.parameter import Parameter
 from rclpy.time import Time as RosTime
 
