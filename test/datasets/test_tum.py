@@ -10,17 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets import tum
 from cliploc_ros.offline.datasets.bag_frames import BagTopics
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import DepthFormat, FolderOptions
 from cliploc_ros.offline.datasets.images import open_images
 from cliploc_ros.offline.datasets.parsing import pose_of, read_numbers
 from cliploc_ros.offline.datasets.poses import TimedPoses, mount_from_numbers
-from cliploc_ros.offline.datasets.tum import (
-    read_recorded_detections,
-    read_tum,
-    read_tum_trajectory,
-)
 
 MS = 1_000_000
 
@@ -41,7 +37,7 @@ def sequence_folder(tmp_path):
 
 
 def test_poses_between_samples_near_the_ends_and_in_gaps(sequence_folder):
-    sequence = read_tum(sequence_folder)
+    sequence = tum.read_tum(sequence_folder)
     pose = sequence.pose_at(1_010 * MS)
     quarter = Rotation.from_euler('z', 22.5, degrees=True).as_matrix()
     np.testing.assert_allclose(pose[:3, :3], quarter, atol=1e-12)
@@ -51,7 +47,7 @@ def test_poses_between_samples_near_the_ends_and_in_gaps(sequence_folder):
     assert sequence.pose_at(1_060 * MS) is not None
     assert sequence.pose_at(1_060 * MS + 1) is None
     (sequence_folder / 'groundtruth.txt').write_text('1.00 0 0 0 0 0 0 1\n1.10 1 0 0 0 0 0 1\n')
-    gap = read_tum(sequence_folder)
+    gap = tum.read_tum(sequence_folder)
     assert gap.pose_at(1_020 * MS) is not None
     assert gap.pose_at(1_050 * MS) is None
 
@@ -65,7 +61,7 @@ def test_poses_between_samples_near_the_ends_and_in_gaps(sequence_folder):
 def test_malformed_files_are_named(sequence_folder, name, text, message):
     (sequence_folder / name).write_text(text)
     with pytest.raises(DatasetError, match=message):
-        read_tum(sequence_folder)
+        tum.read_tum(sequence_folder)
 
 
 @pytest.mark.parametrize(('truth', 'message'), [
@@ -106,7 +102,7 @@ def test_recorded_detections(tmp_path):
     path.write_text(json.dumps({'image_size': [640, 480], 'frames': [
         {'timestamp': '1341847980.722988', 'detections': [BOOK, {**BOOK, 'class_id': 'tv'}]},
         {'timestamp': 1341847980.754743, 'detections': []}]}))
-    detections = read_recorded_detections(path, (640, 480))
+    detections = tum.read_recorded_detections(path, (640, 480))
     assert list(detections) == [1341847980722988000, 1341847980754743000], 'exact stamps'
     first, second = detections.values()
     np.testing.assert_array_equal(first.bboxes_xyxy, [[173, 138, 219.5, 208]] * 2)
@@ -123,7 +119,7 @@ def test_booleans_and_missing_fields_are_refused(tmp_path, frame, message):
     path = tmp_path / 'd.json'
     path.write_text(json.dumps({'frames': [{'detections': [], **frame}]}))
     with pytest.raises(DatasetError, match=message):
-        read_recorded_detections(path)
+        tum.read_recorded_detections(path)
 
 
 @pytest.mark.parametrize('number', [1e308, 1e-320, 2.0])
@@ -134,7 +130,7 @@ def test_quaternions_of_any_numbers_are_refused(number, tmp_path):
     file.write_text('1.0 ' + ' '.join(map(str, sample)))
     for read in (lambda: pose_of(sample[:3], sample[3:], 'here'),
                  lambda: mount_from_numbers(sample),
-                 lambda: read_tum_trajectory(file),
+                 lambda: tum.read_tum_trajectory(file),
                  lambda: TimedPoses.from_samples([1], [sample], 'here')):
         with pytest.raises(DatasetError):
             read()

@@ -3,9 +3,6 @@
 """Runs of methods: with several processes; their names and numbers."""
 
 import csv
-import multiprocessing
-import os
-import signal
 from dataclasses import replace
 from itertools import combinations
 
@@ -18,7 +15,6 @@ from scene import make_room
 from cliploc_ros.core.geometry.transforms import make_transform, quaternion_from_transform
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, DatasetError
-from cliploc_ros.files.parallel import WorkersError
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation import summary
@@ -82,13 +78,6 @@ def test_workers_do_not_matter_and_get_the_queries_once(results, room, questions
         found = run_methods(room, methods, Counted(questions), trials=3, workers=workers)
         assert without_times(found) == without_times(results)
     assert len(sent) == 2
-
-
-def test_a_dead_worker_ends_the_run(room, questions, methods):
-    def kill_one(_part):
-        os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
-    with pytest.raises(WorkersError):
-        run_methods(room, methods, questions, trials=3, workers=2, advance=kill_one)
 
 
 def test_similarities_follow_the_maps_order(room, recording, questions):

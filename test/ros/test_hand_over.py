@@ -21,13 +21,7 @@ from rclpy.parameter import Parameter
 from rclpy.time import Time
 from std_srvs.srv import Empty
 
-from cliploc_ros.ros.handoff import (
-    HandOff,
-    HandOffError,
-    NoLocalizerError,
-    difference,
-    usable_pose,
-)
+from cliploc_ros.ros import handoff
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
@@ -75,7 +69,7 @@ class Robot:
         self.node, self.wait = make_node('relocalizer'), wait
         self.localizer = Localizer(make_node('amcl'))
         self.odometry = OdometrySource(self.node)
-        self.handoff = HandOff(self.node, self.odometry, CoordinateFrames(self.node))
+        self.handoff = handoff.HandOff(self.node, self.odometry, CoordinateFrames(self.node))
         self.jumps = TimeJumps(self.node, self.odometry.forget)
 
     def hand_over(self, timeout_s=10.0, **changes):
@@ -148,12 +142,12 @@ def wheels(robot, make_node):
 def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
     """Who hears the pose but shows none, such as ros2 topic echo, is no localizer."""
     robot.handoff.open('amcl_pose')
-    with pytest.raises(NoLocalizerError, match=r'/initialpose.*retry'):
+    with pytest.raises(handoff.NoLocalizerError, match=r'/initialpose.*retry'):
         robot.hand_over(1.5)
     robot.localizer.subscribe()
     robot.meet()
     start = time.monotonic()
-    with pytest.raises(NoLocalizerError, match='/amcl_pose'):
+    with pytest.raises(handoff.NoLocalizerError, match='/amcl_pose'):
         robot.hand_over(1.5)
     assert 0.5 < time.monotonic() - start < 3.0
     assert not robot.localizer.poses
@@ -233,7 +227,7 @@ def showing(served):
     (math.nan, 0.3, 'too little time', 0)])
 def test_a_localizer_has_taken_the_pose_once_it_shows_it(showing, off_m, timeout_s, named, times):
     showing.localizer.off_m = off_m
-    with pytest.raises(NoLocalizerError, match=named) if named else nullcontext():
+    with pytest.raises(handoff.NoLocalizerError, match=named) if named else nullcontext():
         showing.hand_over(timeout_s)
     assert len(showing.localizer.poses) == times
 
@@ -241,7 +235,7 @@ def test_a_localizer_has_taken_the_pose_once_it_shows_it(showing, off_m, timeout
 def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):
     """It published the pose, but then answers no update and publishes nothing more."""
     showing.localizer.may_answer.clear()
-    with pytest.raises(NoLocalizerError, match=r'took the pose, but has ended or hangs'):
+    with pytest.raises(handoff.NoLocalizerError, match=r'took the pose, but has ended or hangs'):
         showing.hand_over()
     assert len(showing.localizer.poses) == 1
     showing.localizer.may_answer.set()
@@ -277,7 +271,7 @@ def test_where_the_localizer_is_once_it_has_settled_decides(showing, wheels, x_m
         stand(showing, wheels, {0.4 + 0.1 * tick: driven_m * tick / 20 for tick in range(1, 21)},
               twist_m_s=5.0 * driven_m / 10, body=body)
         showing.localizer.show(x_m, 2.4)
-        with pytest.raises(NoLocalizerError, match=named) if named else nullcontext():
+        with pytest.raises(handoff.NoLocalizerError, match=named) if named else nullcontext():
             handing_over.result()
     showing.localizer.may_answer.set()
 
@@ -285,13 +279,13 @@ def test_where_the_localizer_is_once_it_has_settled_decides(showing, wheels, x_m
 @pytest.mark.parametrize('timeout_s', [10.0, 0.3])
 def test_a_robot_that_drives_is_told_so_however_little_time_is_left(showing, wheels, timeout_s):
     tell(showing, wheels, TEN_HZ, twist_m_s=0.5)
-    with pytest.raises(HandOffError, match=r'moves at 0\.50'):
+    with pytest.raises(handoff.HandOffError, match=r'moves at 0\.50'):
         showing.hand_over(timeout_s)
     assert not showing.localizer.poses
 
 
 @pytest.mark.parametrize(('end', 'error'), [
-    (Robot.jump, TimeJumpError), (lambda robot: robot.handoff.stop(), HandOffError)])
+    (Robot.jump, TimeJumpError), (lambda robot: robot.handoff.stop(), handoff.HandOffError)])
 def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(showing, end, error):
     showing.localizer.off_m = math.nan
     with ThreadPoolExecutor(1) as pool:
@@ -318,16 +312,16 @@ def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
     shown.header.frame_id, shown.pose.pose.position.x = frame, x_m
     shown.pose.pose.orientation.z = math.sin(math.radians(yaw_deg) / 2)
     shown.pose.pose.orientation.w = math.cos(math.radians(yaw_deg) / 2)
-    assert (not difference(given, shown)) == is_taken_over
+    assert (not handoff.difference(given, shown)) == is_taken_over
     shown.pose.pose.orientation.y = 1e200
-    assert difference(given, shown)
+    assert handoff.difference(given, shown)
 
 
 @pytest.mark.parametrize(('now_s', 'published_s'), [(200, 100), (50, 50), (0, 100)])
 def test_the_stamp_is_the_images_but_not_later_than_now(now_s, published_s):
     """A pose without any scatter gets a centimetre."""
     pose = make_pose()
-    usable = usable_pose(pose, Time(seconds=now_s))
+    usable = handoff.usable_pose(pose, Time(seconds=now_s))
     assert usable.header.stamp.sec == published_s
     assert (pose.header.stamp.sec, usable.header.frame_id) == (100, 'map')
     # x, xy, yx, y and yaw: the elements that AMCL reads
@@ -348,7 +342,7 @@ def is_withheld(robot, timeout_s=10.0):
     """Hand a pose over; return the reason why it is withheld, or ''."""
     try:
         robot.hand_over(timeout_s)
-    except HandOffError as error:
+    except handoff.HandOffError as error:
         assert not robot.localizer.poses
         return str(error)
     robot.wait(lambda: robot.localizer.poses, 'the pose')
