@@ -116,10 +116,10 @@ def test_without_views_the_scene_has_the_page_and_ids_tell_equal_labels_apart(ch
         person.picture('labels')
 
 
-def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, studio):
-    first = Person(chromium, studio.url)
+def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, person, studio):
+    first = person
     first.page.get_by_text('pages share').wait_for(state='detached')
-    second = Person(chromium, studio.url)
+    second = Person(chromium, first.page.url)
     for person in (first, second):
         person.page.get_by_text('2 pages share the selection and the view').wait_for()
     second.page.close()
@@ -133,7 +133,6 @@ def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, s
     first.page.wait_for_function(
         "() => $('log').firstChild.textContent === 'earlier: locked mug_2'")
     assert line.get_attribute('class') == 'past'
-    first.page.close()
 
 
 def test_layers_film_and_a_click_on_the_image(person, studio):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rig_bag import camera_messages, write_messages
 from scene import make_layer, make_room, write_bare_map, write_map
-from studio_map import ASSETS, demo_studio, open_page, write_two_rooms
+from studio_map import ASSETS, open_page, write_two_rooms
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
@@ -34,13 +34,6 @@ from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.web import Gate, once
 from demo.truth import read_frames
-
-
-@pytest.fixture
-def studio(tmp_path):
-    studio = demo_studio(tmp_path / 'map.yaml')
-    yield studio
-    studio.document.close()
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ import pytest
 import viser
 from scene import make_layer
 from scipy.spatial.transform import Rotation
-from studio_map import demo_studio
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import DepthImage
@@ -36,13 +35,6 @@ def server():
         server = viser.ViserServer('127.0.0.1', 0, verbose=False)
     yield server
     server.stop()
-
-
-@pytest.fixture
-def studio(tmp_path):
-    studio = demo_studio(tmp_path / 'map.yaml')
-    yield studio
-    studio.document.close()
 
 
 def test_depth_becomes_a_cloud_below_the_ceiling():
