@@ -74,7 +74,7 @@ def test_four_cameras_see_enough_at_once(four_cameras, tester):
 
 def test_the_doctor_looks_at_each_camera(four_cameras, start):
     _, ask = four_cameras
-    doctor = start('cli.doctor', '--timeout', 8)  # a busy machine discovers cameras slowly
+    doctor = start('cli.doctor', '--timeout', 5)  # a busy machine discovers cameras slowly
     ask(working=NAMES[1:])
     while doctor.alive:
         ask(working=NAMES[1:])

@@ -81,17 +81,11 @@ def node():
     made = Answering()
     executor = SingleThreadedExecutor()
     executor.add_node(made)
-    stopped = threading.Event()
-
-    def spin():
-        while not stopped.is_set():
-            executor.spin_once(timeout_sec=0.02)
-    thread = threading.Thread(target=spin)
+    thread = threading.Thread(target=executor.spin)
     thread.start()
     yield made
-    stopped.set()
-    thread.join()
     executor.shutdown()
+    thread.join()
     made.worker.stop()
     made.destroy_node()
     if is_first:
