@@ -96,11 +96,12 @@ def test_the_folder_is_all_that_the_nodes_need_without_a_network_and_read_only(
     assert any('labels/' in name for name in before)
     variables = {name: value for name, value in os.environ.items()
                  if name not in ('NUMBA_CACHE_DIR', 'XDG_CACHE_HOME')}
+    hidden = hide_pytorch(tmp_path)['PYTHONPATH']
     done = subprocess.run(
         [*offline, *READ_ONLY, str(carried), sys.executable,
          str(Path(__file__).with_name('offline.py')), str(tmp_path),
          '--ros-args', '--params-file', str(robot), '-p', f'cache_dir:={carried}'],
-        env=variables | {'PYTHONPATH': hide_pytorch(tmp_path)['PYTHONPATH'],
+        env=variables | {'PYTHONPATH': f'{hidden}:{PROJECT}/test',
                          'HOME': str(tmp_path / 'home'), 'ROS_LOG_DIR': str(tmp_path)},
         capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
