@@ -46,16 +46,6 @@ def observation_arrays() -> dict[str, np.ndarray]:
                              'timestamps': np.array([10.0, 10.5, 11.0])}
 
 
-KINDS = {'query': (query_arrays, observations.load_queries),
-         'observation': (observation_arrays, observations.load_observations)}
-
-
-@pytest.fixture(params=KINDS)
-def kind(request):
-    """The arrays of a valid file, and the function that loads such files."""
-    return KINDS[request.param]
-
-
 def save(path, arrays):
     np.savez_compressed(path, **arrays)
     return path
@@ -88,12 +78,14 @@ def become(name, value):
     (become('stamps_ns', [0, 1, 2]), 'stamps_ns contradicts timestamps in row 0'),
     (become('clip_ms', [1.0, -2.0, 3.0]), 'clip_ms is negative'),
     (become('scores', np.array([1, 'a', None], dtype=object)), 'scores cannot be')])
-def test_malformed_arrays_are_named(tmp_path, kind, change, message):
-    path, arrays = tmp_path / 'q.npz', kind[0]()
-    change(arrays)
-    with pytest.raises(DatasetError, match=message) as caught:
-        kind[1](save(path, arrays))
-    assert str(path) in str(caught.value)
+def test_malformed_arrays_are_named(tmp_path, change, message):
+    path, queries, seen = tmp_path / 'q.npz', query_arrays(), observation_arrays()
+    for arrays, load in ((queries, observations.load_queries),
+                         (seen, observations.load_observations)):
+        change(arrays)
+        with pytest.raises(DatasetError, match=message) as caught:
+            load(save(path, arrays))
+        assert str(path) in str(caught.value)
 
 
 # ---- queries ------------------------------------------------------------------------------------

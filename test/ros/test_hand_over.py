@@ -192,9 +192,6 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
         with pytest.raises(TimeJumpError):
             handing_over.result()
     assert not robot.localizer.poses
-    tell(robot, wheels, (1.0, 1.1))
-    robot.hand_over()
-    robot.wait(lambda: robot.localizer.poses, 'the pose')
 
 
 @pytest.fixture
