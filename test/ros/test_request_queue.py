@@ -20,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from vision_msgs.msg import Detection2DArray
 
-from cliploc_ros.errors import MapError
+from cliploc_ros.errors import MapError, StoppedError
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict
 from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
@@ -174,6 +174,20 @@ def test_a_start_that_lasts_or_fails_is_retried_by_requests(node, capfd, wait):
                for line in capfd.readouterr().err.splitlines()) == 1
     node.loads = lambda: 'a map'
     assert 'no new frame' in node.requests.answer().message
+
+
+def test_a_start_that_is_cancelled_ends_the_wait_for_it(node, clients, wait):
+    """The node is destroyed while its start waits: concurrent.futures.wait would never return."""
+    wait(lambda: node.active, 'the node to be active')
+    node.trigger_deactivate()
+    release, former = threading.Event(), node._start
+    node._starting.submit(release.wait, 10.0)
+    starting = clients.submit(node.bring_up)
+    wait(lambda: node._start is not former, 'the start')
+    node._starting.shutdown(wait=False, cancel_futures=True)
+    with pytest.raises(StoppedError):
+        starting.result(10.0)
+    release.set()
 
 
 class LateTransforms:
