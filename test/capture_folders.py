@@ -42,6 +42,22 @@ def shots_of(folder=WALK):
                  raw.color.args[0].camera) for raw in raws]
 
 
+def copy_walk(source, folder, every, with_last=True):
+    """Copy a walk of the demo with every n-th image; return the lines of these images.
+
+    Without the last one, the last of them has no pose.
+    """
+    shutil.copytree(source, folder)
+    rows = [line for line in (folder / 'rgb.txt').read_text().splitlines()
+            if not line.startswith('#')][::every]
+    (folder / 'rgb.txt').write_text('\n'.join(rows) + '\n')
+    end = float(rows[-1].split()[0]) + (1.0 if with_last else -0.25)
+    truth = (folder / 'groundtruth.txt').read_text().splitlines()
+    (folder / 'groundtruth.txt').write_text('\n'.join(
+        line for line in truth if line.startswith('#') or float(line.split()[0]) < end))
+    return rows
+
+
 def write_colmap(folder, shots, text=False, camera_of=None, scale=1.0, world=None):
     """Write a project; camera_of(number) returns a camera's model, size and values."""
     import pycolmap

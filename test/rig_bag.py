@@ -23,50 +23,38 @@ MOUNTS = json.loads((RIG / 'mounts.json').read_text())
 TF = 'tf2_msgs/msg/TFMessage'
 
 
-def write_rig_bag(path, cameras=tuple(MOUNTS), halved=(), in_tf=tuple(MOUNTS)):
+def write_rig_bag(path, cameras=tuple(MOUNTS), halved=()):
     """Write images, camera_info and ground truth of cameras, the robot's pose, and tf.
 
-    The images of some cameras are halved; some cameras are in tf.
+    The images of some cameras are halved.
     """
-    with BagWriter(path) as bag:
-        for topic, msgtype in (('/tf', TF), ('/tf_static', TF), ('/robot', bag_messages.POSE)):
-            bag.add_topic(topic, msgtype)
-        robot = read_tum(RIG / 'front')
-        for stamp in robot.stamps_ns:
-            pose = robot.pose_at(stamp)
-            bag.write('/robot', stamp, bag_messages.pose_message(stamp, 'map', pose))
-            bag.write('/tf', stamp, transform(stamp, 'map', 'robot', pose))
-        for name in cameras:
-            sequence, frame = read_tum(RIG / name), f'{name}_optical'
-            camera = find_camera(None, sequence.folder)[0]
+    robot = read_tum(RIG / 'front')
+    poses = [(stamp, robot.pose_at(stamp)) for stamp in robot.stamps_ns]
+    recorded = [*pose_messages(poses, '/robot'), *tf_messages(poses, child='robot')]
+    for name in cameras:
+        sequence, frame = read_tum(RIG / name), f'{name}_optical'
+        camera = find_camera(None, sequence.folder)[0]
+        if name in halved:
+            camera = replace(camera, width=camera.width // 2, height=camera.height // 2,
+                             **{key: getattr(camera, key) / 2 for key in ('fx', 'fy')},
+                             **{key: (getattr(camera, key) + 0.5) / 2 - 0.5
+                                for key in ('cx', 'cy')})
+        recorded += tf_messages([(sequence.stamps_ns[0], mount_from_numbers(MOUNTS[name]))],
+                                'robot', frame, '/tf_static')
+        recorded += pose_messages([(stamp, sequence.pose_at(stamp))
+                                   for stamp in sequence.stamps_ns], f'/{name}/ground_truth')
+        for stamp, file in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
+            data = file.read_bytes()
             if name in halved:
-                camera = replace(camera, width=camera.width // 2, height=camera.height // 2,
-                                 **{key: getattr(camera, key) / 2 for key in ('fx', 'fy')},
-                                 **{key: (getattr(camera, key) + 0.5) / 2 - 0.5
-                                    for key in ('cx', 'cy')})
-            topics = [f'/{name}/{topic}' for topic in ('image/compressed', 'camera_info',
-                                                       'ground_truth')]
-            for topic, msgtype in zip(topics, (bag_messages.COMPRESSED_IMAGE,
-                                               bag_messages.CAMERA_INFO, bag_messages.POSE),
-                                      strict=True):
-                bag.add_topic(topic, msgtype)
-            first = sequence.stamps_ns[0]
-            if name in in_tf:
-                bag.write('/tf_static', first, transform(first, 'robot', frame,
-                                                         mount_from_numbers(MOUNTS[name])))
-            for stamp, file in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
-                data = file.read_bytes()
-                if name in halved:
-                    image = cv2.resize(cv2.imread(str(file)), (camera.width, camera.height),
-                                       interpolation=cv2.INTER_AREA)
-                    data = cv2.imencode('.jpg', image)[1].tobytes()
-                for topic, message in zip(topics, (
-                        bag_messages.compressed_image_message(stamp, frame, data, 'jpeg'),
-                        bag_messages.camera_info_message(stamp, frame, camera),
-                        bag_messages.pose_message(stamp, 'map', sequence.pose_at(stamp))),
-                        strict=True):
-                    bag.write(topic, stamp, message)
-    return path
+                image = cv2.resize(cv2.imread(str(file)), (camera.width, camera.height),
+                                   interpolation=cv2.INTER_AREA)
+                data = cv2.imencode('.jpg', image)[1].tobytes()
+            recorded += [
+                (stamp, f'/{name}/image/compressed', bag_messages.COMPRESSED_IMAGE,
+                 bag_messages.compressed_image_message(stamp, frame, data, 'jpeg')),
+                (stamp, f'/{name}/camera_info', bag_messages.CAMERA_INFO,
+                 bag_messages.camera_info_message(stamp, frame, camera))]
+    return write_messages(path, recorded)
 
 
 def transform(stamp, parent, child, pose):
@@ -91,6 +79,25 @@ def depth_message(stamp, values, frame='camera'):
         encoding='16UC1' if values.dtype == np.uint16 else '32FC1', is_bigendian=0,
         step=values.shape[1] * values.itemsize,
         data=np.frombuffer(values.tobytes(), dtype=np.uint8))
+
+
+def camera_messages(at, pixels, camera, frame='camera', stamp=None):
+    """Return an image and its camera_info for `write_messages`; `stamp`: other than the time."""
+    stamp = at if stamp is None else stamp
+    return [(at, '/image', bag_messages.IMAGE, bag_messages.image_message(stamp, frame, pixels)),
+            (at, '/camera_info', bag_messages.CAMERA_INFO,
+             bag_messages.camera_info_message(stamp, frame, camera))]
+
+
+def pose_messages(poses, topic='/pose', late_ns=0):
+    """Return poses of the camera, given with their times, for `write_messages`."""
+    return [(at, topic, bag_messages.POSE, bag_messages.pose_message(at + late_ns, 'map', pose))
+            for at, pose in poses]
+
+
+def tf_messages(poses, parent='map', child='camera', topic='/tf'):
+    """Return poses as transforms, given with their times, for `write_messages`."""
+    return [(at, topic, TF, transform(at, parent, child, pose)) for at, pose in poses]
 
 
 def write_messages(path, recorded):

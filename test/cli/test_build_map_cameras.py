@@ -76,7 +76,7 @@ def test_each_camera_has_keyframes(built):
 
 
 @pytest.mark.parametrize('poses', [
-    ('--pose-topic', 'ground_truth'),
+    pytest.param(('--pose-topic', 'ground_truth'), marks=pytest.mark.full),
     ('--pose-topic', '/robot', '--mount', *(value for name in ALL for value in MOUNTS[name]))])
 def test_poses_of_each_camera_or_of_the_robot_give_the_same_map(bag, built, tmp_path, poses):
     out = tmp_path / 'again.yaml'

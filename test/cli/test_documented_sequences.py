@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rig_bag import TF, transform
+from rig_bag import camera_messages, tf_messages, write_messages
 from test_doc_commands import PROJECT, commands_of, program_of
 from without_pytorch import hide_pytorch
 
@@ -22,8 +22,6 @@ from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import layer_path
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets import bag_messages
-from cliploc_ros.offline.datasets.bags import BagWriter
 from cliploc_ros.offline.datasets.folders import read_sequence
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 from demo import ASSETS
@@ -37,32 +35,25 @@ MOUNT = mount_from_numbers([0.1, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5])
 FEW = ('--positions', '4', '--headings', '2', '--frames', '10')
 WHOLE = [pytest.param(name, marks=FULL) for name in ('rendered', 'real')]
 BOTH = pytest.mark.parametrize('drive', WHOLE, indirect=True)
-TOPICS = {'/camera/image_raw': bag_messages.IMAGE,
-          '/camera/camera_info': bag_messages.CAMERA_INFO, '/tf': TF, '/tf_static': TF}
 
 
 def write_drive(path, folder, every):
     """Write the bag that the pages record: images, camera_info and the robot's tf."""
     sequence, camera, _ = read_sequence(folder, None)
-    sequence = sequence.every(every)
-    image, info = list(TOPICS)[:2]
-    with BagWriter(path) as bag:
-        for topic, msgtype in TOPICS.items():
-            bag.add_topic(topic, msgtype)
-        first = sequence.stamps_ns[0]
-        bag.write('/tf_static', first, transform(first, 'base_footprint', 'camera_optical_frame',
-                                                 MOUNT))
-        for stamp, file in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
-            pixels = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
-            bag.write(image, stamp, bag_messages.image_message(stamp, 'camera_optical_frame',
-                                                               pixels))
-            bag.write(info, stamp, bag_messages.camera_info_message(
-                stamp, 'camera_optical_frame', camera))
-            pose = sequence.pose_at(stamp)
-            if pose is not None:
-                bag.write('/tf', stamp, transform(stamp, 'map', 'odom', np.eye(4)))
-                bag.write('/tf', stamp, transform(stamp, 'odom', 'base_footprint',
-                                                  pose @ invert_transform(MOUNT)))
+    sequence, recorded = sequence.every(every), []
+    for stamp, file in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
+        pixels = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
+        for one, topic in zip(camera_messages(stamp, pixels, camera, 'camera_optical_frame'),
+                              ('/camera/image_raw', '/camera/camera_info'), strict=True):
+            recorded.append((stamp, topic, *one[2:]))
+        pose = sequence.pose_at(stamp)
+        if pose is not None:
+            recorded += tf_messages([(stamp, np.eye(4))], 'map', 'odom')
+            recorded += tf_messages([(stamp, pose @ invert_transform(MOUNT))], 'odom',
+                                    'base_footprint')
+    write_messages(path, [*recorded, *tf_messages(
+        [(sequence.stamps_ns[0], MOUNT)], 'base_footprint', 'camera_optical_frame',
+        '/tf_static')])
 
 
 @pytest.fixture(scope='module')

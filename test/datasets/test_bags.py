@@ -9,78 +9,51 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.messages import camera_from_msg, detections_from_msg, image_from_msg
-from cliploc_ros.offline.datasets import bag_messages
-from cliploc_ros.offline.datasets.bags import (
-    LATCHED_QOS,
-    RELIABLE_QOS,
-    STORAGES,
-    BagMessage,
-    BagReader,
-    BagWriter,
-    typestore,
-)
-from cliploc_ros.ros.conversions import pose_from_msg
+from cliploc_ros.messages import camera_from_msg, detections_from_msg
+from cliploc_ros.offline.datasets import bag_messages, bags
 
 STRING = 'std_msgs/msg/String'
 # Hashes from ROS's generator, not computed here.
 STRING_HASH = 'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'
-QOS = {'/chatter': RELIABLE_QOS, '/robot_description': LATCHED_QOS, '/status': RELIABLE_QOS}
+QOS = {'/chatter': bags.RELIABLE_QOS, '/robot_description': bags.LATCHED_QOS,
+       '/status': bags.RELIABLE_QOS}
 
 
 def make_messages(count):
     """Yield messages of three topics in turn, the third with the stamp of the second."""
-    text = typestore().types[STRING]
-    return [BagMessage([*QOS][number % 3], 10**18 + (number - (number % 3 == 2)) * 100_000_001,
-                       bytes(typestore().serialize_cdr(text(f'message {number}'), STRING)))
+    store = bags.typestore()
+    text = store.types[STRING]
+    return [bags.BagMessage([*QOS][number % 3],
+                            10**18 + (number - (number % 3 == 2)) * 100_000_001,
+                            bytes(store.serialize_cdr(text(f'message {number}'), STRING)))
             for number in range(count)]
 
 
-def write_bag(path, storage, parts, compression='NONE'):
-    """Write a recording of several files, as `ros2 bag record` splits it."""
-    for index, messages in enumerate(parts):
-        writer = Writer(path.parent / f'part_{index}', version=9, storage_plugin=STORAGES[storage])
-        writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
-        with writer:
-            topics = {name: writer.add_connection(name, STRING, typestore=typestore(),
-                                                  offered_qos_profiles=[qos])
-                      for name, qos in QOS.items()}
-            for message in messages:
-                writer.write(topics[message.topic], message.stamp_ns, message.data)
-    path.mkdir()
-    every = []
-    for index, _ in enumerate(parts):
-        part = path.parent / f'part_{index}'
-        every.append(yaml.safe_load((part / 'metadata.yaml').read_text()))
-        for file in every[-1]['rosbag2_bagfile_information']['relative_file_paths']:
-            (part / file).rename(path / file)
-    info = every[0]['rosbag2_bagfile_information']
-    for part_info in (each['rosbag2_bagfile_information'] for each in every[1:]):
-        info['relative_file_paths'] += part_info['relative_file_paths']
-        info['files'] += part_info['files']
-        info['message_count'] += part_info['message_count']
-        info['duration']['nanoseconds'] = (
-            part_info['starting_time']['nanoseconds_since_epoch']
-            + part_info['duration']['nanoseconds']
-            - info['starting_time']['nanoseconds_since_epoch'])
-        for topic, more in zip(info['topics_with_message_count'],
-                               part_info['topics_with_message_count'], strict=True):
-            topic['message_count'] += more['message_count']
-    # a user has edited the QoS of /status
-    info['topics_with_message_count'][2]['topic_metadata']['offered_qos_profiles'][0]['depth'] = 7
-    (path / 'metadata.yaml').write_text(yaml.safe_dump(every[0]))
+def write_bag(path, storage, messages, compression='NONE'):
+    """Write a recording as `ros2 bag record` does; a user has edited the QoS of /status."""
+    writer = Writer(path, version=9, storage_plugin=bags.STORAGES[storage])
+    writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
+    with writer:
+        topics = {name: writer.add_connection(name, STRING, typestore=bags.typestore(),
+                                              offered_qos_profiles=[qos])
+                  for name, qos in QOS.items()}
+        for message in messages:
+            writer.write(topics[message.topic], message.stamp_ns, message.data)
+    content = yaml.safe_load((path / 'metadata.yaml').read_text())
+    status = content['rosbag2_bagfile_information']['topics_with_message_count'][2]
+    status['topic_metadata']['offered_qos_profiles'][0]['depth'] = 7
+    (path / 'metadata.yaml').write_text(yaml.safe_dump(content))
     return path
 
 
-@pytest.mark.parametrize('storage', STORAGES)
+@pytest.mark.parametrize('storage', bags.STORAGES)
 @pytest.mark.parametrize('compression', ['NONE', 'FILE', 'MESSAGE'])
 def test_reads_what_jazzy_records(tmp_path, storage, compression):
     messages = make_messages(18)
-    bag = write_bag(tmp_path / 'bag', storage, [messages[:6], messages[6:]], compression)
-    with BagReader(bag) as reader:
+    bag = write_bag(tmp_path / 'bag', storage, messages, compression)
+    with bags.BagReader(bag) as reader:
         assert list(reader.messages()) == messages
         assert reader.message_count == 18
         assert (reader.start_ns, reader.end_ns) == (messages[0].stamp_ns, messages[-1].stamp_ns)
@@ -92,6 +65,8 @@ def test_reads_what_jazzy_records(tmp_path, storage, compression):
         chosen = reader.messages(['/chatter', '/robot_description'], messages[3].stamp_ns,
                                  messages[9].stamp_ns)
         assert list(chosen) == [message for message in messages[3:9] if message.topic != '/status']
+        with pytest.raises(DatasetError, match='/chatter'):
+            reader.topic('/image')
 
 
 def truncate(path, size):
@@ -100,21 +75,13 @@ def truncate(path, size):
 
 @pytest.mark.parametrize(('damage', 'reason'), [
     (lambda bag: (bag / 'metadata.yaml').unlink(), 'ros2 bag reindex'),
-    (lambda bag: (bag / 'part_0.mcap').unlink(), 'part_0.mcap'),
-    (lambda bag: truncate(bag / 'part_0.mcap', -20), 'magic')])
+    (lambda bag: (bag / 'bag.mcap').unlink(), 'bag.mcap'),
+    (lambda bag: truncate(bag / 'bag.mcap', -20), 'magic')])
 def test_broken_recordings_are_refused(tmp_path, damage, reason):
-    bag = write_bag(tmp_path / 'bag', 'mcap', [make_messages(30)])
+    bag = write_bag(tmp_path / 'bag', 'mcap', make_messages(30))
     damage(bag)
-    with pytest.raises(DatasetError, match=reason), BagReader(bag) as reader:
+    with pytest.raises(DatasetError, match=reason), bags.BagReader(bag) as reader:
         list(reader.messages())
-
-
-def test_missing_recording_and_topic_are_named(tmp_path):
-    with pytest.raises(DatasetError, match='no such recording'), BagReader(tmp_path / 'none'):
-        pass
-    bag = write_bag(tmp_path / 'bag', 'mcap', [make_messages(3)])
-    with BagReader(bag) as reader, pytest.raises(DatasetError, match='/chatter'):
-        reader.topic('/image')
 
 
 STAMP_NS = 1341847980722988001
@@ -122,43 +89,34 @@ CAMERA = Camera(64, 48, 53.5, 53.9, 32.0, 24.7, 'plumb_bob', (0.1, -0.2, 0.001, 
 
 
 def test_messages_come_back(tmp_path):
-    pixels_rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    """Those that other tests of bags do not read: a lens, detections."""
     detections = Detections(np.array([[1.5, 2.0, 30.25, 40.0], [0.0, 0.0, 63.0, 47.0]]),
                             ('teddy bear', 'tv'), np.array([0.5, 0.25]))
-    map_from_camera = transform_from_pose(np.array([1.0, -2.0, 3.0]),
-                                          np.array([0.5, 0.5, -0.5, 0.5]))
-    written = {
-        bag_messages.IMAGE: bag_messages.image_message(STAMP_NS, 'camera', pixels_rgb),
-        bag_messages.CAMERA_INFO: bag_messages.camera_info_message(STAMP_NS, 'camera', CAMERA),
-        bag_messages.DETECTIONS: bag_messages.detections_message(STAMP_NS, 'camera', detections),
-        bag_messages.POSE: bag_messages.pose_message(STAMP_NS, 'world', map_from_camera)}
-    with BagWriter(tmp_path / 'bag') as bag:
-        for number, (msgtype, message) in enumerate(written.items()):
-            bag.add_topic(f'/topic_{number}', msgtype)
-            bag.write(f'/topic_{number}', STAMP_NS, message)
-    with BagReader(tmp_path / 'bag') as reader:
-        raws = sorted(reader.messages(), key=lambda one: one.topic)
-        image, info, array, pose = map(reader.deserialize, raws)
-    assert {raw.stamp_ns for raw in raws} == {bag_messages.stamp_ns(image)} == {STAMP_NS}
-    assert image.header.frame_id == 'camera'
-    np.testing.assert_array_equal(image_from_msg(image), pixels_rgb)
+    with bags.BagWriter(tmp_path / 'bag') as bag:
+        for topic, msgtype, message in (
+                ('/a', bag_messages.CAMERA_INFO,
+                 bag_messages.camera_info_message(STAMP_NS, 'camera', CAMERA)),
+                ('/b', bag_messages.DETECTIONS,
+                 bag_messages.detections_message(STAMP_NS, 'camera', detections))):
+            bag.add_topic(topic, msgtype)
+            bag.write(topic, STAMP_NS, message)
+    with bags.BagReader(tmp_path / 'bag') as reader:
+        info, array = map(reader.deserialize, sorted(reader.messages(), key=lambda one: one.topic))
     assert camera_from_msg(info, (64, 48), False) == CAMERA
     assert list(info.p) == [53.5, 0, 32.0, 0, 0, 53.9, 24.7, 0, 0, 0, 1, 0]
-    stamps_ns = [bag_messages.stamp_ns(message) for message in (array, *array.detections)]
-    assert stamps_ns == [STAMP_NS] * 3
+    stamps_ns = [bag_messages.stamp_ns(message) for message in (info, array, *array.detections)]
+    assert stamps_ns == [STAMP_NS] * 4
     again = detections_from_msg(array)
     np.testing.assert_array_equal(again.bboxes_xyxy, detections.bboxes_xyxy)
     np.testing.assert_array_equal(again.scores, detections.scores)
     assert again.class_ids == detections.class_ids
-    assert pose.header.frame_id == 'world'
-    np.testing.assert_allclose(pose_from_msg(pose.pose), map_from_camera, atol=1e-15)
 
 
-@pytest.mark.parametrize('plugin', STORAGES)
+@pytest.mark.parametrize('plugin', bags.STORAGES)
 def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
-    with BagWriter(tmp_path / 'office', plugin) as bag:
-        bag.add_topic('/pose', bag_messages.POSE, RELIABLE_QOS)
-        bag.add_topic('/map', bag_messages.DETECTIONS, LATCHED_QOS)
+    with bags.BagWriter(tmp_path / 'office', plugin) as bag:
+        bag.add_topic('/pose', bag_messages.POSE, bags.RELIABLE_QOS)
+        bag.add_topic('/map', bag_messages.DETECTIONS, bags.LATCHED_QOS)
         for index in range(3):
             message = bag_messages.pose_message(STAMP_NS + index, 'world', np.eye(4))
             bag.write('/pose', STAMP_NS + index, message)
@@ -186,17 +144,17 @@ def test_metadata_is_as_jazzy_reads_it(tmp_path, plugin):
 def test_existing_output_is_kept(tmp_path):
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / 'precious').write_text('data')
-    with pytest.raises(DatasetError, match='already exists'), BagWriter(tmp_path / 'bag'):
+    with pytest.raises(DatasetError, match='already exists'), bags.BagWriter(tmp_path / 'bag'):
         pass
     assert [path.name for path in tmp_path.rglob('*')] == ['bag', 'precious']
 
 
-@pytest.mark.parametrize('plugin', STORAGES)
+@pytest.mark.parametrize('plugin', bags.STORAGES)
 def test_failure_leaves_nothing(tmp_path, plugin):
-    with pytest.raises(ZeroDivisionError), BagWriter(tmp_path / 'bag', plugin) as bag:
+    with pytest.raises(KeyboardInterrupt), bags.BagWriter(tmp_path / 'bag', plugin) as bag:
         bag.add_topic('/pose', bag_messages.POSE)
         bag.write('/pose', 1, bag_messages.pose_message(1, 'world', np.eye(4)))
         assert not (tmp_path / 'bag').exists()  # written beside its final path
         assert len(list(tmp_path.iterdir())) == 1
-        _ = 1 / 0
+        raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []

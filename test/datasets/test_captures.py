@@ -12,21 +12,10 @@ import struct
 import time
 import tracemalloc
 
+import capture_folders as captures
 import cv2
 import numpy as np
 import pytest
-from capture_folders import (
-    ASSETS,
-    DEPTH_MM,
-    FLIP,
-    WALK,
-    WRITERS,
-    edited,
-    shots_of,
-    write_colmap,
-    write_nerf,
-    write_stray,
-)
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -56,12 +45,12 @@ OPTIONS = MappingOptions(min_baseline_deg=5.0, estimate_pose_errors=False)
 @pytest.fixture(scope='session')
 def look():
     """Return the demo's detector, which runs once on equal pixels."""
-    detect, seen = load_detector(DetectorOptions(model=str(ASSETS / 'yolo.onnx'))).detect, {}
+    network, seen = load_detector(DetectorOptions(model=str(captures.ASSETS / 'yolo.onnx'))), {}
 
     def once(image):
         key = image.tobytes()
         if key not in seen:
-            seen[key] = detect(image)
+            seen[key] = network.detect(image)
         return seen[key]
     return RunNetworks(once)
 
@@ -69,18 +58,18 @@ def look():
 @pytest.fixture(scope='session')
 def original(look):
     """Return the map of the walk as a TUM folder."""
-    return build_map(record_every_frame(read_folder(WALK, FolderOptions(layout='tum')), look),
-                     OPTIONS).landmark_map
+    walk = read_folder(captures.WALK, FolderOptions(layout='tum'))
+    return build_map(record_every_frame(walk, look), OPTIONS).landmark_map
 
 
 @pytest.fixture(scope='session')
 def shots():
-    return shots_of()
+    return captures.shots_of()
 
 
-@pytest.mark.parametrize('layout', WRITERS)
+@pytest.mark.parametrize('layout', captures.WRITERS)
 def test_what_is_seen_and_from_where_is_that_of_the_original(layout, shots, tmp_path):
-    folder = WRITERS[layout](tmp_path / 'scan', shots)
+    folder = captures.WRITERS[layout](tmp_path / 'scan', shots)
     assert find_layout(folder).name == layout
     frames = read_folder(folder, METRES)
     assert frames.notes[0] == f'read as {layout}: {len(shots)} of {len(shots)} images have poses'
@@ -92,7 +81,7 @@ def test_what_is_seen_and_from_where_is_that_of_the_original(layout, shots, tmp_
     assert (raw.depth is not None) == (layout in ('Polycam', 'Stray Scanner', 'ARKitScenes'))
     if raw.depth is not None:
         depths = raw.depth().depths_m
-        assert depths.shape == DEPTH_MM.shape and depths[-1, -1] == 2.0
+        assert depths.shape == captures.DEPTH_MM.shape and depths[-1, -1] == 2.0
         # where Polycam's confidence is low
         assert np.isnan(depths[0, 0]) == (layout == 'Polycam')
     np.testing.assert_array_equal(raw.color()[0], cv2.imread(str(shot.path))[..., ::-1])
@@ -100,10 +89,10 @@ def test_what_is_seen_and_from_where_is_that_of_the_original(layout, shots, tmp_
 
 def test_text_models_and_per_frame_intrinsics_say_the_same(shots, tmp_path):
     for text in (False, True):
-        write_colmap(tmp_path / f'{text}', shots[:5], text)
-    write_nerf(tmp_path / 'nerf', shots[:5], per_frame=True)
+        captures.write_colmap(tmp_path / f'{text}', shots[:5], text)
+    captures.write_nerf(tmp_path / 'nerf', shots[:5], per_frame=True)
     # without points, every second line is empty
-    bare = write_colmap(tmp_path / 'bare', shots[:5], text=True) / 'sparse/0/images.txt'
+    bare = captures.write_colmap(tmp_path / 'bare', shots[:5], text=True) / 'sparse/0/images.txt'
     lines = bare.read_text().splitlines()
     first = next(row for row, line in enumerate(lines) if not line.startswith('#'))
     bare.write_text('\r\n'.join([*lines[:first], *(
@@ -123,7 +112,7 @@ def test_text_models_and_per_frame_intrinsics_say_the_same(shots, tmp_path):
 def test_camera_models_project_as_colmap_does(model, values, shots, tmp_path):
     import pycolmap
 
-    write_colmap(tmp_path, shots[:1], camera_of=lambda _: (model, 640, 480, values))
+    captures.write_colmap(tmp_path, shots[:1], camera_of=lambda _: (model, 640, 480, values))
     raw = next(read_folder(tmp_path, METRES).read_raw(lambda *_: True))
     theirs = pycolmap.Camera(model=model, width=640, height=480, params=values)
     points = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.4, 0.0, 0.4]), -1).reshape(-1, 2)
@@ -139,7 +128,7 @@ def test_images_with_their_own_cameras(shots, look, tmp_path):
     def camera_of(number):
         return 'PINHOLE', 640, 480, [500 * focus[number], 500 * focus[number], 320 + number / 9,
                                      240]
-    folder = write_colmap(tmp_path, shots, camera_of=camera_of)
+    folder = captures.write_colmap(tmp_path, shots, camera_of=camera_of)
     frames = read_folder(folder, METRES)
     assert frames.varies
     recorded = record_every_frame(frames, look)
@@ -151,7 +140,7 @@ def test_images_with_their_own_cameras(shots, look, tmp_path):
         recorded.cameras[0].normalize_bboxes(recorded.bboxes_xyxy[rows]),
         own.normalize_bboxes(boxes.bboxes_xyxy), atol=1e-9)
     # a rotated image has a separate camera, in the file as well
-    other = write_colmap(tmp_path / 'other', shots, camera_of=lambda number: (
+    other = captures.write_colmap(tmp_path / 'other', shots, camera_of=lambda number: (
         ('PINHOLE', 480, 640, [500, 500, 240, 320]) if number == 1 else camera_of(number)))
     cv2.imwrite(str(other / 'images/walk' / shots[0].path.name),
                 np.zeros((640, 480, 3), dtype=np.uint8))
@@ -165,7 +154,7 @@ def test_images_with_their_own_cameras(shots, look, tmp_path):
 
 
 def test_a_video_is_read_image_by_image(shots, tmp_path):
-    write_stray(tmp_path, shots[:6])
+    captures.write_stray(tmp_path, shots[:6])
     for path in (tmp_path / 'rgb').iterdir():
         path.unlink()
     video = cv2.VideoWriter(str(tmp_path / 'rgb.mp4'), cv2.VideoWriter.fourcc(*'mp4v'), 30.0,
@@ -180,7 +169,7 @@ def test_a_video_is_read_image_by_image(shots, tmp_path):
 
 
 def test_the_scale_by_a_distance_and_by_objects(shots, look, original, tmp_path):
-    folder = write_colmap(tmp_path, shots, scale=0.4)
+    folder = captures.write_colmap(tmp_path, shots, scale=0.4)
     first, last = shots[0], shots[-1]
     apart = float(np.linalg.norm(first.pose[:3, 3] - last.pose[:3, 3]))
     frames = read_folder(folder, FolderOptions(
@@ -199,9 +188,9 @@ def test_the_scale_by_a_distance_and_by_objects(shots, look, original, tmp_path)
 # ---- axes and vertical --------------------------------------------------------------------------
 # of a camera in a body with x forward, y left, z up
 ROS_FROM_CAMERA = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
-STORED = {'opencv': lambda pose: pose, 'opengl': lambda pose: pose @ FLIP,
+STORED = {'opencv': lambda pose: pose, 'opengl': lambda pose: pose @ captures.FLIP,
           'opencv-inverse': invert_transform,
-          'opengl-inverse': lambda pose: invert_transform(pose @ FLIP),
+          'opengl-inverse': lambda pose: invert_transform(pose @ captures.FLIP),
           'ros': lambda pose: pose @ ROS_FROM_CAMERA}
 
 
@@ -229,7 +218,8 @@ def test_real_images_tell_the_axes(folder, shared_data, monkeypatch):
 
 
 def test_the_option_mends_it(shots, tmp_path):
-    folder = write_nerf(tmp_path, [shot._replace(pose=shot.pose @ FLIP) for shot in shots])
+    folder = captures.write_nerf(tmp_path, [shot._replace(pose=shot.pose @ captures.FLIP)
+                                            for shot in shots])
     with pytest.raises(DatasetError, match='`axes` opencv'):
         read_folder(folder, FolderOptions(scale=1.0))
     found = next(read_folder(folder, FolderOptions(scale=1.0, axes='opencv')).read())
@@ -240,7 +230,7 @@ def test_the_option_mends_it(shots, tmp_path):
 def test_levelled_by_the_tilt_of_the_cameras(angles_deg, shots, tmp_path):
     world = make_transform(Rotation.from_euler('xyz', angles_deg, degrees=True).as_matrix(),
                            np.array([1.0, 2.0, 3.0]))
-    folder = write_colmap(tmp_path, shots, world=world)
+    folder = captures.write_colmap(tmp_path, shots, world=world)
     plain = read_folder(folder, FolderOptions(scale=1.0))
     up = world[:3, 2]
     tilt_deg = np.degrees(np.arccos(up[2]))
@@ -262,7 +252,7 @@ def test_cameras_that_do_not_tell_the_vertical(shots, tmp_path):
     on_its_side = poses @ make_transform(Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix(),
                                          np.zeros(3))
     assert find_vertical(on_its_side) is None
-    folder = write_colmap(tmp_path, [shot._replace(pose=poses[0]) for shot in shots])
+    folder = captures.write_colmap(tmp_path, [shot._replace(pose=poses[0]) for shot in shots])
     with pytest.raises(DatasetError, match='the vertical'):
         read_folder(folder, FolderOptions(scale=1.0, level=True))
 
@@ -281,8 +271,8 @@ def refuses(folder, expected, options=METRES):
 
 @pytest.mark.parametrize('name', ['..', 'C:\\', 'a\0b'])
 def test_names_of_no_file_are_counted(name, few, tmp_path):
-    folder = edited(write_nerf(tmp_path, few), lambda values: values['frames'][0].update(
-        file_path=name))
+    folder = captures.write_nerf(tmp_path, few)
+    captures.edited(folder, lambda values: values['frames'][0].update(file_path=name))
     assert any('1 of 4 listed images are missing' in note
                for note in read_folder(folder, METRES).notes)
 
@@ -297,7 +287,7 @@ def test_folders_without_poses_or_images(few, tmp_path):
     (tmp_path / 'photos/metadata.yaml').touch()
     refuses(tmp_path / 'photos', '`bag`')
     refuses(tmp_path / 'photos', 'has no COLMAP model', FolderOptions(layout='colmap'))
-    folder = write_colmap(tmp_path / 'scan', few)
+    folder = captures.write_colmap(tmp_path / 'scan', few)
     shutil.move(folder / 'images', tmp_path / 'moved')
     refuses(folder, 'none of 4 .* `images`')
     found = read_folder(folder, FolderOptions(scale=1.0, images=tmp_path / 'moved'))
@@ -308,23 +298,23 @@ def test_folders_without_poses_or_images(few, tmp_path):
 
 
 def test_the_unit_must_be_known(few, tmp_path):
-    refuses(write_colmap(tmp_path / 'c', few), '`scale`', FolderOptions())
+    refuses(captures.write_colmap(tmp_path / 'c', few), '`scale`', FolderOptions())
     refuses(tmp_path / 'c', 'named z.jpg',
             FolderOptions(known_distance=('z.jpg', few[1].path.name, 1.0)))
     name = few[0].path.name
     refuses(tmp_path / 'c', 'at the same place',
             FolderOptions(known_distance=(name, name, 1.0)))
-    refuses(write_nerf(tmp_path / 'z', few, applied_scale=0), 'applied_scale is 0')
+    refuses(captures.write_nerf(tmp_path / 'z', few, applied_scale=0), 'applied_scale is 0')
     doubled = [shot._replace(pose=make_transform(shot.pose[:3, :3], 2.0 * shot.pose[:3, 3]))
                for shot in few]
-    raws = read_folder(write_nerf(tmp_path / 'n', doubled, applied_scale=2.0), METRES).read_raw(
-        lambda *_: True)
+    folder = captures.write_nerf(tmp_path / 'n', doubled, applied_scale=2.0)
+    raws = read_folder(folder, METRES).read_raw(lambda *_: True)
     np.testing.assert_allclose(next(raws).map_from_camera, few[0].pose, atol=1e-9)
 
 
 def test_models_in_pieces_and_turned_images(few, tmp_path):
-    folder = write_colmap(tmp_path / 'a', few)
-    other = write_colmap(tmp_path / 'b', few[:1])
+    folder = captures.write_colmap(tmp_path / 'a', few)
+    other = captures.write_colmap(tmp_path / 'b', few[:1])
     shutil.move(other / 'sparse/0', folder / 'sparse/1')
     assert any('2 pieces' in note for note in read_folder(folder, METRES).notes)
     path = folder / 'images/walk' / few[0].path.name
@@ -333,7 +323,7 @@ def test_models_in_pieces_and_turned_images(few, tmp_path):
 
 
 def test_false_counts_cost_nothing(few, tmp_path):
-    folder = write_colmap(tmp_path, few)
+    folder = captures.write_colmap(tmp_path, few)
     for name in ('cameras.bin', 'images.bin'):
         path = folder / 'sparse/0' / name
         data = path.read_bytes()
@@ -357,19 +347,19 @@ def test_false_counts_cost_nothing(few, tmp_path):
      'it is a reflection'),
     (lambda v: v['frames'][0].update(transform_matrix=[[np.nan] * 4] * 4), 'of shape')])
 def test_faults_of_transforms_json(edit, expected, few, tmp_path):
-    refuses(edited(write_nerf(tmp_path, few), edit), expected)
+    refuses(captures.edited(captures.write_nerf(tmp_path, few), edit), expected)
 
 
 MUTATIONS = st.lists(st.tuples(st.floats(0.0, 0.999), st.binary(max_size=12)), max_size=6)
 
 
-@pytest.mark.parametrize('layout', [*WRITERS, 'text'])
+@pytest.mark.parametrize('layout', [*captures.WRITERS, 'text'])
 def test_any_bytes_end_in_a_message(layout, few, tmp_path_factory):
     folder = tmp_path_factory.mktemp('fuzz') / 'scan'
     if layout == 'text':
-        write_colmap(folder, few[:2], text=True)
+        captures.write_colmap(folder, few[:2], text=True)
     else:
-        WRITERS[layout](folder, few[:2])
+        captures.WRITERS[layout](folder, few[:2])
     files = {path: path.read_bytes() for path in sorted(folder.rglob('*'))
              if path.is_file() and path.suffix not in ('.jpg', '.png')
              and not path.stem.startswith(('points', 'rigs', 'frames'))}

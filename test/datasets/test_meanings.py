@@ -12,8 +12,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import rig_bag
 from capture_folders import edited, shots_of, write_colmap, write_nerf
-from rig_bag import TF, depth_message, make, transform, write_messages
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
@@ -48,28 +48,30 @@ def room(shared_data):
 
 def odometry_message(stamp, child, pose):
     field, zeros = bag_messages.pose_message(stamp, 'map', pose), np.zeros(36)
-    zero = make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
-    return make(ODOMETRY, header=field.header, child_frame_id=child,
-                pose=make('geometry_msgs/msg/PoseWithCovariance', pose=field.pose,
+    zero = rig_bag.make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
+    return rig_bag.make(ODOMETRY, header=field.header, child_frame_id=child,
+                pose=rig_bag.make('geometry_msgs/msg/PoseWithCovariance', pose=field.pose,
                           covariance=zeros),
-                twist=make('geometry_msgs/msg/TwistWithCovariance', covariance=zeros,
-                           twist=make('geometry_msgs/msg/Twist', linear=zero, angular=zero)))
+                twist=rig_bag.make('geometry_msgs/msg/TwistWithCovariance', covariance=zeros,
+                                   twist=rig_bag.make('geometry_msgs/msg/Twist', linear=zero,
+                                                      angular=zero)))
 
 
 def write_bag(path, room, *, frame='camera', pose=lambda pose: pose, info=lambda message: message,
-              image=lambda pixels: pixels, stamp=lambda stamp: stamp, more=(), poses=True):
+              stamp=lambda stamp: stamp, more=(), poses=True):
     """Write images, camera_info and /ground_truth of a room, each changed by a function."""
     recorded = [*more]
     for at, pixels, true_pose, camera in room:
-        recorded += [
-            (at, '/image', bag_messages.IMAGE,
-             bag_messages.image_message(stamp(at), frame, image(pixels))),
-            (at, '/camera_info', bag_messages.CAMERA_INFO,
-             info(bag_messages.camera_info_message(stamp(at), frame, camera)))]
+        image, (_, *given, message) = rig_bag.camera_messages(at, pixels, camera, frame, stamp(at))
+        recorded += [image, (at, *given, info(message))]
         if poses:
-            recorded.append((at, '/ground_truth', bag_messages.POSE,
-                             bag_messages.pose_message(stamp(at), 'map', pose(true_pose))))
-    return write_messages(path, recorded)
+            recorded += rig_bag.pose_messages([(at, pose(true_pose))], '/ground_truth',
+                                              stamp(at) - at)
+    return rig_bag.write_messages(path, recorded)
+
+
+def poses_of(room):
+    return [(at, pose) for at, _, pose, _ in room]
 
 
 def reads(bag, topics=None, poses=None, depth=None):
@@ -141,8 +143,7 @@ def test_a_few_bad_messages_are_left_out_and_counted(room, tmp_path):
             message.k[:] = 0.0
         return message
 
-    poses = [(at, '/ground_truth', bag_messages.POSE, bag_messages.pose_message(at, 'map', pose))
-             for at, _, pose, _ in room]
+    poses = rig_bag.pose_messages(poses_of(room), '/ground_truth')
     poses[3][3].pose.position.x = np.nan
     bad = {room[place][0] for place in (0, 1, 7)}
     bag = write_bag(tmp_path / 'bag', room, info=info, more=poses, poses=False)
@@ -188,8 +189,7 @@ def test_whose_poses_they_are_and_in_which_frame_depth_is(room, tmp_path):
                            np.array([0.2, 0.0, 1.0]))
     odometry = [(at, '/ground_truth', ODOMETRY, odometry_message(
         at, '/base_footprint', pose @ invert_transform(mount))) for at, _, pose, _ in room]
-    static = [(START, '/tf_static', TF, transform(START, 'base_footprint', 'camera',
-                                                          mount))]
+    static = rig_bag.tf_messages([(START, mount)], 'base_footprint', topic='/tf_static')
     refuses('base_footprint.*`mount`', write_bag(tmp_path / 'a', room, more=odometry, poses=False))
     bag = write_bag(tmp_path / 'b', room, more=[*odometry, *static], poses=False)
     frame = next(reads(bag).read())
@@ -201,14 +201,14 @@ def test_whose_poses_they_are_and_in_which_frame_depth_is(room, tmp_path):
         tmp_path / 'c', room, pose=lambda pose: pose @ invert_transform(body)))
     # depth of another camera needs its camera_info and tf
     depth_from = make_transform(np.eye(3), np.array([0.05, 0.0, 0.0]))
-    depths = [(at, '/depth/image', bag_messages.IMAGE, depth_message(at, DEPTH, 'depth'))
+    depths = [(at, '/depth/image', bag_messages.IMAGE, rig_bag.depth_message(at, DEPTH, 'depth'))
               for at, *_ in room]
     topics = BagTopics(depth='/depth/image')
     refuses("frame 'depth'.*/depth/camera_info is missing", write_bag(
         tmp_path / 'd', room, more=depths), topics)
     infos = [(START, '/depth/camera_info', bag_messages.CAMERA_INFO,
               bag_messages.camera_info_message(START, 'depth', room[0][3])),
-             (START, '/tf_static', TF, transform(START, 'camera', 'depth', depth_from))]
+             *rig_bag.tf_messages([(START, depth_from)], 'camera', 'depth', '/tf_static')]
     frame = next(reads(write_bag(tmp_path / 'e', room, more=[*depths, *infos]), topics).read())
     np.testing.assert_allclose(frame.depth.camera.color_from_depth, depth_from, atol=1e-9)
 
@@ -309,14 +309,12 @@ def test_messages_of_two_cameras_or_bodies_on_one_topic(room, tmp_path):
 def test_depth_of_a_camera_without_calibration_and_of_one_of_several_robots(room, tmp_path):
     few, topics = room[:3], BagTopics(depth='/depth/image', tf='/robot2/tf')
     info = bag_messages.camera_info_message(START, 'depth', room[0][3])
-    more = [(at, '/depth/image', bag_messages.IMAGE, depth_message(at, DEPTH, 'depth'))
+    more = [(at, '/depth/image', bag_messages.IMAGE, rig_bag.depth_message(at, DEPTH, 'depth'))
             for at, *_ in few]
     more += [(START, '/depth/camera_info', bag_messages.CAMERA_INFO, info)]
     for robot in ('/robot1', '/robot2'):
-        more += [(START, f'{robot}/tf_static', TF, transform(
-            START, 'camera', 'depth', np.eye(4)))]
-        more += [(at, f'{robot}/tf', TF, transform(at, 'map', 'camera', pose))
-                 for at, _, pose, _ in few]
+        more += rig_bag.tf_messages([(START, np.eye(4))], 'camera', 'depth', f'{robot}/tf_static')
+        more += rig_bag.tf_messages(poses_of(few), topic=f'{robot}/tf')
     frame = next(reads(write_bag(tmp_path / 'a', few, more=more), topics).read())
     assert frame.depth.camera.fx == room[0][3].fx
     info.k[:] = np.nan
@@ -327,8 +325,7 @@ def test_depth_of_a_camera_without_calibration_and_of_one_of_several_robots(room
 def test_stamps_that_begin_again(room, tmp_path):
     """All of a run, and those of a camera whose clock restarts."""
     half = room[len(room) // 2][0]
-    poses = [(at, '/ground_truth', bag_messages.POSE, bag_messages.pose_message(at, 'map', pose))
-             for at, _, pose, _ in room]
+    poses = rig_bag.pose_messages(poses_of(room), '/ground_truth')
     for more, topic in (((), 'ground_truth'), (poses, 'camera_info')):
         refuses(f'/{topic}: the stamps jump back: .*ros2 bag convert', write_bag(
             tmp_path / topic, room, more=more, poses=not more,
@@ -349,8 +346,7 @@ def test_two_sources_of_one_value(room, shots, tmp_path):
         read_folder(folder, METRES)
     # a topic and tf
     beside = make_transform(np.eye(3), np.array([0.18, 0.0, 0.0]))
-    moving = [(at, '/tf', TF, transform(at, 'map', 'camera', beside @ pose))
-              for at, _, pose, _ in room]
+    moving = rig_bag.tf_messages([(at, beside @ pose) for at, pose in poses_of(room)])
     notes = reads(write_bag(tmp_path / 'bag', room, more=moving)).notes
     assert any('different poses of the camera: 18 cm' in note for note in notes)
 
@@ -386,11 +382,10 @@ def test_layouts_that_are_not_read_are_named(there, expected, tmp_path):
 
 
 def test_tf_under_the_name_of_a_robot_and_a_way_out_of_bad_drivers(room, tmp_path):
-    moving = [(at, '/robot1/tf', TF, transform(at, 'map', 'camera', pose))
-              for at, _, pose, _ in room]
+    moving, second = (rig_bag.tf_messages(poses_of(room), topic=f'/{robot}/tf')
+                      for robot in ('robot1', 'robot2'))
     bag = write_bag(tmp_path / 'bag', room, more=moving, poses=False)
     np.testing.assert_allclose(next(reads(bag).read()).map_from_camera, room[0][2], atol=1e-6)
-    second = [(at, '/robot2/tf', TF, message) for at, _, _, message in moving]
     bag = write_bag(tmp_path / 'two', room, more=[*moving, *second], poses=False)
     refuses('several robots: /robot1/tf, /robot2/tf; give `tf`', bag, None,
             PoseSource(map_frame='map'))
@@ -405,8 +400,7 @@ def test_tf_under_the_name_of_a_robot_and_a_way_out_of_bad_drivers(room, tmp_pat
     topics = BagTopics(intrinsics=str(tmp_path / 'camera.json'))
     assert next(reads(bag, topics).read()).camera.fx == room[0][3].fx
     # stamps that are 60 ms apart
-    apart = [(at, '/late', bag_messages.POSE, bag_messages.pose_message(at + 60 * MS, 'map', pose))
-             for at, _, pose, _ in room[:3]]
+    apart = rig_bag.pose_messages(poses_of(room[:3]), '/late', 60 * MS)
     bag = write_bag(tmp_path / 'apart', room[:3], more=apart)
     assert [next(reads(bag, None, PoseSource('/late', tolerance_ns=most * MS)).read()
                  ).map_from_camera is None for most in (20, 100)] == [True, False]

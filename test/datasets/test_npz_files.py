@@ -11,18 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.map_recording import (
-    MapRecording,
-    load_recording,
-    recording_path,
-    save_recording,
-)
-from cliploc_ros.offline.datasets.observations import (
-    load_observations,
-    load_queries,
-    save_observations,
-    save_queries,
-)
+from cliploc_ros.offline.datasets import map_recording, observations
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 
@@ -57,16 +46,6 @@ def observation_arrays() -> dict[str, np.ndarray]:
                              'timestamps': np.array([10.0, 10.5, 11.0])}
 
 
-KINDS = {'query': (query_arrays, load_queries),
-         'observation': (observation_arrays, load_observations)}
-
-
-@pytest.fixture(params=KINDS)
-def kind(request):
-    """The arrays of a valid file, and the function that loads such files."""
-    return KINDS[request.param]
-
-
 def save(path, arrays):
     np.savez_compressed(path, **arrays)
     return path
@@ -98,18 +77,20 @@ def become(name, value):
     (become('depths', [1.0, np.inf, np.nan]), 'depths is not positive and finite in row 1'),
     (become('stamps_ns', [0, 1, 2]), 'stamps_ns contradicts timestamps in row 0'),
     (become('scores', np.array([1, 'a', None], dtype=object)), 'scores cannot be')])
-def test_malformed_arrays_are_named(tmp_path, kind, change, message):
-    path, arrays = tmp_path / 'q.npz', kind[0]()
-    change(arrays)
-    with pytest.raises(DatasetError, match=message) as caught:
-        kind[1](save(path, arrays))
-    assert str(path) in str(caught.value)
+def test_malformed_arrays_are_named(tmp_path, change, message):
+    path, queries, seen = tmp_path / 'q.npz', query_arrays(), observation_arrays()
+    for arrays, load in ((queries, observations.load_queries),
+                         (seen, observations.load_observations)):
+        change(arrays)
+        with pytest.raises(DatasetError, match=message) as caught:
+            load(save(path, arrays))
+        assert str(path) in str(caught.value)
 
 
 # ---- queries ------------------------------------------------------------------------------------
 def test_queries_are_read(tmp_path):
     path = save(tmp_path / 'q.npz', query_arrays())
-    queries = load_queries(path, ['cup_1', 'cup_2', 'tv_1', 'lamp'])
+    queries = observations.load_queries(path, ['cup_1', 'cup_2', 'tv_1', 'lamp'])
     assert queries.landmark_ids == ('cup_1', 'cup_2', 'tv_1')
     first, second, third = queries
     seen = [frame.observation for frame in queries]
@@ -125,22 +106,22 @@ def test_queries_are_read(tmp_path):
     assert [frame.is_main for frame in queries] == [True, False, True]
     assert first.group == second.group != third.group
     with pytest.raises(DatasetError, match=r"'cup_2'.* 1 more"):
-        load_queries(path, ['cup_1'])
+        observations.load_queries(path, ['cup_1'])
 
 
 def test_queries_come_back(tmp_path):
-    queries = load_queries(save(tmp_path / 'q.npz', query_arrays()))
+    queries = observations.load_queries(save(tmp_path / 'q.npz', query_arrays()))
     # A float64 of seconds cannot hold this stamp.
     frames = [replace(frame, observation=replace(
         frame.observation, stamp_ns=stamp_ns, camera=Camera(600, 480, 500, 501, 320, 240)))
         for frame, stamp_ns in zip(queries, (1, 2, 1341847981000000123), strict=True)]
     queries = replace(queries, frames=tuple(frames))
-    save_queries(tmp_path / 'again.npz', queries)
-    again = load_queries(tmp_path / 'again.npz')
+    observations.save_queries(tmp_path / 'again.npz', queries)
+    again = observations.load_queries(tmp_path / 'again.npz')
     assert again.landmark_ids == queries.landmark_ids
     for query, other in zip(queries, again, strict=True):
         np.testing.assert_equal(asdict(query), asdict(other))
-    save_queries(tmp_path / 'other.npz', queries)
+    observations.save_queries(tmp_path / 'other.npz', queries)
     assert (tmp_path / 'other.npz').read_bytes() == (tmp_path / 'again.npz').read_bytes()
 
 
@@ -151,29 +132,23 @@ def test_odometry_is_read_back_in_the_order_of_time(tmp_path):
     odometry[1] = np.nan
     arrays = observation_arrays() | {'timestamps': np.array([11.0, 10.5, 10.0]),
                               'odom_from_camera': odometry}
-    loaded = load_observations(save(tmp_path / 'o.npz', arrays))
+    loaded = observations.load_observations(save(tmp_path / 'o.npz', arrays))
     assert loaded.odom_from_camera[[0, 2], 0, 3].tolist() == [1.0, 3.0]
     assert np.isnan(loaded.odom_from_camera[1]).all()
-    save_observations(tmp_path / 'again.npz', loaded)
-    np.testing.assert_array_equal(load_observations(tmp_path / 'again.npz').odom_from_camera,
-                                  loaded.odom_from_camera)
+    observations.save_observations(tmp_path / 'again.npz', loaded)
+    again = observations.load_observations(tmp_path / 'again.npz')
+    np.testing.assert_array_equal(again.odom_from_camera, loaded.odom_from_camera)
 
 
-def test_embeddings_come_back_and_their_checksum_is_verified(tmp_path):
+def test_embeddings_come_back(tmp_path):
     rows = np.random.default_rng(0).normal(size=(3, 300_000)).astype(np.float16)
-    plain = load_observations(save(tmp_path / 'o.npz', observation_arrays()))
+    plain = observations.load_observations(save(tmp_path / 'o.npz', observation_arrays()))
     given = replace(plain, embeddings=rows)
-    save_observations(tmp_path / 'large.npz', given)
-    loaded = load_observations(tmp_path / 'large.npz')
+    observations.save_observations(tmp_path / 'large.npz', given)
+    loaded = observations.load_observations(tmp_path / 'large.npz')
     assert (loaded.embeddings == rows).all()
     save(tmp_path / 'compressed.npz', observation_arrays() | {'embeddings': rows})
-    assert (load_observations(tmp_path / 'compressed.npz').embeddings == rows).all()
-
-    content = bytearray((tmp_path / 'large.npz').read_bytes())
-    content[content.index(rows[1].tobytes()[:50]) + 20] ^= 1  # as on a failing disk
-    (tmp_path / 'large.npz').write_bytes(content)
-    with pytest.raises(DatasetError, match=r'embeddings.*CRC'):
-        load_observations(tmp_path / 'large.npz')
+    assert (observations.load_observations(tmp_path / 'compressed.npz').embeddings == rows).all()
 
 
 @pytest.fixture
@@ -183,11 +158,11 @@ def built(tmp_path):
     (folder / 'drive').mkdir(parents=True)
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, :3, 3] = 1.0, 2.0, 3.0
-    save_observations(folder / 'drive.npz', PosedDetections(
+    observations.save_observations(folder / 'drive.npz', PosedDetections(
         (CAMERA,), poses, np.array([0.0, 1.0]), np.array([0, 1, 1]),
         np.array([[1.0, 2.0, 30.0, 40.0]]), ('cup',), np.zeros(1, dtype=np.int64), np.ones(1)))
     turn = Rotation.from_euler('x', 90, degrees=True).as_matrix()
-    save_recording(folder / 'm.yaml', MapRecording(
+    map_recording.save_recording(folder / 'm.yaml', map_recording.MapRecording(
         folder / 'drive.npz', folder / 'drive', '/image', '/info', scale=2.0,
         rotation=turn.tolist()))
     return folder / 'm.yaml', poses
@@ -196,7 +171,7 @@ def built(tmp_path):
 def test_a_moved_folder_keeps_its_recording(built, tmp_path):
     path, poses = built
     path.parent.rename(tmp_path / 'there')
-    found = load_recording(tmp_path / 'there/m.yaml')
+    found = map_recording.load_recording(tmp_path / 'there/m.yaml')
     assert found.source.samefile(tmp_path / 'there/drive')
     assert (found.image, found.camera_info, found.intrinsics) == ('/image', '/info', None)
     np.testing.assert_allclose(found.load().map_from_camera[:, 1, 3], -2.0 * poses[:, 2, 3])
@@ -205,12 +180,12 @@ def test_a_moved_folder_keeps_its_recording(built, tmp_path):
 def test_what_is_gone_is_none_and_what_is_damaged_is_named(built):
     path, _ = built
     (path.parent / 'drive').rmdir()
-    assert load_recording(path).source is None
+    assert map_recording.load_recording(path).source is None
     (path.parent / 'drive.npz').unlink()
-    assert load_recording(path) is None
+    assert map_recording.load_recording(path) is None
     for text in ('{"speed": 1}', '{"observations": "m.yaml", "scale": -1}', '[]',
                  '{"observations": "m.yaml", "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}'):
-        recording_path(path).write_text(text)
+        map_recording.recording_path(path).write_text(text)
         with pytest.raises(DatasetError, match='recording'):
-            load_recording(path)
-    assert load_recording(path.with_name('other.yaml')) is None
+            map_recording.load_recording(path)
+    assert map_recording.load_recording(path.with_name('other.yaml')) is None

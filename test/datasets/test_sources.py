@@ -9,7 +9,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from rig_bag import TF, depth_message, make, transform, write_messages
+from rig_bag import (
+    camera_messages,
+    depth_message,
+    make,
+    pose_messages,
+    tf_messages,
+    write_messages,
+)
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
@@ -27,8 +34,7 @@ COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 
 
 def header(stamp, frame_id):
-    time = make('builtin_interfaces/msg/Time', sec=stamp // 10**9, nanosec=stamp % 10**9)
-    return make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
+    return bag_messages.pose_message(stamp, frame_id, np.eye(4)).header
 
 
 def pose_at(x, turn_deg=0.0):
@@ -45,20 +51,16 @@ def compressed_depth(stamp, encoding, values, a=0.0, b=0.0):
 
 
 def write_bag(path, images_ms, messages):
-    """Write images at stamps [ms], and messages: (time [ms], topic, type, message)."""
-    recorded = [(t, '/image', bag_messages.IMAGE, bag_messages.image_message(
-        START + t * MS, 'camera', np.full((48, 64, 3), t % 200, dtype=np.uint8)))
-        for t in images_ms]
-    recorded += [(t, '/camera_info', bag_messages.CAMERA_INFO,
-                  bag_messages.camera_info_message(START + t * MS, 'camera', CAMERA))
-                 for t in images_ms]
-    return write_messages(path, [(START + t * MS, *rest) for t, *rest in [*recorded, *messages]])
+    """Write images at stamps [ms], and other messages."""
+    shown = [message for t in images_ms for message in camera_messages(
+        START + t * MS, np.full((48, 64, 3), t % 200, dtype=np.uint8), CAMERA)]
+    return write_messages(path, [*shown, *messages])
 
 
 def drive(stamps_ms=range(0, 1001, 100), offset_ns=0):
     """Return poses of a body that drives 1 m in 1 s, as PoseStamped."""
-    return [(t, '/pose', bag_messages.POSE, bag_messages.pose_message(
-        START + offset_ns + t * MS, 'map', pose_at(t / 1000))) for t in stamps_ms]
+    return pose_messages([(START + t * MS, pose_at(t / 1000)) for t in stamps_ms],
+                         late_ns=offset_ns)
 
 
 def positions(frames):
@@ -88,15 +90,14 @@ def test_poses_are_interpolated_within_a_gap(tmp_path):
     (CAMERA, 'other', '/image', None, "'other'"), (CAMERA, 'camera', '/image_rect', None, None)])
 def test_what_contradicts_itself_in_a_recording(tmp_path, camera, frame_id, topic, error, note):
     """The node's functions check them: refused, or reported in a note."""
-    image = bag_messages.image_message(START, 'camera', np.zeros((48, 64, 3), dtype=np.uint8))
-    info = bag_messages.camera_info_message(START, frame_id, camera)
-    write_messages(tmp_path / 'bag', [
-        (START, topic, bag_messages.IMAGE, image),
-        (START, '/info', bag_messages.CAMERA_INFO, info),
-        (START, '/pose', bag_messages.POSE, bag_messages.pose_message(START, 'map', np.eye(4)))])
+    blank = np.zeros((48, 64, 3), dtype=np.uint8)
+    (_, _, kind, image), _ = camera_messages(START, blank, camera)
+    _, info = camera_messages(START, blank, camera, frame_id)
+    write_messages(tmp_path / 'bag', [(START, topic, kind, image), info,
+                                      *pose_messages([(START, np.eye(4))])])
 
     def read():
-        frames = bag_frames(tmp_path / 'bag', BagTopics(topic, '/info'), PoseSource('/pose'))
+        frames = bag_frames(tmp_path / 'bag', BagTopics(topic, info[1]), PoseSource('/pose'))
         return list(frames.read()), frames.notes
     if error is not None:
         with pytest.raises(DatasetError, match=error):
@@ -109,10 +110,10 @@ def test_what_contradicts_itself_in_a_recording(tmp_path, camera, frame_id, topi
 
 def test_the_only_topics_and_poses_are_found(tmp_path):
     bag = write_bag(tmp_path / 'bag', [450], [
-        *tf_messages(), (450, '/image/compressed', COMPRESSED, make(
+        *moving_tf(), (START + 450 * MS, '/image/compressed', COMPRESSED, make(
             COMPRESSED, header=header(START, 'camera'), format='jpeg',
             data=np.zeros(1, np.uint8))),
-        (450, '/depth/image', bag_messages.IMAGE, depth_message(START, np.ones((2, 2))))])
+        (START, '/depth/image', bag_messages.IMAGE, depth_message(START, np.ones((2, 2))))])
     assert find_topics(bag, None, None) == ('/image', '/camera_info')
     frame, = bag_frames(bag, BagTopics(), PoseSource(max_gap_ns=1000 * MS)).read()
     expected, = bag_frames(bag, BagTopics(), of_tf('map', 1000)).read()
@@ -120,10 +121,12 @@ def test_the_only_topics_and_poses_are_found(tmp_path):
 
 
 def test_a_covariance_with_a_mount(tmp_path):
-    with_covariance = [(t, '/amcl_pose', 'geometry_msgs/msg/PoseWithCovarianceStamped', make(
-        'geometry_msgs/msg/PoseWithCovarianceStamped', header=header(START + t * MS, 'map'),
-        pose=make('geometry_msgs/msg/PoseWithCovariance', pose=bag_messages.pose_message(
-            0, '', pose_at(t / 1000, 90.0)).pose, covariance=np.zeros(36)))) for t in (0, 100)]
+    kind = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+    with_covariance = [(START + t * MS, '/amcl_pose', kind, make(
+        kind, header=header(START + t * MS, 'map'),
+        pose=make('geometry_msgs/msg/PoseWithCovariance', covariance=np.zeros(36),
+                  pose=bag_messages.pose_message(0, '', pose_at(t / 1000, 90.0)).pose)))
+        for t in (0, 100)]
     bag = write_bag(tmp_path / 'bag', [50], with_covariance)
     mount = mount_from_numbers([0.3, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
     frame, = bag_frames(bag, BagTopics(), PoseSource(
@@ -131,14 +134,13 @@ def test_a_covariance_with_a_mount(tmp_path):
     np.testing.assert_allclose(frame.map_from_camera[:3, 3], [0.05, 0.3, 0.5], atol=1e-9)
 
 
-def tf_messages(*, static=True):
-    """Write a map corrected at 1 Hz, odometry at 10 Hz, and a camera 0.2 m ahead."""
-    moving = [(t, '/tf', TF, transform(
-        START + t * MS, 'map', 'odom', pose_at(0.0, 90.0 * t / 1000))) for t in (0, 1000)]
-    moving += [(t, '/tf', TF, transform(
-        START + t * MS, 'odom', 'base', pose_at(t / 1000))) for t in range(0, 1001, 100)]
-    return moving + static * [(0, '/tf_static', TF, transform(START, 'base', '/camera',
-                                                               pose_at(0.2)))]
+def moving_tf(*, static=True):
+    """Return a map corrected at 1 Hz, odometry at 10 Hz, and a camera 0.2 m ahead."""
+    return [*tf_messages([(START + t * MS, pose_at(0.0, 90.0 * t / 1000)) for t in (0, 1000)],
+                         'map', 'odom'),
+            *tf_messages([(START + t * MS, pose_at(t / 1000)) for t in range(0, 1001, 100)],
+                         'odom', 'base'),
+            *static * tf_messages([(START, pose_at(0.2))], 'base', '/camera', '/tf_static')]
 
 
 def of_tf(map_frame, max_gap_ms, camera_frame=None):
@@ -146,7 +148,7 @@ def of_tf(map_frame, max_gap_ms, camera_frame=None):
 
 
 def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
-    bag = write_bag(tmp_path / 'bag', [450], tf_messages())
+    bag = write_bag(tmp_path / 'bag', [450], moving_tf())
     frame, = bag_frames(bag, BagTopics(), of_tf('map', 1000)).read()
     expected = pose_at(0.0, 90.0 * 0.45) @ pose_at(0.45) @ pose_at(0.2)
     np.testing.assert_allclose(frame.map_from_camera, expected, atol=1e-9)
@@ -159,7 +161,7 @@ def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
 
 
 def test_odometry_is_read_from_tf(tmp_path):
-    bag = write_bag(tmp_path / 'bag', [450], tf_messages())
+    bag = write_bag(tmp_path / 'bag', [450], moving_tf())
     odometry = bag_odometry(bag, '/image', of_tf('odom', 200))
     # map -> odom changes, and is not included
     np.testing.assert_allclose(odometry.pose_at(START + 450 * MS), pose_at(0.65), atol=1e-9)
@@ -170,13 +172,11 @@ def test_odometry_is_read_from_tf(tmp_path):
 
 
 @pytest.mark.parametrize(('messages', 'frames', 'expected'), [
-    (tf_messages(), ('world', 'camera'), "'world'; it has base"),
-    (tf_messages(static=False), ('map', 'camera'), "frame 'camera'"),
-    ([*tf_messages(static=False), (0, '/tf_static', TF, transform(
-        START, 'arm', 'camera', np.eye(4)))], ('map', 'camera'),
-     "'map' and 'arm'"),
-    ([*tf_messages(), (900, '/tf', TF, transform(
-        START, 'other_odom', 'base', np.eye(4)))], ('map', 'camera'),
+    (moving_tf(), ('world', 'camera'), "'world'; it has base"),
+    (moving_tf(static=False), ('map', 'camera'), "frame 'camera'"),
+    ([*moving_tf(static=False), *tf_messages([(START, np.eye(4))], 'arm', topic='/tf_static')],
+     ('map', 'camera'), "'map' and 'arm'"),
+    ([*moving_tf(), *tf_messages([(START, np.eye(4))], 'other_odom', 'base')], ('map', 'camera'),
      "'base' has two")])
 def test_tf_that_does_not_serve(tmp_path, messages, frames, expected):
     bag = write_bag(tmp_path / 'bag', [450], messages)
@@ -185,7 +185,7 @@ def test_tf_that_does_not_serve(tmp_path, messages, frames, expected):
 
 
 def test_depth_is_paired_with_the_nearest_image(tmp_path):
-    depths = [(t + 4, '/depth', bag_messages.IMAGE, depth_message(
+    depths = [(START + (t + 4) * MS, '/depth', bag_messages.IMAGE, depth_message(
         START + t * MS, np.full((48, 64), value, dtype=np.uint16)))
         for t, value in ((0, 1000), (95, 2000), (130, 3000), (400, 0))]
     bag = write_bag(tmp_path / 'bag', [0, 100, 300, 400], [*drive(), *depths])
@@ -208,9 +208,9 @@ def test_compressed_depth(tmp_path):
     cut = compressed_depth(START + 200 * MS, '16UC1', counts)
     cut.data = cut.data[:30]
     bag = write_bag(tmp_path / 'bag', [0, 100, 200], [
-        *drive(), (1, '/depth', COMPRESSED, compressed_depth(START, '16UC1', counts)),
-        (101, '/depth', COMPRESSED, compressed_depth(START + 100 * MS, '32FC1', inverse, a, b)),
-        (201, '/depth', COMPRESSED, cut)])
+        *drive(), *((START + t * MS + MS, '/depth', COMPRESSED, message) for t, message in (
+            (0, compressed_depth(START, '16UC1', counts)),
+            (100, compressed_depth(START + 100 * MS, '32FC1', inverse, a, b)), (200, cut)))])
     frames = bag_frames(bag, BagTopics(depth='/depth'), PoseSource('/pose')).read()
     np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 0.7], [1.5, np.nan]],
                                rtol=1e-6)

@@ -2,23 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train the demo's networks: CLIP's loss decreases, and the files load like any CLIP and YOLO."""
 
+import csv
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
+from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
+from demo import ASSETS
 from demo.world import train_clip, train_detector
 from demo.world.appearance import CLASSES
 
 pytestmark = pytest.mark.full
+
+PROJECT = ASSETS.parents[1]
 
 
 @pytest.fixture(scope='module')
@@ -27,7 +32,7 @@ def worlds(tmp_path_factory):
     folder = tmp_path_factory.mktemp('worlds')
     subprocess.run(
         [sys.executable, '-m', 'demo.world.make_worlds', str(folder), '--count', '2',
-         '--frames', '3', '--seed', '40'], cwd=Path(__file__).parents[2], check=True, timeout=300)
+         '--frames', '3', '--seed', '40'], cwd=PROJECT, check=True, timeout=300)
     return folder
 
 
@@ -64,3 +69,23 @@ def test_the_command_writes_a_detector(worlds, tmp_path, capsys):
     assert detector.class_names == CLASSES
     found = detector.detect(np.full((480, 640, 3), 128, dtype=np.uint8))
     assert found.bboxes_xyxy.shape[1] == 4
+
+
+def test_the_networks_know_a_walk_they_never_saw_and_labels_lead_where_classes_do_not(tmp_path):
+    limits = yaml.safe_load((PROJECT / 'test/thresholds.yaml').read_text())['demo']['table']
+    done = subprocess.run(
+        [sys.executable, '-m', 'demo.world.compare', '--out', str(tmp_path), '--budget', '0.05',
+         '--trials', '1'], cwd=PROJECT, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stderr
+    print('\n' + done.stdout)
+    map50, first, third = map(float, re.search(
+        r'mAP50 ([.0-9]+); CLIP: top-1 ([.0-9]+), top-3 ([.0-9]+)', done.stdout).groups())
+    assert map50 >= limits['map50']
+    assert first >= limits['clip_top_1'] and third >= limits['clip_top_3']
+    with (tmp_path / 'summary.csv').open() as file:
+        rows = {row['method']: row for row in csv.DictReader(file)}
+    assert tuple(rows) == (*PAPER_METHODS, 'auto')
+    success = {name: float(row['success_0.5m']) for name, row in rows.items()}
+    assert success['hybrid_b-prosac'] >= limits['hybrid_b-prosac_at_half_a_metre']
+    assert success['hybrid_b-prosac'] > success['class_ransac']
+    assert {name for name, row in rows.items() if int(row['wrongly_accepted'])} == set()

@@ -8,8 +8,6 @@ from processes import Process
 from scene import make_room, write_map
 from tester import Tester, class_matching
 
-from cliploc_ros.cli.evaluate import main as evaluate
-
 
 @pytest.fixture(scope='session')
 def ros():
@@ -90,21 +88,4 @@ def own_relocalizer(start, tester, room_map):
         process.wait_for_output(expect)
         tester.connect()
         return process
-    return run
-
-
-@pytest.fixture
-def replay(capsys):
-    """Answer a recorded case with the executable evaluate; return its output.
-
-    The verdict is the same, with the confidence of the recorded answer.
-    """
-    def run(case, landmark_map, answer):
-        capsys.readouterr()
-        assert evaluate(['--bag', str(case), '--map', str(landmark_map)]) == 0
-        printed = capsys.readouterr().out
-        assert printed.endswith('the same verdict\n')
-        confidence = answer.message.partition('[confidence ')[2].partition(',')[0]
-        assert f'confidence {confidence}' in printed
-        return printed
     return run

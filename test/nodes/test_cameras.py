@@ -5,16 +5,15 @@
 import numpy as np
 import pytest
 from cameras import MAP, MOUNTS, NAMES, look
+from frames import header_of, messages_of
 from processes import wait_for
-from scene import CAMERA, write_map
+from scene import write_map
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
-from std_msgs.msg import Header
 from tester import RELIABLE, ask_until, transform_of
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.ros.conversions import detections_to_msg
 
 BASE_FROM_CAMERA = [float(number) for mount in MOUNTS for number in (
     *mount[:3, 3], *Rotation.from_matrix(mount[:3, :3]).as_quat())]
@@ -44,18 +43,9 @@ def four_cameras(start_shared, tester, tmp_path_factory):
         for name, seen in zip(NAMES, look(rng), strict=True):
             if name not in working:
                 continue
-            header = Header(frame_id=f'{name}_optical')
             nanoseconds = round(number * 1e8) + 10**12 - round(late_s.get(name, 0.0) * 1e9)
-            if late_s.get(name) != NEVER:
-                header.stamp.sec, header.stamp.nanosec = divmod(nanoseconds, 10**9)
-            for msg in (
-                    CameraInfo(header=header, width=CAMERA.width, height=CAMERA.height,
-                               k=CAMERA.matrix.ravel(), distortion_model='plumb_bob',
-                               d=[0.0] * 5, p=np.c_[CAMERA.matrix, np.zeros(3)].ravel()),
-                    detections_to_msg(seen.detections, header),
-                    Image(header=header, width=CAMERA.width, height=CAMERA.height,
-                          encoding='mono8', step=CAMERA.width,
-                          data=bytes(CAMERA.width * CAMERA.height))):
+            for msg in messages_of(seen.detections, header_of(
+                    0 if late_s.get(name) == NEVER else nanoseconds, f'{name}_optical')):
                 publishers[name][type(msg)].publish(msg)
 
     def ask(working=NAMES, late_s=None):
@@ -84,7 +74,7 @@ def test_four_cameras_see_enough_at_once(four_cameras, tester):
 
 def test_the_doctor_looks_at_each_camera(four_cameras, start):
     _, ask = four_cameras
-    doctor = start('cli.doctor', '--timeout', 8)  # a busy machine discovers cameras slowly
+    doctor = start('cli.doctor', '--timeout', 5)  # a busy machine discovers cameras slowly
     ask(working=NAMES[1:])
     while doctor.alive:
         ask(working=NAMES[1:])

@@ -27,11 +27,10 @@ def message(frame, depths_m=DEPTHS_M, encoding='16UC1', frame_id=None, late_s=0.
 
 
 @pytest.fixture(scope='module')
-def process(start_shared, tester, room_map, tmp_path_factory):
+def process(start_shared, tester, room_map):
     """Start a relocalizer with enough time for its search on a busy machine, too."""
     process = start_shared('nodes.relocalizer', parameters=class_matching(
-        room_map, depth_transport='raw', record_folder=tmp_path_factory.mktemp('cases'),
-        algorithm='auto', time_budget_ms=5000.0))
+        room_map, depth_transport='raw', algorithm='auto', time_budget_ms=5000.0))
     process.wait_for_output('ready after')
     tester.connect()
     return process
@@ -58,11 +57,8 @@ def depth_camera(process, tester):
     tester.destroy_publisher(publisher)
 
 
-def test_depth_counts_and_a_recorded_request_keeps_it(tester, depth_camera, room_map, replay):
-    answer = ask_until(depth_camera, 'depth of 12', {})
-    stored = tester.trigger('record')
-    assert stored.success, stored.message
-    replay(stored.message.partition(': ')[0], room_map, answer)
+def test_depth_counts(depth_camera):
+    ask_until(depth_camera, 'depth of 12', {})
 
 
 @pytest.mark.parametrize(('given', 'said'), [

@@ -15,9 +15,6 @@ from tester import class_matching, make_frame
 
 IDS = {'configure': Transition.TRANSITION_CONFIGURE, 'activate': Transition.TRANSITION_ACTIVATE,
        'deactivate': Transition.TRANSITION_DEACTIVATE, 'cleanup': Transition.TRANSITION_CLEANUP}
-SHUTDOWN_IDS = {'unconfigured': Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
-                'inactive': Transition.TRANSITION_INACTIVE_SHUTDOWN,
-                'active': Transition.TRANSITION_ACTIVE_SHUTDOWN}
 WAY_TO = {'unconfigured': (), 'inactive': ('configure',), 'active': ('configure', 'activate')}
 
 
@@ -79,7 +76,7 @@ def test_sigterm_ends_a_node_in_every_state(manage, room_map, name, state):
     process, manager = manage(name, **(class_matching(room_map) if name == 'relocalizer' else
                                        {'model': PROJECT / 'demo/assets/yolo.onnx'}))
     if state == 'finalized':
-        assert manager.change(SHUTDOWN_IDS['unconfigured'])
+        assert manager.change(Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
     else:
         manager.do(*WAY_TO[state])
     assert manager.state == state

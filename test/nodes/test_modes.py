@@ -2,13 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer as a process: inputs, modes, frames, floods and shutdown."""
 
+import os
 import signal
+from types import SimpleNamespace as Fields
 
 import cv2
 import numpy as np
 import pytest
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CompressedImage
-from tester import make_frame
+from tester import class_matching, make_frame
+
+from cliploc_ros.ros.conversions import from_yolo_msg
 
 
 def test_compressed_images(own_relocalizer, tester):
@@ -48,3 +53,32 @@ def test_a_request_is_answered_when_its_node_is_told_to_stop(own_relocalizer, te
     tester.wait(lambda: not process.alive, 'its end')
     assert process.stop()[0] == 0
     assert 'internal error' not in process.output() and 'Traceback' not in process.output()
+
+
+# ---- yolo_msgs
+def as_yolo(msg):
+    """Return detections with the fields of a yolo_msgs/DetectionArray."""
+    made = []
+    for given in msg.detections:
+        guess, box = given.results[0].hypothesis, given.bbox
+        made.append(Fields(class_id=0, class_name=guess.class_id, score=guess.score, id='',
+                           bbox=Fields(center=Fields(position=box.center.position, theta=0.0),
+                                       size=Fields(x=box.size_x, y=box.size_y))))
+    return Fields(header=msg.header, detections=made)
+
+
+def test_all_that_counts_is_kept():
+    expected = make_frame()[2]
+    assert serialize_message(from_yolo_msg(as_yolo(expected))) == serialize_message(expected)
+
+
+def test_without_yolo_msgs_the_node_says_so(start, tester, room_map, tmp_path):
+    (tmp_path / 'yolo_msgs.py').write_text("raise ImportError('not here')")
+    process = start('nodes.relocalizer', parameters=class_matching(
+        room_map, detections_type='yolo_msgs'), PYTHONPATH=os.pathsep.join(
+            [str(tmp_path), os.environ.get('PYTHONPATH', '')]))
+    process.wait_for_output('[ERROR]')
+    tester.connect()
+    assert 'yolo_msgs' in process.output()
+    assert not tester.answer(tester.ask()).success
+    assert 'Traceback' not in process.output()

@@ -8,6 +8,7 @@ import numpy as np
 from scene import make_room, see_room
 from tester import make_frame
 
+from cliploc_ros.cli.evaluate import main as evaluate
 from cliploc_ros.core.query import read_case
 from cliploc_ros.messages import image_from_msg
 
@@ -20,7 +21,7 @@ def four_of(rows=(0, 3, 6, 9)):
 
 
 def test_a_recorded_failure_replays_to_the_same_verdict(own_relocalizer, tester, room_map,
-                                                        tmp_path, replay):
+                                                        tmp_path, capsys):
     own_relocalizer(record_folder=tmp_path / 'cases', algorithm='auto', record_limit_mb=1)
     assert not tester.trigger('record').success, 'no request yet'
     answer = tester.relocalize(four_of())
@@ -30,7 +31,10 @@ def test_a_recorded_failure_replays_to_the_same_verdict(own_relocalizer, tester,
     (case,) = (tmp_path / 'cases').iterdir()
     assert case.name.endswith('_refused.npz')
     assert stored.message == f'{case}: 1 frames; {answer.message}'
-    output = replay(case, room_map, answer)
+    assert evaluate(['--bag', str(case), '--map', str(room_map)]) == 0
+    output = capsys.readouterr().out
+    assert output.endswith('the same verdict\n')
+    assert f"confidence {answer.message.partition('[confidence ')[2].partition(',')[0]}" in output
     reason = answer.message.removeprefix('refused: ').rpartition(' [')[0]
     assert f'again:    refused: {reason}\n' in output
     digest = hashlib.sha256(room_map.read_bytes()).hexdigest()[:12]

@@ -13,12 +13,7 @@ from processes import PROJECT
 from scene import MAP_FROM_CAMERA, make_room, see_room
 from tester import make_frame, transform_of
 
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    move_covariance,
-    pose_error,
-    transform_from_pose,
-)
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.ros.qos import LATCHED
 
 
@@ -31,7 +26,7 @@ def test_a_request_is_answered_with_a_pose(relocalizer, tester):
     assert pose == tester.initial_poses[0]
     assert (pose.header.frame_id, pose.header.stamp.sec, pose.header.stamp.nanosec) == (
         'map', 12, 500_000_000)
-    error_m, error_deg = pose_error(transform_of(pose.pose.pose), MAP_FROM_CAMERA)
+    error_m, error_deg = transforms.pose_error(transform_of(pose.pose.pose), MAP_FROM_CAMERA)
     assert error_m < 0.05 and error_deg < 1.0
     covariance = np.array(pose.pose.covariance).reshape(6, 6)
     assert np.linalg.eigvalsh(covariance).min() > 0
@@ -91,13 +86,13 @@ def test_the_mount_moves_the_pose_and_its_covariance(relocalizer, tester):
         assert tester.relocalize(make_frame()).success
         tester.wait(lambda: len(tester.poses) == 2, 'the poses of camera and base')
         camera, base = (transform_of(pose.pose.pose) for pose in tester.poses)
-        camera_from_base = invert_transform(
-            transform_from_pose(np.array(mount[:3]), np.array(mount[3:])))
-        error_m, error_deg = pose_error(base, MAP_FROM_CAMERA @ camera_from_base)
+        camera_from_base = transforms.invert_transform(
+            transforms.transform_from_pose(np.array(mount[:3]), np.array(mount[3:])))
+        error_m, error_deg = transforms.pose_error(base, MAP_FROM_CAMERA @ camera_from_base)
         assert error_m < 0.08 and error_deg < 1.0
         of_camera, of_base = (np.array(pose.pose.covariance).reshape(6, 6)
                               for pose in tester.poses)
-        moved = move_covariance(of_camera, base[:3, 3] - camera[:3, 3])
+        moved = transforms.move_covariance(of_camera, base[:3, 3] - camera[:3, 3])
         assert np.abs(moved - of_camera).max() > 1e-6
         np.testing.assert_allclose(of_base, moved, rtol=1e-6, atol=1e-12)
     finally:

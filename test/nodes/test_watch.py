@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from frames import stamp
 from processes import wait_for
 from scene import make_room, write_map
 from std_msgs.msg import Bool, Header, String
 from tester import class_matching, transform_of
-from watched import MOUNT, Robot, stamp
+from watched import MOUNT, Robot
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros.handoff import transform_msg
@@ -200,7 +201,8 @@ def test_wake_up_goes_on_and_wakes_a_lost_robot_up_again(watched, start):
 
 
 @pytest.mark.needs('tf2_ros')
-def test_a_localizer_by_tf_is_right_kidnapped_and_silent(watching, start, tester, room_map):
+def test_a_localizer_by_tf_is_right_kidnapped_and_silent(watching, own_relocalizer, tester,
+                                                         room_map):
     from tf2_msgs.msg import TFMessage
     publisher = tester.create_publisher(TFMessage, '/tf', 100)
 
@@ -210,10 +212,7 @@ def test_a_localizer_by_tf_is_right_kidnapped_and_silent(watching, start, tester
             for parent, child, pose in (('map', 'odom', map_from_odom),
                                         ('odom', 'base_link', odom_from_base))]))
     watching.stop()
-    process = start('nodes.relocalizer', parameters=parameters(room_map, watch='tf'))
-    process.wait_for_output('ready after')
-    tester.connect()
-    watched = Watched(tester, process)
+    watched = Watched(tester, own_relocalizer(**parameters(room_map, watch='tf')))
     watched.robot.on_tick, watched.robot.has_localizer = send, False
     watched.until_state('localized')
     watched.kidnap()

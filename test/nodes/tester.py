@@ -6,7 +6,7 @@ import time
 from contextlib import contextmanager
 
 import numpy as np
-from builtin_interfaces.msg import Time
+from frames import header_of, messages_of
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
 from processes import PATIENCE_S, wait_for
 from rcl_interfaces.srv import SetParameters
@@ -17,15 +17,15 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scene import CAMERA, make_room, see_room
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import Header
 from std_srvs.srv import Empty, Trigger
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.messages import detections_from_msg
-from cliploc_ros.ros.conversions import detections_to_msg, stamp_ns
+from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.qos import LATCHED
 
+PIXELS = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width, 3), np.uint8)
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -55,6 +55,8 @@ class TakingLocalizer:
 
 class Tester(Node):
     """Publishes frames, requests poses, and collects the relocalizer's messages."""
+
+    __test__ = False  # no class of tests
 
     def __init__(self, namespace=''):
         super().__init__('tester', namespace=namespace)
@@ -196,17 +198,8 @@ def transform_of(pose):
 
 def make_frame(detections=None, stamp_s=100.0):
     """Return the messages of one frame of the simulated room, with the same stamp."""
-    seconds = int(stamp_s)
-    header = Header(frame_id='camera_optical_frame',
-                    stamp=Time(sec=seconds, nanosec=round((stamp_s - seconds) * 1e9)))
-    image = Image(header=header, height=CAMERA.height, width=CAMERA.width, encoding='rgb8',
-                  step=3 * CAMERA.width)
-    image.data = np.random.default_rng(0).integers(
-        0, 256, 3 * CAMERA.width * CAMERA.height, dtype=np.uint8).tobytes()
-    info = CameraInfo(header=header, width=CAMERA.width, height=CAMERA.height,
-                      k=CAMERA.matrix.ravel(), distortion_model='plumb_bob', d=[0.0] * 5,
-                      p=np.c_[CAMERA.matrix, np.zeros(3)].ravel())
-    return image, info, detections_to_msg(detections or see_room(make_room()), header)
+    return messages_of(detections or see_room(make_room()),
+                       header_of(round(stamp_s * 1e9), 'camera_optical_frame'), PIXELS)
 
 
 def class_matching(room_map, **parameters):

@@ -5,24 +5,19 @@
 import time
 
 import numpy as np
-from builtin_interfaces.msg import Time
+from frames import stamp
 from nav_msgs.msg import Odometry
-from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
+from scene import MAP_FROM_CAMERA, make_room, see_room
 from std_msgs.msg import Header
-from tester import RELIABLE, make_frame, transform_of
+from tester import PIXELS, RELIABLE, make_frame, transform_of
 
-from cliploc_ros.core.geometry.transforms import (
-    invert_transform,
-    make_transform,
-    transform_from_pose,
-)
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg
 
 ROOM = make_room()
-NOISE = np.random.default_rng(0).integers(0, 256, 3 * CAMERA.width * CAMERA.height, np.uint8)
 # The camera looks along the base's x axis.
 MOUNT = [0.0, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5]
-BASE_FROM_CAMERA = transform_from_pose(np.array(MOUNT[:3]), np.array(MOUNT[3:]))
+BASE_FROM_CAMERA = transforms.transform_from_pose(np.array(MOUNT[:3]), np.array(MOUNT[3:]))
 TICK_S, POSE_EVERY = 0.05, 5
 # It turns around after this distance.
 REACH_M = 0.5
@@ -30,11 +25,7 @@ REACH_M = 0.5
 
 def aside(metres):
     """Return a move (4, 4) along the image's rows."""
-    return make_transform(np.eye(3), np.array([metres, 0.0, 0.0]))
-
-
-def stamp(seconds):
-    return Time(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
+    return transforms.make_transform(np.eye(3), np.array([metres, 0.0, 0.0]))
 
 
 class Robot:
@@ -59,7 +50,7 @@ class Robot:
     @property
     def map_from_base(self):
         """The truth."""
-        return self.start @ aside(self._x) @ invert_transform(BASE_FROM_CAMERA)
+        return self.start @ aside(self._x) @ transforms.invert_transform(BASE_FROM_CAMERA)
 
     def carry(self, metres):
         """Kidnap the robot; odometry and localizer do not register it."""
@@ -72,7 +63,7 @@ class Robot:
         self._x += self._sign * self.speed_m_s * TICK_S
         now_s = self.clock()
         header = Header(frame_id='odom', stamp=stamp(now_s))
-        odom_from_base = aside(self._x) @ invert_transform(BASE_FROM_CAMERA)
+        odom_from_base = aside(self._x) @ transforms.invert_transform(BASE_FROM_CAMERA)
         self.on_tick(now_s, self.map_from_odom, odom_from_base)
         if self.has_odom:
             odometry = Odometry(header=header, child_frame_id='base_link')
@@ -81,11 +72,11 @@ class Robot:
         if self._tick % 2 == 0:
             seen = see_room(ROOM, self.map_from_base @ BASE_FROM_CAMERA)
             image, *others = make_frame(self.sees(seen), now_s)
-            image.data = np.roll(NOISE, self._tick).tobytes()  # a frozen image is a fault
+            image.data = np.roll(PIXELS, self._tick).tobytes()  # a frozen image is a fault
             self._tester.publish((image, *others))
         if self._tester.initial_poses:  # as AMCL accepts it at rest
             given = transform_of(self._tester.initial_poses.pop().pose.pose)
-            self.map_from_odom = given @ invert_transform(odom_from_base)
+            self.map_from_odom = given @ transforms.invert_transform(odom_from_base)
             self.show(odom_from_base, now_s)
         elif self._tick % POSE_EVERY == 0 and self.has_localizer:
             self.show(odom_from_base, now_s)

@@ -3,12 +3,11 @@
 """Run the programs on the demo's walks through a lens with strong distortion."""
 
 import json
-import shutil
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from capture_folders import ASSETS, copy_walk
 from rig_bag import errors_of
 
 from cliploc_ros.cli.build_map import main as build_map
@@ -21,7 +20,6 @@ from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.views import make_views
 from cliploc_ros.offline.recording.networks import RunNetworks
 
-ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.onnx')
 # Distortion of the TUM sequences fr1.
 LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob',
@@ -30,9 +28,7 @@ LENS = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, 'plumb_bob',
 
 def bend(source, folder, every=1):
     """Write every n-th image of a walk of the demo as seen through the lens."""
-    shutil.copytree(source, folder)
-    rows = [row for row in (folder / 'rgb.txt').read_text().splitlines() if row[0] != '#'][::every]
-    (folder / 'rgb.txt').write_text('\n'.join(rows) + '\n')
+    rows = copy_walk(source, folder, every)
     straight = json.loads((folder / 'camera.json').read_text())
     pixels = np.stack(np.meshgrid(*map(np.arange, (640.0, 480.0))), axis=-1).reshape(-1, 1, 2)
     points = cv2.undistortPoints(pixels, LENS.matrix, np.array(LENS.distortion),

@@ -3,7 +3,6 @@
 """Images of keyframes: stored only on request, small, and undistorted."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,8 +21,8 @@ from cliploc_ros.offline.recording.keyframe_layer import (
     build_layer,
     depths_of_points,
 )
+from demo import ASSETS
 
-ASSETS = Path(__file__).resolve().parents[2] / 'demo/assets'
 WITH_IMAGES = LayerOptions(most_points=200, images=True)
 
 

@@ -3,18 +3,17 @@
 """Observations of the demo's walk with its real networks: complete, resumed, by two workers."""
 
 import fcntl
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from contextlib import redirect_stdout
 from io import StringIO
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from capture_folders import ASSETS, copy_walk
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.cli import check_map
@@ -28,15 +27,8 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.protocols import DetectorOptions
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
 from cliploc_ros.offline.datasets.observations import load_observations
-from cliploc_ros.offline.recording.recorder import (
-    KeyframeFilter,
-    KeyframeOptions,
-    RecordingOptions,
-    record_once,
-)
+from cliploc_ros.offline.recording import recorder
 
-PROJECT = Path(__file__).resolve().parents[2]
-ASSETS = PROJECT / 'demo/assets'
 NETWORKS = ('--model', ASSETS / 'yolo.onnx')
 CLIP = ('--clip-pretrained', ASSETS / 'clip')
 COLOURS = ('red', 'orange', 'yellow', 'green', 'blue', 'purple', 'pink', 'brown', 'black', 'white')
@@ -53,14 +45,7 @@ def arguments(*parts):
 def walk(tmp_path_factory):
     """Return a third of the demo's walk with flat depth, and poses for all but the last image."""
     folder = tmp_path_factory.mktemp('walk') / 'tum'
-    shutil.copytree(ASSETS / 'sequence', folder)
-    rows = [line for line in (folder / 'rgb.txt').read_text().splitlines()
-            if not line.startswith('#')][::3]
-    (folder / 'rgb.txt').write_text('\n'.join(rows) + '\n')
-    last = float(rows[-1].split()[0])
-    truth = (folder / 'groundtruth.txt').read_text().splitlines()
-    (folder / 'groundtruth.txt').write_text('\n'.join(
-        line for line in truth if line.startswith('#') or float(line.split()[0]) < last - 0.25))
+    rows = copy_walk(ASSETS / 'sequence', folder, 3, with_last=False)
     (folder / 'depth').mkdir()
     cv2.imwrite(str(folder / 'depth/flat.png'), np.full((480, 640), 10000, dtype=np.uint16))
     (folder / 'depth.txt').write_text(''.join(f'{row.split()[0]} depth/flat.png\n'
@@ -142,15 +127,16 @@ def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen):
         for place in range(seen):
             yield RawFrame(place, place, np.eye(4), lambda: (image, camera), None)
         raise DatasetError('ends here')
-    options = RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx')), None)
+    frames = Frames(tmp_path / 'walk', 3, read)
+    options = recorder.RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx')), None)
     with pytest.raises(DatasetError, match='ends here'):
-        record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
+        recorder.record_once(frames, options, tmp_path / 'seen.npz')
     left = list(tmp_path.iterdir())
     assert len(left) == bool(seen)
     for path in left:  # while another run has it open
         with path.open('ab') as other, pytest.raises(DatasetError, match='ends here'):
             fcntl.flock(other, fcntl.LOCK_EX)
-            record_once(Frames(tmp_path / 'walk', 3, read), options, tmp_path / 'seen.npz')
+            recorder.record_once(frames, options, tmp_path / 'seen.npz')
         assert len(list(tmp_path.iterdir())) == 1
     assert all(str(path) in caplog.text for path in left)
 
@@ -161,7 +147,8 @@ def test_killed_and_resumed(walk, recorded, tmp_path, capsys):
     command = arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--record-to', file, '--out',
                         tmp_path / 'map.yaml')
     process = subprocess.Popen([sys.executable, '-m', 'cliploc_ros.cli.build_map', *command],
-                               cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+                               cwd=ASSETS.parents[1], stdout=subprocess.DEVNULL,
+                               stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + TIMEOUT_S
     while not any(path.stat().st_size > 15_000 for path in tmp_path.glob('.*.outputs')):
         assert process.poll() is None and time.monotonic() < deadline
@@ -209,7 +196,6 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
                tmp_path / 'map.yaml')
     assert main(arguments(*command)) == 0
     assert '/camera_info' in capsys.readouterr().out
-    assert main(arguments(*command, '--pose-topic', '/ground_truth')) == 0
     from_bag, from_folder = load_observations(file), load_observations(recorded)
     np.testing.assert_allclose(from_bag.bboxes_xyxy, from_folder.bboxes_xyxy, atol=1e-2)
     np.testing.assert_allclose(from_bag.map_from_camera, from_folder.map_from_camera, atol=1e-6)
@@ -222,17 +208,10 @@ def test_a_bag_says_the_same_and_its_topics_are_found(walk, recorded, tmp_path, 
     again = load_observations(file)
     assert (again.odom_from_camera == again.map_from_camera).all()
     assert (again.bboxes_xyxy == from_bag.bboxes_xyxy).all()
-    assert main(arguments(*linked, '/ground_truth', '--pose-noise', 0.02, 0.5,
-                          '--odometry-noise', 0.02, 1)) == 0
-    assert 'joins 14 of 14' in capsys.readouterr().out
     assert check_map.main(arguments(
         tmp_path / 'map.yaml', '--observations', file, '--images', bag, '--positions', 1,
         '--headings', 1, '--frames', 1, '--out', tmp_path / 'check')) in (0, 1)
     assert f'{bag}: /image and /camera_info' in capsys.readouterr().out
-    stamp = file.stat().st_mtime_ns
-    assert main(arguments(*command, '--pose-topic', '/ground_truth')) == 0
-    assert 'odometry' not in capsys.readouterr().out
-    assert file.stat().st_mtime_ns == stamp
     assert main(arguments('--tum', walk, '--pose-topic', '/pose', *NETWORKS, '--no-clip', '--out',
                           tmp_path / 'other.yaml')) == 1
     assert 'are for --bag' in capsys.readouterr().err
@@ -244,7 +223,7 @@ def pose(x=0.0, turn_deg=0.0):
 
 
 def test_keyframes_by_distance_angle_and_pose():
-    is_keyframe = KeyframeFilter(KeyframeOptions(0.1, 5.0))
+    is_keyframe = recorder.KeyframeFilter(recorder.KeyframeOptions(0.1, 5.0))
     walk = [None, pose(), pose(0.06), pose(0.11), None, pose(0.11, 4.0), pose(0.11, 6.0),
             pose(0.205, 6.0), pose(0.215, 6.0)]
     assert [is_keyframe(place, place, one) for place, one in enumerate(walk)] == [

@@ -2,16 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes inside the test's process, in their own context."""
 
-import threading
 import time
-from contextlib import suppress
 
 import pytest
-from handing_over import Robot
-from nav_msgs.msg import Odometry
 from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
-from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 # Time limit of a wait. Only a failing test takes this long.
@@ -65,32 +60,3 @@ def spin_until(context, make_node, wait):
         wait(condition, what, step)
     yield spin
     executor.shutdown()
-
-
-@pytest.fixture
-def robot(context, make_node, wait):
-    robot = Robot(make_node, wait)
-    executor = MultiThreadedExecutor(4, context=context)
-    for node in (robot.node, robot.localizer.node):
-        executor.add_node(node)
-
-    def spin():
-        with suppress(InvalidHandle):  # the shutdown below may happen while it waits
-            executor.spin()
-    spinning = threading.Thread(target=spin)
-    spinning.start()
-    yield robot
-    robot.localizer.may_answer.set()
-    executor.shutdown()
-    spinning.join()
-
-
-@pytest.fixture
-def wheels(robot, make_node):
-    """Create a silent publisher of odometry that the robot subscribes to."""
-    wheels = make_node('wheels').create_publisher(Odometry, 'odom', 10)
-    robot.odometry.open()
-    robot.wait(lambda: wheels.get_subscription_count() and robot.odometry.is_published,
-               'the discovery of the odometry')
-    yield wheels
-    robot.odometry.close()

@@ -4,7 +4,7 @@
 
 import math
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -139,20 +139,6 @@ def test_a_request_is_answered_and_its_record_is_answered_alike(cameras, known, 
     assert asdict(drive.parameters).items() >= case.report['parameters'].items()
     assert len(case.queries) == 2
     equal(again, found.found)
-
-
-@pytest.mark.parametrize('x_m', [0.0, 30.0])
-def test_where_a_prior_decides_the_record_has_it(x_m, tmp_path):
-    drive = Drive(1, 'prior', tmp_path)
-    drive.region = replace(drive.region, mean=np.array([x_m, 0.0, 0.0]))
-    found, _ = drive.localize()
-    case, again = drive.recorded()
-    assert (found.found.evidence.prior < 0.0) == (x_m > 0.0)
-    equal(again, found.found)
-    query, = case.queries
-    without = Localizer(Relocalizer(MAP, case.options)).answer(replace(query, frames=(
-        replace(query.newest, region=None),)))
-    assert without.evidence != again.evidence
 
 
 @pytest.mark.parametrize(('cameras', 'known'), COMBINATIONS)

@@ -11,18 +11,12 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 from std_msgs.msg import Header
-from vision_msgs.msg import (
-    Detection2D,
-    Detection2DArray,
-    ObjectHypothesis,
-    ObjectHypothesisWithPose,
-)
+from vision_msgs import msg as vision
 
-from cliploc_ros.core.geometry.transforms import pose_error, transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import ImageError
 from cliploc_ros.messages import camera_from_msg, detections_from_msg, image_from_msg
-from cliploc_ros.ros.conversions import detections_to_msg, pose_to_msg
+from cliploc_ros.ros.conversions import detections_to_msg
 
 HEADER = Header(frame_id='camera', stamp=Time(sec=12, nanosec=34))
 # Two rows of three pixels, red first.
@@ -81,12 +75,6 @@ def test_a_small_file_that_claims_a_huge_size_is_not_decoded(extension):
         data[frame + 5:frame + 9] = (60_000).to_bytes(2) * 2
     with pytest.raises(ImageError, match='60000x60000'):
         image_from_msg(CompressedImage(format=extension, data=bytes(data)))
-
-
-@given(st.binary(max_size=200))
-def test_bytes_that_are_no_image_are_refused(data):
-    with pytest.raises(ImageError, match='does not decode'):
-        image_from_msg(CompressedImage(format='jpeg', data=data))
 
 
 def camera_info(**changes):
@@ -151,7 +139,7 @@ def test_detections_come_back_over_the_wire(found):
     sent = Detections(boxes, tuple(name for _, name, _ in found),
                       np.array([score for _, _, score in found], dtype=np.float64))
     msg = deserialize_message(serialize_message(detections_to_msg(sent, HEADER)),
-                              Detection2DArray)
+                              vision.Detection2DArray)
     assert msg.header == HEADER
     assert all(detection.header == HEADER for detection in msg.detections)
     received = detections_from_msg(msg)
@@ -168,29 +156,17 @@ def test_detections_come_back_over_the_wire(found):
 
 
 def classified(*hypotheses):
-    return Detection2D(results=[
-        ObjectHypothesisWithPose(hypothesis=ObjectHypothesis(class_id=class_id, score=score))
-        for class_id, score in hypotheses])
+    return vision.Detection2D(results=[
+        vision.ObjectHypothesisWithPose(hypothesis=vision.ObjectHypothesis(
+            class_id=class_id, score=score)) for class_id, score in hypotheses])
 
 
 def test_the_most_confident_class_counts():
     nan = float('nan')  # does not hide another class
-    msg = Detection2DArray(detections=[
+    msg = vision.Detection2DArray(detections=[
         classified(('cup', 0.2), ('vase', 0.7), ('bowl', 0.1)), classified(),
         classified(('chair', 0.5)), classified(('cup', 0.9), ('vase', nan)),
         classified(('vase', nan), ('cup', 0.9))])
     received = detections_from_msg(msg)
     assert received.class_ids == ('vase', '', 'chair', 'cup', 'cup')
     assert received.scores.tolist() == [0.7, 0.0, 0.5, 0.9, 0.9]
-
-
-@given(st.tuples(COORDINATES, COORDINATES, COORDINATES),
-       st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1))
-def test_a_pose_comes_back(position, quat_xyzw):
-    pose = transform_from_pose(np.array(position), np.array(quat_xyzw))
-    msg = pose_to_msg(pose)
-    p, q = msg.position, msg.orientation
-    again = transform_from_pose(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
-    distance, angle_deg = pose_error(again, pose)
-    assert distance == 0.0 and angle_deg < 1e-5
-    assert q.x**2 + q.y**2 + q.z**2 + q.w**2 == pytest.approx(1.0) and q.w >= 0.0

@@ -8,15 +8,10 @@ from scene import CAMERA
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
+from cliploc_ros import messages
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
 from cliploc_ros.core.observation import OPTICAL_FROM_BODY
 from cliploc_ros.errors import CameraError
-from cliploc_ros.messages import (
-    camera_from_msg,
-    faults_of_camera_info,
-    faults_of_headers,
-    faults_of_rectified,
-)
 from cliploc_ros.ros.frame_localizer import faults_of_axes
 
 SIZE = (CAMERA.width, CAMERA.height)
@@ -36,7 +31,8 @@ def judged(changes, rectified=False):
     msg = CameraInfo(**{name: value if isinstance(value, (int, str, RegionOfInterest)) else [
         *map(float, value)] for name, value in fields.items()})
     try:
-        faults = faults_of_camera_info(msg, camera_from_msg(msg, SIZE, rectified), rectified)
+        camera = messages.camera_from_msg(msg, SIZE, rectified)
+        faults = messages.faults_of_camera_info(msg, camera, rectified)
     except CameraError as error:
         return 'refused', str(error)
     text = '; '.join(fault.text for fault in faults)
@@ -126,7 +122,7 @@ def test_valid_odd_messages_are_sound(changes, rectified):
     (('left', 'left', 'right'), [True]), (('left', 'right', ''), [False]),
     (('left', 'right', 'right'), [True, False])])
 def test_messages_of_another_coordinate_frame(frames, certain):
-    assert [fault.is_certain for fault in faults_of_headers(*frames)] == certain
+    assert [fault.is_certain for fault in messages.faults_of_headers(*frames)] == certain
 
 
 @pytest.mark.parametrize('tilt_deg', [-40.0, 30.0])
@@ -152,5 +148,5 @@ def test_a_body_frame_in_place_of_an_optical_one(tilt_deg):
     ('/camera/image', True, BARREL, [])])
 def test_images_that_sound_rectified_or_raw(topic, rectified, changes, certain):
     fields = {'distortion_model': 'plumb_bob', 'd': [0.0] * 5, 'k': K, 'p': P} | changes
-    found = faults_of_rectified(topic, rectified, CameraInfo(**fields))
+    found = messages.faults_of_rectified(topic, rectified, CameraInfo(**fields))
     assert [fault.is_certain for fault in found] == certain

@@ -3,27 +3,156 @@
 """Handing a pose over: real subscribers, odometry, and services that answer or never do."""
 
 import math
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
+from dataclasses import replace
 
 import pytest
+from builtin_interfaces.msg import Time as Stamp
+from frames import stamp
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from handing_over import ONE_HZ, PARAMETERS, TEN_HZ, Robot, make_pose, stamp, stand, tell
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.parameter import Parameter
 from rclpy.time import Time
+from std_srvs.srv import Empty
 
-from cliploc_ros.ros.handoff import HandOffError, NoLocalizerError, difference, usable_pose
-from cliploc_ros.ros.inputs.stamps import TimeJumpError
+from cliploc_ros.ros import handoff
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
+from cliploc_ros.ros.inputs.odometry import OdometrySource
+from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.parameters import RelocalizerParameters
+
+PARAMETERS = RelocalizerParameters(base_frame='base_link')
+
+# Times of odometry since the image [s].
+ONE_HZ, TEN_HZ = (0.0, 1.0, 2.0), tuple(tick / 10 for tick in range(10))
 
 
-@pytest.mark.clock
+def make_pose():
+    pose = PoseWithCovarianceStamped()
+    pose.header.frame_id, pose.header.stamp = 'map', Stamp(sec=100)
+    return pose
+
+
+class Localizer:
+    """Replaces AMCL: receives initial poses, and answers update requests while it may."""
+
+    def __init__(self, node):
+        self.node = node
+        self.poses, self.updates = [], []
+        self.may_answer = threading.Event()
+        self.may_answer.set()
+        self._group = ReentrantCallbackGroup()
+
+    def subscribe(self):
+        self.node.create_subscription(PoseWithCovarianceStamped, 'initialpose',
+                                      self.poses.append, 10)
+
+    def serve(self):
+        def update(_, response):
+            self.updates.append(time.monotonic())
+            self.may_answer.wait()
+            return response
+        self.node.create_service(Empty, 'request_nomotion_update', update,
+                                 callback_group=self._group)
+
+
+class Robot:
+    """A relocalizer's hand-over and a localizer, whose callbacks are all executed."""
+
+    def __init__(self, make_node, wait):
+        self.node, self.wait = make_node('relocalizer'), wait
+        self.localizer = Localizer(make_node('amcl'))
+        self.odometry = OdometrySource(self.node)
+        self.handoff = handoff.HandOff(self.node, self.odometry, CoordinateFrames(self.node))
+        self.jumps = TimeJumps(self.node, self.odometry.forget)
+
+    def hand_over(self, timeout_s=10.0, **changes):
+        """Hand a pose over; return the elapsed time [s]."""
+        start = time.monotonic()
+        self.handoff.hand_over(make_pose(), replace(PARAMETERS, **changes), start + timeout_s,
+                               start, self.jumps)
+        return time.monotonic() - start
+
+    def jump(self):
+        """Make the relocalizer's clock jump: to simulated time, and back."""
+        for is_simulated in (True, False):
+            self.node.set_parameters([Parameter('use_sim_time', value=is_simulated)])
+
+    def meet(self):
+        """Wait until the relocalizer has discovered the localizer."""
+        self.wait(lambda: self.handoff._publisher.get_subscription_count(), 'the subscriber')
+
+    def meet_service(self):
+        self.wait(self.handoff._updater.service_is_ready, 'the service')
+
+
+def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
+    """Publish odometry at times since the image, and wait until the last is received."""
+    stand(robot, wheels, {moment_s: speed_m_s * moment_s for moment_s in moments_s}, twist_m_s)
+
+
+def stand(robot, wheels, places, twist_m_s=0.0, rad_per_m=0.0, body=''):
+    """Publish poses of the robot at times since the image, and wait until they are received."""
+    for moment_s, x_m in places.items():
+        odometry = Odometry(child_frame_id=body)
+        odometry.header.stamp = stamp(100.0 + moment_s)
+        odometry.pose.pose.position.x, odometry.twist.twist.linear.x = x_m, twist_m_s
+        odometry.pose.pose.orientation.z = math.sin(rad_per_m * x_m / 2)
+        odometry.pose.pose.orientation.w = math.cos(rad_per_m * x_m / 2)
+        wheels.publish(odometry)
+    robot.wait(lambda: (newest := robot.odometry.recent(60.0, 0.0)) is not None
+               and newest == odometry, 'odometry')
+
+
+@pytest.fixture
+def robot(context, make_node, wait):
+    robot = Robot(make_node, wait)
+    executor = MultiThreadedExecutor(4, context=context)
+    for node in (robot.node, robot.localizer.node):
+        executor.add_node(node)
+
+    def spin():
+        with suppress(InvalidHandle):  # the shutdown below may happen while it waits
+            executor.spin()
+    spinning = threading.Thread(target=spin)
+    spinning.start()
+    yield robot
+    robot.localizer.may_answer.set()
+    executor.shutdown()
+    spinning.join()
+
+
+@pytest.fixture
+def wheels(robot, make_node):
+    """Create a silent publisher of odometry that the robot subscribes to."""
+    wheels = make_node('wheels').create_publisher(Odometry, 'odom', 10)
+    robot.odometry.open()
+    robot.wait(lambda: wheels.get_subscription_count() and robot.odometry.is_published,
+               'the discovery of the odometry')
+    yield wheels
+    robot.odometry.close()
+
+
 def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
-    start = time.monotonic()
-    with pytest.raises(NoLocalizerError, match=r'/initialpose.*retry'):
-        robot.hand_over(4.0)
-    assert 3.0 < time.monotonic() - start < 5.0
+    """Who hears the pose but shows none, such as ros2 topic echo, is no localizer."""
+    robot.handoff.open('amcl_pose')
+    with pytest.raises(handoff.NoLocalizerError, match=r'/initialpose.*retry'):
+        robot.hand_over(1.5)
     robot.localizer.subscribe()
     robot.meet()
+    start = time.monotonic()
+    with pytest.raises(handoff.NoLocalizerError, match='/amcl_pose'):
+        robot.hand_over(1.5)
+    assert 0.5 < time.monotonic() - start < 3.0
+    assert not robot.localizer.poses
+    robot.handoff.close()
+    robot.handoff.open('')
     robot.hand_over()
     robot.wait(lambda: robot.localizer.poses, 'the pose')
     assert len(robot.localizer.poses) == 1, 'the withheld pose is not delivered late'
@@ -63,9 +192,6 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
         with pytest.raises(TimeJumpError):
             handing_over.result()
     assert not robot.localizer.poses
-    tell(robot, wheels, (1.0, 1.1))
-    robot.hand_over()
-    robot.wait(lambda: robot.localizer.poses, 'the pose')
 
 
 @pytest.fixture
@@ -98,26 +224,15 @@ def showing(served):
     (math.nan, 0.3, 'too little time', 0)])
 def test_a_localizer_has_taken_the_pose_once_it_shows_it(showing, off_m, timeout_s, named, times):
     showing.localizer.off_m = off_m
-    with pytest.raises(NoLocalizerError, match=named) if named else nullcontext():
+    with pytest.raises(handoff.NoLocalizerError, match=named) if named else nullcontext():
         showing.hand_over(timeout_s)
     assert len(showing.localizer.poses) == times
-
-
-def test_who_hears_the_pose_but_shows_none_is_no_localizer(robot):
-    """Subscribers such as ros2 topic echo."""
-    robot.localizer.subscribe()
-    robot.handoff.open('amcl_pose')
-    robot.meet()
-    with pytest.raises(NoLocalizerError, match='/amcl_pose'):
-        robot.hand_over(1.0)
-    assert not robot.localizer.poses
-    robot.handoff.close()
 
 
 def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):
     """It published the pose, but then answers no update and publishes nothing more."""
     showing.localizer.may_answer.clear()
-    with pytest.raises(NoLocalizerError, match=r'took the pose, but has ended or hangs'):
+    with pytest.raises(handoff.NoLocalizerError, match=r'took the pose, but has ended or hangs'):
         showing.hand_over()
     assert len(showing.localizer.poses) == 1
     showing.localizer.may_answer.set()
@@ -153,7 +268,7 @@ def test_where_the_localizer_is_once_it_has_settled_decides(showing, wheels, x_m
         stand(showing, wheels, {0.4 + 0.1 * tick: driven_m * tick / 20 for tick in range(1, 21)},
               twist_m_s=5.0 * driven_m / 10, body=body)
         showing.localizer.show(x_m, 2.4)
-        with pytest.raises(NoLocalizerError, match=named) if named else nullcontext():
+        with pytest.raises(handoff.NoLocalizerError, match=named) if named else nullcontext():
             handing_over.result()
     showing.localizer.may_answer.set()
 
@@ -161,13 +276,13 @@ def test_where_the_localizer_is_once_it_has_settled_decides(showing, wheels, x_m
 @pytest.mark.parametrize('timeout_s', [10.0, 0.3])
 def test_a_robot_that_drives_is_told_so_however_little_time_is_left(showing, wheels, timeout_s):
     tell(showing, wheels, TEN_HZ, twist_m_s=0.5)
-    with pytest.raises(HandOffError, match=r'moves at 0\.50'):
+    with pytest.raises(handoff.HandOffError, match=r'moves at 0\.50'):
         showing.hand_over(timeout_s)
     assert not showing.localizer.poses
 
 
 @pytest.mark.parametrize(('end', 'error'), [
-    (Robot.jump, TimeJumpError), (lambda robot: robot.handoff.stop(), HandOffError)])
+    (Robot.jump, TimeJumpError), (lambda robot: robot.handoff.stop(), handoff.HandOffError)])
 def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(showing, end, error):
     showing.localizer.off_m = math.nan
     with ThreadPoolExecutor(1) as pool:
@@ -194,23 +309,20 @@ def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
     shown.header.frame_id, shown.pose.pose.position.x = frame, x_m
     shown.pose.pose.orientation.z = math.sin(math.radians(yaw_deg) / 2)
     shown.pose.pose.orientation.w = math.cos(math.radians(yaw_deg) / 2)
-    assert (not difference(given, shown)) == is_taken_over
+    assert (not handoff.difference(given, shown)) == is_taken_over
     shown.pose.pose.orientation.y = 1e200
-    assert difference(given, shown)
+    assert handoff.difference(given, shown)
 
 
-def test_a_pose_without_any_scatter_gets_a_centimetre():
-    covariance = usable_pose(make_pose(), Time()).pose.covariance
-    # x, xy, yx, y and yaw: the elements that AMCL reads
-    assert [covariance[i] for i in (0, 1, 6, 7, 35)] == [1e-4, 0.0, 0.0, 1e-4, 1e-5]
-
-
-@pytest.mark.parametrize(('now_s', 'published_s'), [(200, 100), (100, 100), (50, 50), (0, 100)])
+@pytest.mark.parametrize(('now_s', 'published_s'), [(200, 100), (50, 50), (0, 100)])
 def test_the_stamp_is_the_images_but_not_later_than_now(now_s, published_s):
+    """A pose without any scatter gets a centimetre."""
     pose = make_pose()
-    usable = usable_pose(pose, Time(seconds=now_s))
+    usable = handoff.usable_pose(pose, Time(seconds=now_s))
     assert usable.header.stamp.sec == published_s
     assert (pose.header.stamp.sec, usable.header.frame_id) == (100, 'map')
+    # x, xy, yx, y and yaw: the elements that AMCL reads
+    assert [usable.pose.covariance[i] for i in (0, 1, 6, 7, 35)] == [1e-4, 0.0, 0.0, 1e-4, 1e-5]
 
 
 # ---- odometry shows whether the robot has moved since its image ---------------------------------
@@ -227,15 +339,15 @@ def is_withheld(robot, timeout_s=10.0):
     """Hand a pose over; return the reason why it is withheld, or ''."""
     try:
         robot.hand_over(timeout_s)
-    except HandOffError as error:
+    except handoff.HandOffError as error:
         assert not robot.localizer.poses
         return str(error)
     robot.wait(lambda: robot.localizer.poses, 'the pose')
     return ''
 
 
-@pytest.mark.parametrize('moments_s', [ONE_HZ, (0.0, 0.5, 2.5)])
-@pytest.mark.parametrize('speeds', [{'speed_m_s': 0.5}, {'twist_m_s': 0.5}])
+@pytest.mark.parametrize(('moments_s', 'speeds'), [
+    (ONE_HZ, {'speed_m_s': 0.5}), ((0.0, 0.5, 2.5), {'twist_m_s': 0.5})])
 def test_a_robot_that_drives_gets_no_pose_however_slow_its_odometry(listening, wheels, moments_s,
                                                                     speeds):
     """Motion shows in poses without a twist, or in a twist with constant poses."""
@@ -252,22 +364,18 @@ def test_a_robot_at_rest_gets_its_pose_however_slow_its_odometry(listening, whee
     listening.wait(lambda: listening.localizer.poses, 'the pose')
 
 
-@pytest.mark.parametrize(('x_m', 'rad_per_m', 'has_moved'), [
-    (-0.12, 0.0, True), (0.01, 10.0, True), (0.08, 0.8, False)])
-def test_a_robot_that_has_moved_since_its_image_gets_no_pose(listening, wheels, x_m, rad_per_m,
+@pytest.mark.parametrize(('places', 'rad_per_m', 'has_moved'), [
+    *(({tick / 10: min(1.0, tick / 5) * x_m for tick in range(11)}, rad_per_m, has_moved)
+      for x_m, rad_per_m, has_moved in ((-0.12, 0.0, True), (0.01, 10.0, True),
+                                        (0.08, 0.8, False))),
+    # slow odometry: it was between two places
+    ({-1.5: 0.0, 0.5: 0.2, 1.5: 0.2}, 0.0, True),
+    ({-0.5: 0.0, 0.6: 1.0, 0.8: 1.0, 1.0: 1.0}, 0.0, True)])
+def test_a_robot_that_has_moved_since_its_image_gets_no_pose(listening, wheels, places, rad_per_m,
                                                              has_moved):
-    """The robot stopped half a second before the hand-over."""
-    stand(listening, wheels, {tick / 10: min(1.0, tick / 5) * x_m for tick in range(11)},
-          rad_per_m=rad_per_m)
+    """The robot stopped before the hand-over."""
+    stand(listening, wheels, places, rad_per_m=rad_per_m)
     assert ('has moved' in is_withheld(listening)) == has_moved
-
-
-@pytest.mark.parametrize('places', [
-    {-1.5: 0.0, 0.5: 0.2, 1.5: 0.2}, {-0.5: 0.0, 0.6: 1.0, 0.8: 1.0, 1.0: 1.0}])
-def test_slow_odometry_tells_that_the_robot_has_moved_since_its_image(listening, wheels, places):
-    """It was between two places when the image was taken, and stands now."""
-    stand(listening, wheels, places)
-    assert 'has moved' in is_withheld(listening)
 
 
 @pytest.mark.parametrize(('x_m', 'has_moved'), [(1.0, True), (0.0, False)])

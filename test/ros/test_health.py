@@ -4,9 +4,12 @@ import time
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from cliploc_ros.core.acceptance.verdict import RefusalKind
+from cliploc_ros.ros.answer import Answer, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.node.diagnostics import Health, StageTimes, join_names, split_names
 
 
@@ -36,3 +39,23 @@ def test_stages_of_one_result_follow_each_other():
     assert times.ms['waiting'] == pytest.approx(2000.0)
     assert times.ms['CLIP'] == pytest.approx(5000.0)
     assert 2000.0 <= times.ms['search'] < 2500.0, 'the running stage counts up to now'
+
+
+def test_counts_add_up():
+    counters = RequestCounters()
+    counters.add(Answer(Verdict.ACCEPTED, 'x 1.00'))
+    counters.add(Answer(Verdict.REFUSED, 'a reason', kind=RefusalKind.AMBIGUOUS))
+    counters.add(Answer(Verdict.FAILED, 'no new frame'))
+    values = counters.values()
+    assert values['requests'] == 3
+    assert [values[f'requests {verdict}'] for verdict in Verdict] == [1, 1, 0, 1]
+    assert {kind: values[f'refused: {kind}'] for kind in RefusalKind if values[f'refused: {kind}']
+            } == {'ambiguous': 1}
+
+
+def test_a_withheld_answer_states_no_pose():
+    withheld = Answer(Verdict.ACCEPTED, 'here', PoseWithCovarianceStamped(), map_hash='ab',
+                      pose_figures={'x [m]': 1.0}).withheld('the robot moves')
+    status, = answer_msg(withheld, '/relocalizer').status
+    assert status.message == 'withheld: the robot moves (accepted: here; map ab); map ab'
+    assert withheld.pose is None and 'x [m]' not in {value.key for value in status.values}

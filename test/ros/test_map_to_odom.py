@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from handing_over import stamp
+from frames import stamp
 from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 

@@ -7,16 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import Quaternion
-from handing_over import stamp
+from frames import stamp
+from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion
 from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import make_transform, transform_from_pose
-from cliploc_ros.ros.conversions import pose_to_msg
+from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.watch import LaterError, LocalizerPose, NoLocalizerPoseError
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
 BASE_FROM_CAMERA = transform_from_pose(np.array(OPTICAL[:3]), np.array(OPTICAL[3:]))
@@ -126,3 +127,94 @@ def test_odometry_that_goes_on_is_no_restart_and_invalid_messages_change_nothing
 def test_poses_give_the_mean_speed_where_the_twist_is_empty(source, moments):
     talk(source, *moments)
     assert source.speeds_by_poses(0.0) == (pytest.approx(0.1), pytest.approx(np.radians(20.0)))
+
+
+# ---- the pose of the localizer, carried by odometry ---------------------------------------------
+MAP_FROM_BASE = make_transform(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.ones(3))
+
+
+def shown(seconds, frame_id='/map', pose=MAP_FROM_BASE):
+    return pose_with_covariance_msg(Header(frame_id=frame_id, stamp=stamp(seconds)), pose,
+                                    np.eye(6))
+
+
+@pytest.fixture
+def amcl(make_node):
+    """A localizer that has not published a pose yet."""
+    return make_node('amcl').create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
+
+
+@pytest.fixture
+def localizer(robot, amcl, wait):
+    found = LocalizerPose(robot._node, robot)
+    wait(lambda: robot._node.count_publishers('/amcl_pose'), 'the localizer')
+    return found
+
+
+def at(localizer, robot, seconds, frame_ids=('other', 'map')):
+    image = Header(frame_id='camera', stamp=stamp(seconds))
+    return localizer.at(image, robot.at(image, PARAMETERS), PARAMETERS, frame_ids)
+
+
+def test_without_odometry_a_pose_holds_for_half_a_second(localizer, robot):
+    localizer.hear(shown(10.0))
+    for seconds in (10.51, 9.49):
+        with pytest.raises(NoLocalizerPoseError):
+            at(localizer, robot, seconds)
+    for seconds in (10.49, 9.51):
+        frame_id, pose = at(localizer, robot, seconds)
+        assert frame_id == 'map'
+        np.testing.assert_allclose(pose, MAP_FROM_BASE @ BASE_FROM_CAMERA, atol=1e-9)
+
+
+def test_odometry_carries_the_pose_on(localizer, robot):
+    talk(robot.odometry, *np.arange(9.0, 14.05, 0.1))
+    localizer.hear(shown(10.0))
+    for seconds in (10.0, 12.0, 9.5):
+        moved = np.linalg.inv(odom_from_base(10.0)) @ odom_from_base(seconds)
+        np.testing.assert_allclose(at(localizer, robot, seconds)[1],
+                                   MAP_FROM_BASE @ moved @ BASE_FROM_CAMERA, atol=1e-6)
+    localizer.hear(shown(13.0))
+    np.testing.assert_allclose(at(localizer, robot, 13.0)[1], MAP_FROM_BASE @ BASE_FROM_CAMERA,
+                               atol=1e-6)
+
+
+def test_a_pose_from_before_odometry_waits_for_the_next_one(localizer, robot):
+    talk(robot.odometry, *np.arange(9.0, 10.05, 0.1))
+    localizer.hear(shown(5.0))
+    with pytest.raises(LaterError):
+        at(localizer, robot, 10.0)
+
+
+def test_a_localizer_that_says_nothing_for_two_metres_is_silent(localizer, robot):
+    localizer.hear(shown(10.0))
+    for tick in range(22):
+        one = message(10.0 + 0.1 * tick)
+        one.pose.pose.position.x, one.pose.pose.orientation.z = 0.1 * tick, 0.0
+        one.pose.pose.orientation.w = 1.0
+        robot.odometry.take(one)
+    assert at(localizer, robot, 11.9)[0] == 'map'
+    with pytest.raises(NoLocalizerPoseError):
+        at(localizer, robot, 12.1)
+
+
+def test_what_is_no_pose_of_one_localizer_is_refused(localizer, robot, make_node, wait):
+    def is_refused(msg=None, **given):
+        if msg is not None:
+            localizer.hear(msg)
+        with pytest.raises(NoLocalizerPoseError):
+            at(localizer, robot, 10.0, **given)
+    is_refused()  # none was published
+    broken = shown(10.0)
+    broken.pose.pose.orientation.w = np.nan
+    is_refused(broken)
+    is_refused(shown(10.0, 'odom'))
+    localizer.hear(shown(10.0))
+    at(localizer, robot, 10.0)
+    is_refused(frame_ids=('other',))
+    localizer.forget()
+    is_refused()
+    localizer.hear(shown(10.0))
+    make_node('other').create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
+    wait(lambda: robot._node.count_publishers('/amcl_pose') == 2, 'the second localizer')
+    is_refused()

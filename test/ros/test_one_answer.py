@@ -46,7 +46,7 @@ def fr3(shared_data):
     """Return a map, no keyframes, and queries with blank images."""
     folder = shared_data / 'tum_fr3_office'
     landmark_map = LandmarkMap.from_file(folder / 'map.yaml')
-    queries = make_queries(load_queries(folder / 'queries.npz'), landmark_map)[::3]
+    queries = make_queries(load_queries(folder / 'queries.npz'), landmark_map)[::4]
     camera = queries[0].observation.camera
     blank = np.zeros((camera.height, camera.width, 3), np.uint8)
     return landmark_map, None, [replace(query, image=partial(np.asarray, blank))
@@ -70,7 +70,7 @@ def rooms(shared_data):
     landmark_map = LandmarkMap.from_file(ASSETS / 'map.yaml')
     walked, asked = (read_folder(ASSETS / name, FolderOptions(layout='tum'))
                      for name in ('mapping', 'sequence'))
-    asked = asked.select(range(0, asked.count, 10))
+    asked = asked.select(range(0, asked.count, 16))
     recorded = record_every_frame(asked, LoadNetworks(
         DetectorOptions(model=str(ASSETS / 'yolo.onnx')), None)())
     return (landmark_map, build_layer(walked.select(range(0, walked.count, 4)), landmark_map,

@@ -1,10 +1,18 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
+import copy
+import math
+
 import pytest
+from frames import header_of
 from hypothesis import given
 from hypothesis import strategies as st
+from sensor_msgs.msg import CameraInfo, Image
+from vision_msgs.msg import Detection2DArray
 
+from cliploc_ros.ros.inputs.frame_source import FrameSource
 from cliploc_ros.ros.inputs.stamps import ExactPairing
+from cliploc_ros.ros.parameters import RelocalizerParameters
 
 TOPICS = ('image', 'camera_info', 'detections')
 LIMITS = {'image': 100, 'camera_info': 30, 'detections': 50}
@@ -50,29 +58,22 @@ def test_a_set_is_complete_if_and_only_if_nothing_of_it_was_evicted(additions):
         assert sum(pairing._bytes.values()) == sum(map(expected.size, TOPICS))
 
 
-def paired_by_a_slow_detector(behind, room, images, begin):
-    """Return the paired images of a camera whose detections arrive a number of images later.
+@pytest.mark.parametrize(('behind', 'room'), [(12, 10), (60, 43), (300, 10), (5, 43)])
+def test_images_pair_however_slow_the_detector_is(behind, room):
+    """4K images at 30 Hz, of which 10 fit into memory, and 1080p: .2 to 10 s late.
 
     A detector processes the newest image when it is ready.
     """
     pairing = ExactPairing({'image': 100 * room, 'detections': 10**9}, 2000, 'image', 'detections')
-    paired, taken, done_at = [], 0, begin
-    for number in range(1, images + 1):
+    paired, taken, done_at = [], 0, behind // 2  # it was already running
+    for number in range(1, 10 * behind + 1):
         pairing.add('image', number, number, 100)
         assert sum(pairing._bytes.values()) <= 100 * room
         if number >= done_at:
             if taken and pairing.add('detections', taken, 'boxes', 0):
                 paired.append(taken)
             taken, done_at = number, number + behind
-    return paired
-
-
-@pytest.mark.parametrize(('behind', 'room'), [(12, 10), (60, 43), (300, 10), (5, 43)])
-def test_images_pair_however_slow_the_detector_is(behind, room):
-    """4K images at 30 Hz, of which 10 fit into memory, and 1080p: .2 to 10 s late."""
-    for begin in (0, behind // 2):  # it starts with the first image, or was already running
-        paired = paired_by_a_slow_detector(behind, room, 10 * behind, begin)
-        assert len(paired) >= 8, paired
+    assert len(paired) >= 8, paired
 
 
 def test_detections_of_forgotten_images_are_noticed():
@@ -86,3 +87,39 @@ def test_detections_of_forgotten_images_are_noticed():
     pairing.clear()
     assert pairing.received == {'image': 0, 'detections': 0} and pairing.last_stamp_ns == {}
     assert pairing.add('image', 3, 3, 100) is None
+
+
+# ---- with real messages of depth ----------------------------------------------------------------
+
+PERIOD_NS = 33_333_333
+
+
+def stamped(msg, number):
+    found = copy.copy(msg)  # all share the same pixels
+    found.header = header_of((number + 1) * PERIOD_NS)
+    return found
+
+
+@pytest.mark.parametrize(('late', 'depth_bytes', 'share'), [
+    (3, 2 * 1280 * 720, 1.0), (45, 2 * 1280 * 720, 0.45), (45, 4 * 1920 * 1080, 0.1)])
+def test_depth_waits_as_long_as_its_image_does(make_node, late, depth_bytes, share):
+    """A camera at 30 Hz, whose detections arrive some images late.
+
+    More images than fit into memory: some are left out, but not all.
+    """
+    frames, depth = [], Image(data=bytes(depth_bytes))
+    source = FrameSource(make_node(), RelocalizerParameters(depth_transport='raw'), math.inf,
+                         frames.append)
+    source.open()
+    for number in range(3 * late + 30):
+        for name, msg in (('depth', depth), ('image', Image(data=[number % 256])),
+                          ('camera_info', CameraInfo())):
+            source._receive(name, stamped(msg, number))
+        if number >= late:
+            source._receive('detections', stamped(Detection2DArray(), number - late))
+    source.close('the end')
+    depths = [frame.depth for frame in frames]
+    assert len(frames) > 20
+    assert sum(depth is not None for depth in depths) >= share * len(frames)
+    for frame in frames:
+        assert frame.depth is None or frame.depth.header.stamp == frame.image.header.stamp

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import count
 from types import SimpleNamespace
 
 import numpy as np
@@ -71,21 +72,6 @@ class Answering(ManagedNode):
         pass
 
 
-class Camera:
-    """Publishes the three messages of a frame, each time with a new stamp."""
-
-    def __init__(self, node):
-        self.publishers = [node.create_publisher(kind, topic, 10) for kind, topic in (
-            (CameraInfo, 'camera_info'), (Detection2DArray, 'detections'), (Image, 'image'))]
-        self.number = 0
-
-    def shoot(self):
-        self.number += 1
-        header = Header(stamp=Time(sec=self.number))
-        for publisher in self.publishers:
-            publisher.publish(publisher.msg_type(header=header))
-
-
 @pytest.fixture
 def node():
     """A node of the default context, made like ManagedNode, spun in a separate thread."""
@@ -95,17 +81,11 @@ def node():
     made = Answering()
     executor = SingleThreadedExecutor()
     executor.add_node(made)
-    stopped = threading.Event()
-
-    def spin():
-        while not stopped.is_set():
-            executor.spin_once(timeout_sec=0.02)
-    thread = threading.Thread(target=spin)
+    thread = threading.Thread(target=executor.spin)
     thread.start()
     yield made
-    stopped.set()
-    thread.join()
     executor.shutdown()
+    thread.join()
     made.worker.stop()
     made.destroy_node()
     if is_first:
@@ -113,10 +93,19 @@ def node():
 
 
 @pytest.fixture
-def camera(node):
-    made = rclpy.create_node('camera')
-    yield Camera(made)
-    made.destroy_node()
+def shoot(node):
+    """Publish the three messages of a frame, each time with a new stamp."""
+    camera, numbers = rclpy.create_node('camera'), count(1)
+    publishers = [camera.create_publisher(kind, topic, 10) for kind, topic in (
+        (CameraInfo, 'camera_info'), (Detection2DArray, 'detections'), (Image, 'image'))]
+
+    def run():
+        header = Header(stamp=Time(sec=next(numbers)))
+        for publisher in publishers:
+            publisher.publish(publisher.msg_type(header=header))
+        time.sleep(0.02)
+    yield run
+    camera.destroy_node()
 
 
 @pytest.fixture
@@ -125,14 +114,7 @@ def clients():
         yield pool
 
 
-def shoot_until(camera, wait, *futures):
-    def work():
-        camera.shoot()
-        time.sleep(0.02)
-    wait(lambda: all(future.done() for future in futures), 'the answers', work)
-
-
-def test_a_request_gets_no_image_older_than_itself(node, camera, clients, wait):
+def test_a_request_gets_no_image_older_than_itself(node, shoot, clients, wait):
     """The second request arrives while the image of the first is being searched."""
     searched, go_on = [], threading.Event()
 
@@ -142,25 +124,25 @@ def test_a_request_gets_no_image_older_than_itself(node, camera, clients, wait):
         return Answer(Verdict.REFUSED, f'image {len(searched)}', received_at=frame.received_at)
     node.localize = localize
     first = clients.submit(node.requests.answer)
-    wait(lambda: searched, 'the first search', lambda: (camera.shoot(), time.sleep(0.02)))
+    wait(lambda: searched, 'the first search', shoot)
     arrived_at = time.monotonic()
     second, third = clients.submit(node.requests.answer), clients.submit(node.requests.answer)
     wait(lambda: time.monotonic() > arrived_at + 0.1, 'both to wait')
     go_on.set()
-    shoot_until(camera, wait, first, second, third)
+    wait(lambda: second.done() and third.done(), 'the answers', shoot)
     assert first.result().received_at < arrived_at <= second.result().received_at
     # requests that wait together share an answer
     assert third.result() is second.result() and len(searched) == 2
 
 
-def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, camera, clients, wait):
+def test_an_answer_keeps_to_the_time_out_while_a_search_goes_on(node, shoot, clients, wait):
     """The search ends later; then nothing of it is published. Requests wait concurrently."""
     set_values(node, timeout_s=0.6)
     release, published = threading.Event(), []
     node.localize, node.publish = lambda frame: release.wait(10.0), published.append
     start = time.monotonic()
     request, other = clients.submit(node.requests.answer), clients.submit(node.requests.answer)
-    shoot_until(camera, wait, request, other)
+    wait(lambda: request.done() and other.done(), 'the answers', shoot)
     took_s = time.monotonic() - start
     release.set()
     node.worker.run(lambda: None)  # after the search

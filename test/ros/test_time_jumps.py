@@ -1,93 +1,62 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A clock that goes back: a real /clock, and nodes in simulated time."""
+"""A clock that goes back, in simulated time; stamps that are none."""
 
 import time
 
 import pytest
 from builtin_interfaces.msg import Time
-from handing_over import stamp
+from frames import stamp
 from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
+from rclpy.time import Time as RosTime
 
-from cliploc_ros.ros.inputs.stamps import (
-    MessageStamps,
-    StampOrder,
-    TimeJumpError,
-    TimeJumps,
-    stamp_problem,
-)
+from cliploc_ros.ros.inputs import stamps as times
 
 S = 1_000_000_000
 
 
-class Simulation:
-    """A node in simulated time, and a publisher of /clock."""
-
-    def __init__(self, make_node, spin_until):
-        self.node = make_node(parameter_overrides=[Parameter('use_sim_time', value=True)])
-        self.world = make_node('world')
-        self._clock = self.world.create_publisher(Clock, '/clock', 10)
-        self._spin_until = spin_until
-
-    def spin_until(self, condition, what, work=lambda: None):
-        self._spin_until([self.node, self.world], condition, what, work)
-
-    def set_time(self, *moments):
-        """Publish each time [s] until the node's clock has it."""
-        for seconds in moments:
-            message = Clock(clock=stamp(seconds))
-            self.spin_until(lambda m=message: self.node.get_clock().now().to_msg() == m.clock,
-                            f'{seconds} s', lambda m=message: self._clock.publish(m))
-
-
 @pytest.fixture
-def simulation(make_node, spin_until):
-    return Simulation(make_node, spin_until)
+def node(make_node):
+    return make_node(parameter_overrides=[Parameter('use_sim_time', value=True)])
 
 
-@pytest.fixture
-def jumps(simulation):
-    """Watch the simulated clock; the attribute forgot counts."""
-    forgot = []
-    jumps = TimeJumps(simulation.node, lambda: forgot.append(simulation.node.get_clock().now()))
-    jumps.forgot = forgot
-    return jumps
+def set_time(node, *moments_s):
+    """Set simulated time, as a message on /clock does."""
+    for seconds in moments_s:
+        node.get_clock().set_ros_time_override(RosTime(nanoseconds=round(seconds * S)))
 
 
 def is_refused(jumps, stamp_s, received_at):
     try:
         jumps.check(stamp(stamp_s), received_at)
-    except TimeJumpError:
+    except times.TimeJumpError:
         return True
     return False
 
 
-def test_a_bag_that_loops_jumps_back_once_a_round(simulation, jumps):
-    simulation.set_time(*(3 * (100.0, 101.0)))
-    assert [time.nanoseconds for time in jumps.forgot] == [100 * S, 100 * S]
-
-
-def test_messages_from_before_a_jump_are_refused(simulation, jumps):
-    simulation.set_time(100.0)
+def test_messages_from_before_a_jump_are_refused(node):
+    forgot = []
+    jumps = times.TimeJumps(node, lambda: forgot.append(node.get_clock().now().nanoseconds))
+    set_time(node, *(3 * (100.0, 101.0)), 102.0)
+    assert forgot == [100 * S, 100 * S], 'a bag that loops jumps back once a round'
     before = time.monotonic()
-    simulation.set_time(95.0)
+    set_time(node, 97.0)
     after = time.monotonic()
-    with pytest.raises(TimeJumpError, match=r' 5\.000 s'):
-        jumps.check(stamp(99.9), before)
-    assert is_refused(jumps, 95.0, before), 'its counterparts may be from before the jump'
-    assert is_refused(jumps, 99.9, after + 60.0), 'it waited in the middleware'
-    assert not is_refused(jumps, 95.0, after) and not is_refused(jumps, 94.9, after)
-    simulation.set_time(99.9)
-    assert not is_refused(jumps, 99.9, after), 'time went on'
-    simulation.node.set_parameters([Parameter('use_sim_time', value=False)])
-    with pytest.raises(TimeJumpError, match='use_sim_time'):
-        jumps.check(stamp(99.9), after)
-    assert len(jumps.forgot) == 2
+    with pytest.raises(times.TimeJumpError, match=r' 5\.000 s'):
+        jumps.check(stamp(101.9), before)
+    assert is_refused(jumps, 97.0, before), 'its counterparts may be from before the jump'
+    assert is_refused(jumps, 101.9, after + 60.0), 'it waited in the middleware'
+    assert not is_refused(jumps, 97.0, after) and not is_refused(jumps, 96.9, after)
+    set_time(node, 101.9)
+    assert not is_refused(jumps, 101.9, after), 'time went on'
+    node.set_parameters([Parameter('use_sim_time', value=False)])
+    with pytest.raises(times.TimeJumpError, match='use_sim_time'):
+        jumps.check(stamp(101.9), after)
+    assert len(forgot) == 4
 
 
 def test_stamps_of_a_stream_that_go_back_end_all_streams():
-    order = StampOrder()
+    order = times.StampOrder()
 
     def goes_back(*stamps_s, stream='odom'):
         return [order.goes_back(stream, round(stamp_s * S)) for stamp_s in stamps_s]
@@ -103,12 +72,13 @@ def test_stamps_of_a_stream_that_go_back_end_all_streams():
     (Time(), 'is 0'), (Time(sec=-1, nanosec=5), 'is -1 s'),
     (Time(sec=1, nanosec=2**32 - 1), 'has 4294967295 nanoseconds'), (Time(sec=9, nanosec=S), '')])
 def test_a_stamp_that_is_no_time(given, problem):
-    assert stamp_problem(given).startswith(problem) and bool(stamp_problem(given)) == bool(problem)
+    found = times.stamp_problem(given)
+    assert found.startswith(problem) and bool(found) == bool(problem)
 
 
 def named(*messages, stamps=None):
     """Feed stamps and contents, .1 s apart; return the reported ones, and the stamps."""
-    stamps = stamps or MessageStamps()
+    stamps = stamps or times.MessageStamps()
     return [stamps.add(stamp(one), content, 500.0 + 0.1 * number)
             for number, (one, content) in enumerate(messages)], stamps
 

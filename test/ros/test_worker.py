@@ -5,10 +5,14 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from builtin_interfaces.msg import Time
 from hypothesis import given
 from hypothesis import strategies as st
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 
 from cliploc_ros.errors import InternalError, StoppedError, TimeUpError
+from cliploc_ros.nodes.detector import NewestInstant, TimedImage
 from cliploc_ros.ros.node.threads import LatestOnly, Worker
 
 PATIENCE_S = 60.0
@@ -109,3 +113,26 @@ def test_the_last_item_is_never_lost_and_only_the_newest_waits(pauses):
     worker.stop()
     assert done == sorted(set(done)) and done[-1] == len(pauses) + 2
     assert len(done) + latest.dropped == len(pauses) + 3 and latest.dropped >= 2
+
+
+@pytest.mark.parametrize(('offers', 'expected', 'dropped'), [
+    # the newest instant that both have, then the remaining images
+    ([('a', 1), ('b', 1), ('a', 2)], [('a', 1), ('b', 1), ('a', 2)], 0),
+    ([('a', 1), ('b', 1), ('a', 2), ('b', 2)], [('a', 2), ('b', 2)], 2),
+    ([('a', 1), ('a', 2), ('a', 3), ('b', 1)], [('a', 2), ('b', 1), ('a', 3)], 1),
+    # a late camera does not delay the others
+    ([('a', 8), ('a', 9), ('b', 3)], [('a', 8), ('b', 3), ('a', 9)], 0)])
+def test_images_of_one_instant_come_together(worker, gate, offers, expected, dropped):
+    """The worker is busy while the images arrive."""
+    seen = []
+    newest = NewestInstant(worker, lambda camera, one: seen.append(
+        (camera, one.msg.header.stamp.sec)))
+    gate.hold(worker)
+    for camera, stamp in offers:
+        newest.offer(camera, TimedImage(Image(header=Header(stamp=Time(sec=stamp))), float(stamp)))
+    assert newest.waiting_since is not None
+    gate.open()
+    for _ in range(3):
+        worker.run(lambda: None)
+    assert newest.waiting_since is None
+    assert (seen, newest.dropped) == (expected, dropped)

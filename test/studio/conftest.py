@@ -3,8 +3,8 @@
 """Fixtures of the browser tests: Chromium, a studio of the demo's map, a person at its page."""
 
 import pytest
-from browser import Person, running_chromium
-from studio_map import demo_studio, open_page
+from browser import running_chromium
+from studio_map import demo_studio, person_at
 
 
 @pytest.fixture(scope='module')
@@ -21,13 +21,12 @@ def path(tmp_path):
 @pytest.fixture
 def studio(path):
     studio = demo_studio(path)
-    with open_page(studio) as (studio.url, studio.server):
-        yield studio
+    yield studio
+    studio.document.close()
 
 
 @pytest.fixture
 def person(chromium, studio):
-    person = Person(chromium, studio.url)
-    yield person
-    person.page.close()
-    assert person.foreign == [], 'no request leaves the machine'
+    """Open the page of the studio."""
+    with person_at(chromium, studio) as (person, studio.server):
+        yield person

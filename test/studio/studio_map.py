@@ -4,7 +4,6 @@
 
 import shutil
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 from browser import Person
@@ -15,8 +14,8 @@ from cliploc_ros.offline.datasets.images import open_images, views_of_folder
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
+from demo import ASSETS
 
-ASSETS = Path(__file__).parents[2] / 'demo/assets'
 _ROOM = np.array([[0.0, 0.0, 0.4], [0.9, 0.2, 0.6], [0.3, 1.1, 0.5], [1.2, 1.3, 0.8],
                   [-0.5, 0.8, 0.3]])
 _CLASSES = ('cup', 'book', 'plant', 'cup', 'chair')

@@ -9,8 +9,6 @@ from browser import Person, wait_for
 from studio_map import ASSETS, person_at, write_two_rooms
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.mapping.options import CheckOptions
-from cliploc_ros.offline.studio import edits
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.studio import Studio
 
@@ -118,10 +116,10 @@ def test_without_views_the_scene_has_the_page_and_ids_tell_equal_labels_apart(ch
         person.picture('labels')
 
 
-def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, studio):
-    first = Person(chromium, studio.url)
+def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, person, studio):
+    first = person
     first.page.get_by_text('pages share').wait_for(state='detached')
-    second = Person(chromium, studio.url)
+    second = Person(chromium, first.page.url)
     for person in (first, second):
         person.page.get_by_text('2 pages share the selection and the view').wait_for()
     second.page.close()
@@ -135,35 +133,6 @@ def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, s
     first.page.wait_for_function(
         "() => $('log').firstChild.textContent === 'earlier: locked mug_2'")
     assert line.get_attribute('class') == 'past'
-    first.page.close()
-
-
-def test_a_narrow_page_leaves_room_for_the_scene_where_boxes_are_drawn(person):
-    person.page.set_viewport_size({'width': 1100, 'height': 700})
-    person.mode('Create')
-    assert person.page.evaluate("$('scene').clientWidth") >= 360
-    assert person.page.evaluate("$('view').clientWidth") >= 480
-
-
-def test_the_check_becomes_outdated_by_an_edit_and_opens_as_a_page(chromium, path):
-    write_two_rooms(path)
-    document = Document(path)
-    studio = Studio(document)
-    studio.CHECK = CheckOptions(max_positions=9, headings=4)
-    with person_at(chromium, studio) as (person, _):
-        page = person.page
-        person.mode('Test')
-        person.click('Coverage and look-alikes')
-        person.row('cup_0').click()
-        wait_for(lambda: document.selection == ('cup_0',), 'the page stays responsive')
-        page.get_by_text('checked the map').first.wait_for()
-        with page.context.expect_page() as opened:
-            person.click('Open the check')
-        opened.value.get_by_text('places that look alike').first.wait_for()
-        person.picture('places')
-        with document.lock:
-            document.edit(edits.delete, ['cup_0'])
-        page.get_by_text('of the map before the last edits').wait_for()
 
 
 def test_layers_film_and_a_click_on_the_image(person, studio):

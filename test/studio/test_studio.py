@@ -9,14 +9,21 @@ import urllib.request
 import cv2
 import numpy as np
 import pytest
-from studio_map import ASSETS, demo_studio, open_page, write_two_rooms
+from rig_bag import camera_messages, write_messages
+from scene import make_layer, make_room, write_bare_map, write_map
+from studio_map import ASSETS, open_page, write_two_rooms
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
+from cliploc_ros.cli.studio import make_parser, open_studio
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes
+from cliploc_ros.core.keyframes.layer import layer_path, save_layer
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_landmark_embeddings
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.offline.datasets.images import views_of_folder
+from cliploc_ros.offline.datasets.bag_frames import BagTopics
+from cliploc_ros.offline.datasets.images import open_images, views_of_folder
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -27,13 +34,6 @@ from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
 from cliploc_ros.offline.studio.web import Gate, once
 from demo.truth import read_frames
-
-
-@pytest.fixture
-def studio(tmp_path):
-    studio = demo_studio(tmp_path / 'map.yaml')
-    yield studio
-    studio.document.close()
 
 
 @pytest.fixture
@@ -194,6 +194,59 @@ def test_the_check_of_the_edited_map_is_stopped_and_grows_old(tmp_path):
     studio.document.undo()
     assert not studio.is_stale, 'the map is unchanged'
     studio.document.close()
+
+
+# ---- inputs: a bag, keyframes
+
+START_NS, STEP_NS, COUNT = 1_700_000_000_000_000_000, 100_000_000, 20
+
+
+def test_each_view_gets_its_image_of_a_bag(tmp_path):
+    """The images are recorded 0.4 s after their stamps, the last two at once."""
+    camera, pixels = Camera(64, 48, 53.0, 53.0, 32.0, 24.0), np.full((48, 64, 3), 1, np.uint8)
+    stamps = [START_NS + number * STEP_NS for number in range(COUNT)]
+    write_messages(tmp_path / 'bag', [message for number, stamp in enumerate(stamps)
+                                      for message in camera_messages(
+        stamps[min(number, COUNT - 2)] + 4 * STEP_NS, number * pixels, camera, stamp=stamp)])
+    images = open_images(tmp_path / 'bag', BagTopics())
+    for number in (0, COUNT - 1, 7, COUNT - 2):
+        image = images.near(stamps[number] / 1e9)
+        assert image.shape == (48, 64, 3) and (image == number).all()
+    assert images.near((START_NS + STEP_NS // 2) / 1e9) is None
+
+
+def layer_of(path):
+    studio = open_studio(make_parser().parse_args([str(path)]))
+    studio.document.close()
+    return studio.layer
+
+
+def test_the_layer_comes_with_its_map(tmp_path, capsys):
+    path, room = tmp_path / 'room.yaml', make_room()
+    assert layer_of(path) is None, 'an empty map has none'
+    write_map(room, path)
+    assert layer_of(path) is None
+    save_layer(layer_path(path), make_layer(room))
+    assert len(layer_of(path)) == 6
+    assert capsys.readouterr().out == ''
+    layer_path(path).write_bytes(b'no layer')
+    assert layer_of(path) is None
+    assert 'without keyframes: ' in capsys.readouterr().out
+
+
+def test_a_map_of_keyframes_alone_gets_its_first_landmark(tmp_path, capsys):
+    """The keyframes stay the same as in the map."""
+    path = tmp_path / 'bare.yaml'
+    write_bare_map(path, make_layer(LandmarkMap.empty('map')))
+    walk = ASSETS / 'sequence'
+    studio = open_studio(make_parser().parse_args([str(path), '--images', str(walk)]))
+    assert len(studio.layer) == 6
+    assert 'refused; the map has only keyframes' in studio.relocalize_here()
+    studio.document.edit(edits.create, 'a lamp', 'lamp', np.ones(3), np.eye(3))
+    studio.document.save()
+    studio.document.close()
+    assert len(LandmarkMap.from_file(path)) == 1 and len(layer_of(path)) == 6
+    assert capsys.readouterr().out == ''
 
 
 # ---- who may open the page

@@ -12,7 +12,6 @@ import pytest
 import viser
 from scene import make_layer
 from scipy.spatial.transform import Rotation
-from studio_map import demo_studio
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import DepthImage
@@ -21,18 +20,9 @@ from cliploc_ros.errors import MapError
 from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.images import Images
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.studio import viewpoint
+from cliploc_ros.offline.studio import room, viewpoint
 from cliploc_ros.offline.studio.edits import map_of
 from cliploc_ros.offline.studio.recording import Recording
-from cliploc_ros.offline.studio.room import (
-    FREE,
-    OCCUPIED,
-    UNKNOWN,
-    Walls,
-    draw_walls,
-    find_cloud,
-    read_walls,
-)
 from cliploc_ros.offline.studio.scene import Layers, draw_answers
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)
@@ -47,13 +37,6 @@ def server():
     server.stop()
 
 
-@pytest.fixture
-def studio(tmp_path):
-    studio = demo_studio(tmp_path / 'map.yaml')
-    yield studio
-    studio.document.close()
-
-
 def test_depth_becomes_a_cloud_below_the_ceiling():
     """A camera at x = 3, 1 m above the floor, sees a wall 2 m ahead that is red on the left."""
     image = np.zeros((48, 64, 3), dtype=np.uint8)
@@ -64,12 +47,12 @@ def test_depth_becomes_a_cloud_below_the_ceiling():
     views = PosedDetections((CAMERA,), poses, np.zeros(1), np.zeros(2, dtype=np.int64),
                             np.empty((0, 4)), (), np.empty(0, dtype=np.int64), np.empty(0))
     extent = viewpoint.extent_of([np.array([4.0, 0.0, 0.5])], poses)
-    points, colors, _ = find_cloud(Recording(views, images), None, extent)
+    points, colors, _ = room.find_cloud(Recording(views, images), None, extent)
     assert len(points) > 50 and np.allclose(points[:, 0], 5.0, atol=1e-5)
     assert 1.0 < points[:, 2].max() < 1.3 < 1.8, 'no camera or landmark is higher than 1 m'
     is_red = colors[:, 0].astype(int) > colors[:, 1].astype(int)
     assert (points[is_red, 1] > -0.02).all() and (points[~is_red, 1] < 0.02).all()
-    assert find_cloud(Recording(views), None, extent) is None
+    assert room.find_cloud(Recording(views), None, extent) is None
 
 
 def test_points_of_keyframes_without_images_have_the_colours_of_their_height(studio):
@@ -78,16 +61,16 @@ def test_points_of_keyframes_without_images_have_the_colours_of_their_height(stu
     layer = replace(
         make_layer(map_of(landmarks), 1, points=2), map_from_camera=np.eye(4)[None],
         points=np.array([[0.0, 0.0, extent.floor_m], [0.0, 0.0, extent.top_m]], np.float32))
-    points, colors, _ = find_cloud(studio.recording, layer, extent)
+    points, colors, _ = room.find_cloud(studio.recording, layer, extent)
     low, top = colors[points[:, 2].argsort()].astype(int)
     assert low[0] > low[2] + 50 and top[2] > top[0] + 50, 'brown below, blue above'
 
 
 @pytest.mark.parametrize('yaw', (0.0, 0.4))
 def test_walls_lie_where_the_grid_has_them(server, yaw):
-    cells = np.full((30, 40), UNKNOWN, dtype=np.uint8)
-    cells[29 - 4, 33] = cells[29 - 20, 7] = OCCUPIED
-    (handle,) = draw_walls(server.scene, Walls(cells, 0.1, (-1.0, 2.0, yaw)))
+    cells = np.full((30, 40), room.UNKNOWN, dtype=np.uint8)
+    cells[29 - 4, 33] = cells[29 - 20, 7] = room.OCCUPIED
+    (handle,) = room.draw_walls(server.scene, room.Walls(cells, 0.1, (-1.0, 2.0, yaw)))
     rows, columns = np.nonzero(handle.image[..., 3])
     height, width = handle.image.shape[:2]
     across = np.column_stack([((columns + 0.5) / width - 0.5) * handle.render_width,
@@ -123,7 +106,8 @@ def test_up_is_found_where_the_map_is_in_a_cameras_frame():
 # ---- files of nav2_map_server
 
 # the last row is at the origin: y up
-CELLS = np.array([[UNKNOWN, FREE, FREE], [FREE, OCCUPIED, FREE]], dtype=np.uint8)
+CELLS = np.full((2, 3), room.FREE, dtype=np.uint8)
+CELLS[0, 0], CELLS[1, 1] = room.UNKNOWN, room.OCCUPIED
 YAML = """image: walls.{suffix}
 mode: trinary
 resolution: 0.5
@@ -144,7 +128,7 @@ def write(folder, suffix='pgm', negate=0, yaw=0.0, text=YAML):
 
 @pytest.mark.parametrize(('suffix', 'negate'), [('pgm', 0), ('png', 0), ('pgm', 1)])
 def test_a_file_of_map_server_is_read(tmp_path, suffix, negate):
-    grid = read_walls(write(tmp_path, suffix, negate))
+    grid = room.read_walls(write(tmp_path, suffix, negate))
     np.testing.assert_array_equal(grid.cells[negate:], CELLS[negate:])
     assert (grid.resolution_m, grid.origin) == (0.5, (1.0, -2.0, 0.0))
 
@@ -157,7 +141,7 @@ def test_a_file_of_map_server_is_read(tmp_path, suffix, negate):
 def test_a_damaged_file_is_refused_by_name(tmp_path, before, after, text):
     file = write(tmp_path, text=YAML.replace(before, after))
     with pytest.raises(MapError, match=str(file)) as caught:
-        read_walls(file)
+        room.read_walls(file)
     assert text in str(caught.value)
     assert '\n' not in str(caught.value)
 
@@ -168,4 +152,4 @@ def test_an_image_that_is_cut_short_is_refused(tmp_path):
     for length in (0, 5, len(data) - 5):
         image.write_bytes(data[:length])
         with pytest.raises(MapError, match=r'missing, damaged or not an image'):
-            read_walls(file)
+            room.read_walls(file)
