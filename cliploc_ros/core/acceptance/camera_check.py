@@ -443,9 +443,11 @@ class CameraCheck:
             record = self._records.get(name)
             views = reduce(Views.with_look, its_looks, record.views if record else Views())
             extent = record.by_extent if record else 0.0
-            near, added = views.careful_odds(extent).effect(covariance, its_looks[-1].moves)
-            share, wider = min(share, near), wider + added
-            if record is not None and (odds := views.odds(extent)).is_wrong:
+            odds, moves = views.odds(extent), its_looks[-1].moves
+            near, added = views.careful_odds(extent).effect(covariance, moves)
+            share = min(share, near, odds.effect(covariance, moves)[0])
+            wider = wider + added
+            if record is not None and odds.is_wrong:
                 fault = record.in_words(odds)
         return share, wider, fault or '; '.join(self.faults)
 
