@@ -273,14 +273,6 @@ def test_where_the_localizer_is_once_it_has_settled_decides(showing, wheels, x_m
     showing.localizer.may_answer.set()
 
 
-@pytest.mark.parametrize('timeout_s', [10.0, 0.3])
-def test_a_robot_that_drives_is_told_so_however_little_time_is_left(showing, wheels, timeout_s):
-    tell(showing, wheels, TEN_HZ, twist_m_s=0.5)
-    with pytest.raises(handoff.HandOffError, match=r'moves at 0\.50'):
-        showing.hand_over(timeout_s)
-    assert not showing.localizer.poses
-
-
 @pytest.mark.parametrize(('end', 'error'), [
     (Robot.jump, TimeJumpError), (lambda robot: robot.handoff.stop(), handoff.HandOffError)])
 def test_what_ends_a_hand_over_ends_the_wait_for_the_localizer(showing, end, error):
