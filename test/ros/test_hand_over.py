@@ -88,9 +88,6 @@ class Robot:
         """Wait until the relocalizer has discovered the localizer."""
         self.wait(lambda: self.handoff._publisher.get_subscription_count(), 'the subscriber')
 
-    def meet_service(self):
-        self.wait(self.handoff._updater.service_is_ready, 'the service')
-
 
 def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
     """Publish odometry at times since the image, and wait until the last is received."""
@@ -164,7 +161,7 @@ def served(robot):
     robot.localizer.subscribe()
     robot.localizer.serve()
     robot.meet()
-    robot.meet_service()
+    robot.wait(robot.handoff._updater.service_is_ready, 'the service')
     return robot
 
 
