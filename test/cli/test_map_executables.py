@@ -93,18 +93,6 @@ def room_file(tmp_path):
     return tmp_path / 'room.yaml'
 
 
-def test_a_map_without_observations(run_here, room_file, tmp_path):
-    done = run_here(check_map.main, room_file, '--out', tmp_path / 'out', '--min-positions', 0,
-                    *FAST)
-    assert done.returncode == 0, done.stdout + done.stderr
-    checked = json.loads((tmp_path / 'out/check.json').read_text())
-    assert checked['map'] == 'room.yaml' and checked['passed']
-    assert checked['recording'] is None and len(checked['landmarks']) == 12
-    page = (tmp_path / 'out/check.html').read_text()
-    assert page.startswith('<!DOCTYPE html>') and page.endswith('</html>\n')
-    assert 'data:image/png;base64,' in page
-
-
 @pytest.mark.parametrize(('args', 'named'), [
     (('{folder}/missing.yaml',), 'missing.yaml'), (('{room}', '--observations', '{room}'), 'npz'),
     (('{room}', '--images', '{folder}'), '--observations')])

@@ -2,20 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The synthetic world: its labels and boxes agree with its images."""
 
-import json
-
 import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry import ellipsoid
-from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
-from cliploc_ros.offline.datasets.tum import read_tum
-from demo import ASSETS
+from cliploc_ros.core.geometry.transforms import invert_transform
 from demo.world.appearance import CLASSES
 from demo.world.recording import find_boxes
 from demo.world.renderer import Light, Renderer
 from demo.world.room import make_room
-from demo.world.trajectories import CAMERA, draw_views, rig_mounts, rig_walk
+from demo.world.trajectories import CAMERA, draw_views
 
 pytestmark = pytest.mark.full
 
@@ -67,16 +63,3 @@ def _iou(a, b):
     low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
     shared = np.prod(np.clip(high - low, 0, None))
     return shared / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - shared)
-
-
-def test_the_shipped_rig_is_where_its_walk_and_mounts_say():
-    mounts = json.loads((ASSETS / 'rig' / 'mounts.json').read_text())
-    assert list(mounts) == list(rig_mounts())
-    for name, expected in rig_mounts().items():
-        mount = transform_from_pose(np.array(mounts[name][:3]), np.array(mounts[name][3:]))
-        np.testing.assert_allclose(mount, expected, atol=1e-9)
-        sequence = read_tum(ASSETS / 'rig' / name)
-        poses = [sequence.pose_at(stamp) for stamp in sequence.stamps_ns]
-        np.testing.assert_allclose(poses, rig_walk() @ mount, atol=1e-5)
-    # left of the front camera is minus x, and y is down
-    assert rig_mounts()['left'][0, 2] == pytest.approx(-1.0)

@@ -78,12 +78,6 @@ def test_restart_and_remove(path):
     assert not path.exists()
 
 
-def test_one_process_at_a_time(path):
-    with open_log(path), pytest.raises(DatasetError, match='open in another studio'):
-        open_log(path)
-    assert read(path) == ([], False)
-
-
 def test_a_full_disk(path, tmp_path):
     code = ('import sys; from pathlib import Path; from cliploc_ros.files.log import Log\n'
             'from cliploc_ros.errors import DatasetError\n'

@@ -9,7 +9,7 @@ from types import SimpleNamespace as Fields
 import cv2
 import numpy as np
 import pytest
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CompressedImage
 from tester import class_matching, make_frame
 
@@ -56,20 +56,16 @@ def test_a_request_is_answered_when_its_node_is_told_to_stop(own_relocalizer, te
 
 
 # ---- yolo_msgs
-def as_yolo(msg):
-    """Return detections with the fields of a yolo_msgs/DetectionArray."""
-    made = []
-    for given in msg.detections:
+def test_all_that_counts_is_kept():
+    """Detections with the fields of a yolo_msgs/DetectionArray."""
+    expected, made = make_frame()[2], []
+    for given in expected.detections:
         guess, box = given.results[0].hypothesis, given.bbox
         made.append(Fields(class_id=0, class_name=guess.class_id, score=guess.score, id='',
                            bbox=Fields(center=Fields(position=box.center.position, theta=0.0),
                                        size=Fields(x=box.size_x, y=box.size_y))))
-    return Fields(header=msg.header, detections=made)
-
-
-def test_all_that_counts_is_kept():
-    expected = make_frame()[2]
-    assert serialize_message(from_yolo_msg(as_yolo(expected))) == serialize_message(expected)
+    found = from_yolo_msg(Fields(header=expected.header, detections=made))
+    assert deserialize_message(serialize_message(found), type(expected)) == expected
 
 
 def test_without_yolo_msgs_the_node_says_so(start, tester, room_map, tmp_path):

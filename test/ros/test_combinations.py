@@ -21,7 +21,6 @@ from cliploc_ros.core.localizer import Localizer, repeat
 from cliploc_ros.core.observation import Region
 from cliploc_ros.core.query import Case, read_case
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.watch.watch import WatchState
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Instants, Keyframes
 from cliploc_ros.ros.inputs.odometry import OdometryPlace
@@ -154,19 +153,6 @@ def test_continuous_answers_tell_a_filter_only_what_is_new(cameras, known, tmp_p
     assert shares[0] == pytest.approx(1.0)
     assert max(shares[1:]) < 0.9
     equal(drive.repeated(Case(tuple(queries), {}), drive.parameters.options()), found.found)
-
-
-@pytest.mark.parametrize(('cameras', 'known'), [(1, 'nothing'), (4, 'all')])
-@pytest.mark.parametrize(('displaced_m', 'state'), [
-    (0.0, WatchState.LOCALIZED), (2.0, WatchState.LOST)])
-def test_the_watch_tells_a_right_pose_from_a_wrong_one(cameras, known, displaced_m, state,
-                                                       tmp_path):
-    drive = Drive(cameras, known, tmp_path)
-    for number in range(8):
-        ((frame, robot_state), *_), pose = drive.see(10 * number)
-        pose[0, 3] += displaced_m
-        report = drive.localizer.look(frame, drive.parameters, robot_state, 'map', pose)
-    assert report.state is state
 
 
 def test_mounts_of_cameras_are_no_odometry(tmp_path):

@@ -146,14 +146,6 @@ def test_whatever_comes_it_is_allowed_or_refused(value):
                 assert row.low <= validated <= row.high
 
 
-@pytest.mark.parametrize('kind', KINDS.values())
-def test_tables_are_sound(kind):
-    assert len({row.name for row in kind.rows()}) == len(kind.rows())
-    for row in kind.rows():
-        assert row.validated(row.default) == row.default
-        assert row.description.endswith('.') and '|' not in row.description
-
-
 def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
     # an offline search is not limited in time, but a client waits for an answer
     assert RelocalizerParameters().options() == RelocalizerOptions(time_budget_s=0.05)

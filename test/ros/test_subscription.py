@@ -59,13 +59,8 @@ class Ear:
 
 
 @pytest.fixture
-def nodes(make_node):
-    return make_node('listener'), make_node('speaker')
-
-
-@pytest.fixture
-def ear(nodes, spin_until):
-    ear = Ear(*nodes, spin_until)
+def ear(make_node, spin_until):
+    ear = Ear(make_node('listener'), make_node('speaker'), spin_until)
     yield ear
     ear.subscription.destroy()
 
@@ -77,6 +72,10 @@ def test_a_best_effort_publisher_beside_a_reliable_one_is_heard(ear):
     ear.wait_for_policies(BEST_EFFORT)
     ear.wait_for_hearing(best_effort, 'best effort')
     ear.wait_for_hearing(reliable, 'reliable')
+    for publisher in (best_effort, reliable):  # their process dies, and another one is started
+        ear._speaker.destroy_publisher(publisher)
+    ear.wait_for_hearing(ear.offer(RELIABLE), 'another')
+    ear.wait_for_policies(RELIABLE)
 
 
 @pytest.mark.filterwarnings('ignore:MultiThreadedExecutor is used with a single thread')
