@@ -47,14 +47,6 @@ def test_normalizing_inverts_projecting(lens, u, v):
     assert camera(lens).project_normalized(normalized) == pytest.approx(np.array([[u, v]]))
 
 
-def test_a_fisheye_equals_its_equation():
-    point, coefficients = np.array([0.9, -0.5]), LENSES['fisheye'][1]
-    angle = np.arctan(np.linalg.norm(point))
-    radius = angle * (1 + sum(k * angle**(2 * n) for n, k in enumerate(coefficients, start=1)))
-    expected = point / np.linalg.norm(point) * radius * (400, 401) + (318.6, 255.3)
-    assert camera('fisheye').project_normalized(point[None])[0] == pytest.approx(expected)
-
-
 def test_beyond_the_fold_of_a_lens_is_nan():
     folded = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, 'plumb_bob', (-2.0, 0.0, 0.0, 0.0))
     assert np.isnan(folded.normalize_points(np.array([[0.0, 0.0]]))).all()
@@ -129,17 +121,11 @@ def test_iou_equals_quadrature(a, b, p, q, x, y, angle):
 
 @pytest.mark.parametrize(('center', 'axes', 'shared'), [
     ((0.0, 0.0), (1.0, 1.0), np.pi),             # equal circles
-    ((0.0, 0.0), (0.5, 0.25), np.pi / 8),        # inside
-    ((5.0, 0.0), (1.0, 0.5), 0.0),               # apart
     ((1.0, 0.0), (1.0, 1.0), 2 * np.pi / 3 - np.sqrt(3) / 2),  # two circles at distance one
-    ((0.0, 0.0), (2.0, 0.5), None),              # a cross: four common points
     ((0.0, 0.0), (1.0, 0.2), 0.2 * np.pi),       # inside, touching at both ends
     ((0.4, 0.0), (0.6, 0.3), 0.18 * np.pi),      # inside, touching once
 ])
 def test_shared_area_of_simple_cases(center, axes, shared):
-    if shared is None:
-        shared = iou_by_chords(1.0, 1.0, center, np.diag(np.square(axes)))
-        shared = shared / (1 + shared) * 2 * np.pi
     assert unit_circle_overlap(*center, *axes) == pytest.approx(shared, abs=1e-7)
 
 

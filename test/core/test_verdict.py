@@ -19,11 +19,9 @@ from cliploc_ros.core.acceptance import confidence
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
     Support,
-    compared_frame,
     confidences,
     none_right,
     objects_utility,
-    support,
     tilt_handicaps,
     utilities,
 )
@@ -33,14 +31,12 @@ from cliploc_ros.core.acceptance.looks import EarlierLook
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
 from cliploc_ros.core.calibration import CALIBRATION, FILE
 from cliploc_ros.core.fit.covariance import share_within
-from cliploc_ros.core.fit.finalists import Match
 from cliploc_ros.core.fit.succession import succeed
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.keyframes.places import RecognizedPlace
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
-from cliploc_ros.core.search.scene import make_scene
 from cliploc_ros.offline.evaluation.trials import make_queries
 from studies.acceptance.troubles import exchange_landmarks
 
@@ -219,59 +215,6 @@ def test_another_place_is_hardly_ever_accepted(matching, office_map, queries, th
     assert np.mean(accepted) <= thresholds['trust']['accepted_elsewhere'][matching]
 
 
-@pytest.fixture
-def compared(office_map, queries):
-    """Return a frame with three separate boxes and one that nearly repeats the third."""
-    boxes = np.array([[0, 0, 10, 10], [100, 0, 110, 10], [200, 0, 210, 10], [201.0, 0, 210, 10]])
-    camera = queries[0].observation.camera
-    detections = Detections(boxes, ('chair', *office_map.class_ids[4:5], 'none', 'none'),
-                            np.ones(4))
-    similarities = np.zeros((4, len(office_map)), dtype=np.float32)
-    similarities[1, 4] = 1.0
-    scene = make_scene(camera.normalize_bboxes(boxes), office_map.centers, office_map.shapes,
-                       np.ones((4, len(office_map)), dtype=bool), np.empty((0, 2), int), 0.2)
-    return compared_frame(office_map, detections, scene, similarities, np.arange(len(boxes)))
-
-
-@pytest.mark.parametrize(('matches', 'score'), [
-    ((Match(0, 3, 0.5), Match(1, 3, 0.7), Match(2, 4, 0.6)), 1.3),
-    ((Match(2, 1, 0.5), Match(3, 2, 0.7), Match(0, 3, 0.6)), 1.2)])
-def test_boxes_on_one_landmark_and_landmarks_behind_one_box_count_once(
-        compared, office_map, queries, matches, score):
-    found = support(office_map, [compared], queries[0].map_from_camera[None], [matches])
-    assert (found.inliers, found.score) == (2, pytest.approx(score))
-
-
-def test_what_no_landmark_explains_counts_against_a_pose(compared, office_map, queries):
-    poses = np.tile(queries[0].map_from_camera, (2, 1, 1))
-    # chair and the class of landmark 4 are in the map, 'none' is not
-    assert 'chair' in office_map.class_ids and 'none' not in office_map.class_ids
-    for explained, unexplained in (([Match(0, 3, 0.5), Match(1, 4, 0.5)], 0),
-                                   ([Match(1, 4, 0.5), Match(2, 3, 0.5)], 1)):
-        found = support(office_map, [compared], poses[:1], [explained])
-        assert found.unexplained == unexplained
-    # seen twice, missed twice: each counts as one object, like objects explained twice
-    twice = support(office_map, [compared] * 2, poses, [[Match(1, 4, 0.5)]] * 2)
-    assert (twice.inliers, twice.unexplained) == (1, 1)
-
-
-def test_labels_and_classes_support_a_pose(compared, office_map, queries):
-    poses, matches = queries[0].map_from_camera[None], [[Match(1, 4, 0.5)]]
-    found = support(office_map, [compared], poses, matches)
-    count = len(office_map)
-    # one of all columns is 1, the others are 0
-    assert found.likeness == pytest.approx(np.sqrt(count - 1), rel=1e-4)
-    own = office_map.class_ids.count(office_map.class_ids[4])
-    # as common as in a typical building, which is more than in this map
-    common = CALIBRATION.common[office_map.class_ids[4]]
-    assert common > own / count
-    assert (found.rarity, found.unlabelled) == (pytest.approx(-np.log(common)), 0)
-    by_class = support(office_map, [compared._replace(
-        similarities=None, similarity_rows=np.full(4, -1))], poses, matches)
-    assert (by_class.likeness, by_class.unlabelled) == (0.0, 1)
-    assert by_class.misfit == found.misfit > 0
-
-
 def poses_at(*positions):
     return np.array([at(x) for x in positions])
 
@@ -348,9 +291,23 @@ def test_a_contradiction_makes_both_answers_less_certain():
     np.testing.assert_allclose(just_agreeing[0], agreeing[0], rtol=1e-9)
 
 
-def support_of(landmark_map, detections):
-    frame = Observation(scenes.CAMERA, detections)
-    return Relocalizer(landmark_map, scenes.BY_CLASS).relocalize([frame]).hypotheses[0].support
+def support_of(landmark_map, detections, similarities=None):
+    frame = Observation(scenes.CAMERA, detections, similarities)
+    options = scenes.BY_CLASS if similarities is None else OPTIONS
+    return Relocalizer(landmark_map, options).relocalize([frame]).hypotheses[0].support
+
+
+def test_labels_and_classes_support_a_pose():
+    """A class is as common as in a typical building, if that is more than in the map."""
+    room = replace(scenes.ROOM, class_ids=('chair', *scenes.ROOM.class_ids[1:]))
+    seen = replace(scenes.SEEN, class_ids=room.class_ids)
+    found, by_class = (support_of(room, seen, similarities) for similarities in (
+        np.eye(12, dtype=np.float32), None))
+    shares = np.array([room.class_ids.count(name) / 12 for name in room.class_ids])
+    shares[0] = CALIBRATION.common['chair']
+    assert found.rarity == pytest.approx(-np.log(shares).sum())
+    assert found.likeness == pytest.approx(12 * np.sqrt(11), rel=1e-4)
+    assert (found.unlabelled, by_class.unlabelled, by_class.likeness) == (0, 12, 0.0)
 
 
 def test_one_thing_under_two_class_names_counts_once():
