@@ -18,11 +18,7 @@ from cliploc_ros.core.geometry.camera_faults import camera_faults, fields_of_vie
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, unit_circle_overlap
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
 from cliploc_ros.core.geometry.minimal_solvers import two_point
-from cliploc_ros.core.geometry.transforms import (
-    move_covariance,
-    quaternion_from_transform,
-    transform_from_pose,
-)
+from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.errors import CameraError
 
 LENSES = {
@@ -157,18 +153,6 @@ def test_not_wholly_in_front_has_no_outline(depth):
     assert np.isnan(project_ellipsoids(np.eye(4), np.array([[0.0, 0.0, depth]]), shapes)).all()
 
 
-numbers = st.floats(-3.0, 3.0)
-transforms = st.builds(
-    lambda position, turn: transform_from_pose(np.array(position),
-                                               Rotation.from_rotvec(turn).as_quat()),
-    st.tuples(numbers, numbers, numbers), st.tuples(numbers, numbers, numbers))
-
-
-@given(transforms)
-def test_quaternion_and_back(a_from_b):
-    quat_xyzw = quaternion_from_transform(a_from_b)
-    assert quat_xyzw[3] >= 0
-    assert transform_from_pose(a_from_b[:3, 3], quat_xyzw) == pytest.approx(a_from_b, abs=1e-9)
 
 
 def test_moving_a_covariance_by_a_lever(rng):

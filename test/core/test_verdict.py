@@ -15,7 +15,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from cliploc_ros.core.acceptance import confidence
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
     Support,
@@ -373,17 +372,15 @@ OFFICE = of_things([*DESK, ('cup', 0.4, 0.0, 0.75), ('chair', 0.3, 1.6, 0.4),
                     ('potted plant', -1.2, 1.5, 0.5), ('oven', 4.0, -3.0, 0.5)])
 
 
-def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng, monkeypatch):
+def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng):
     """An image may show a desk that the map lacks; its things stand 5 to 10 cm otherwise."""
     terms, camera = CALIBRATION.group, scenes.level(0.3, -1.8, 90.0, 1.2)
 
     def ask(seen):
         found = Relocalizer(OFFICE, scenes.BY_CLASS).relocalize(
             [Observation(scenes.CAMERA, seen, up_in_camera=camera[2, :3])])
-        likely.append(found.evidence.likely)
         return found.hypotheses[0].support.group, found.accepted
 
-    likely = []
     room = scenes.see_room(OFFICE, camera)
     assert ask(room.select(np.arange(4))) == (pytest.approx(terms.unmapped), True)
     assert ask(room.select(np.arange(5))) == (0.0, True), 'more than four'
@@ -396,9 +393,6 @@ def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng, 
     assert min(groups) >= terms.unmapped and np.sum(np.array(groups) > 1.0) >= 3
     most = CALIBRATION.keyframes.most_objects
     assert objects_utility(Support(99.0)) == objects_utility(Support(most))
-    monkeypatch.setattr(confidence, '_of_group', lambda *_: 0.0)
-    assert ask(scenes.see_room(replace(desk, centers=desk.centers + shifts[-1]), camera))[0] == 0.0
-    assert likely[-2] < likely[-1] < 0.9999
 
 
 @pytest.mark.parametrize('table', [[], [('table', 0.0, 0.0, 0.4)]])
