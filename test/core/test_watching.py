@@ -151,7 +151,6 @@ def test_a_localizer_that_drifts_is_right(watch, room):
     assert report.matched
     assert not report.missing
     assert report.camera_turn is None
-    assert len(report.reason) < 120
 
 
 @pytest.mark.parametrize('wrong', [moved(np.eye(4), 2.0, 0.0), moved(np.eye(4), 0.0, 0.0, 60.0),
