@@ -412,6 +412,9 @@ def test_any_link_may_be_broken_and_keyframes_and_inexact_odometry_hold_it(room,
     last, first = (link_of(room, walk, shown) for shown in ('gggn', 'bggn'))
     assert last.holds < 0.8 and first.kept == 3 and first.holds < first.chance == last.chance
     assert last.kept == 1 and last.holds < last.chance
+    old, new = (link_of(room, walk, 'gggg', stamps) for stamps in ((0, 25, 25, 25), (0, 0, 0, 10)))
+    assert (old.kept, new.kept) == (3, 1), 'a link that held before breaks less often'
+    assert old.holds == pytest.approx(new.holds)
     assert link_of(room, walk, 'gggn', (0, 1, 2, 30)).holds < last.holds, 'time for a carry'
     assert link_of(room, walk, 'bbgg').holds < link_of(room, walk, 'bggg').holds
     elsewhere, here = (link_of(room, walk, 'gggn', met=(5.0, where)).holds

@@ -80,6 +80,7 @@ WEAK = {
     'a bad look': ({'earlier': looks(0.0, 0.99)}, None),
     'same view': ({'earlier': looks(0.9, 0.9, doubted=0.6, same_view=1.0)},
                   RefusalKind.FRAMES_DISAGREE),
+    'same view, once unknown': ({'earlier': looks(0.9, same_view=1.0)}, None),
     'linked': ({'linked': 0.5}, RefusalKind.FRAMES_DISAGREE),
     'crops': ({'likely': 0.95, 'crops_left': 12}, RefusalKind.NOT_ALL_CROPS),
     'inliers': ({'inliers': 2}, RefusalKind.TOO_FEW_OBJECTS),
@@ -284,10 +285,10 @@ def test_a_contradiction_makes_both_answers_less_certain():
     np.testing.assert_allclose(just_agreeing[0], agreeing[0], rtol=1e-9)
 
 
-def support_of(landmark_map, detections, similarities=None):
-    frame = Observation(scenes.CAMERA, detections, similarities)
+def support_of(landmark_map, detections, similarities=None, frames=1):
+    frame = Observation(scenes.CAMERA, detections, similarities, odom_from_camera=np.eye(4))
     options = scenes.BY_CLASS if similarities is None else OPTIONS
-    return Relocalizer(landmark_map, options).relocalize([frame]).hypotheses[0].support
+    return Relocalizer(landmark_map, options).relocalize([frame] * frames).hypotheses[0].support
 
 
 def test_labels_and_classes_support_a_pose():
@@ -304,25 +305,31 @@ def test_labels_and_classes_support_a_pose():
 
 
 def test_one_thing_under_two_class_names_counts_once():
-    """The map has each landmark also under a second class, and the image each box."""
+    """The map has each landmark also under a second class, and the image each box or a part."""
     renamed = tuple(f'also {name}' for name in scenes.ROOM.class_ids)
     both = replace(scenes.doubled_room(np.zeros(3)), class_ids=scenes.ROOM.class_ids + renamed)
     alone = support_of(scenes.ROOM, scenes.SEEN)
     twice = support_of(both, scenes.with_boxes(scenes.SEEN, scenes.SEEN.bboxes_xyxy, renamed))
     assert (twice.inliers, twice.score) == pytest.approx((alone.inliers, alone.score), abs=0.2)
     assert twice.unlabelled == pytest.approx(alone.unlabelled, abs=0.2)
+    part = scenes.SEEN.bboxes_xyxy[:1].copy()
+    part[0, 2] = part[0, [0, 2]] @ [0.6, 0.4]
+    best = support_of(scenes.ROOM, scenes.with_boxes(scenes.SEEN, part, 'a'))
+    assert (best.inliers, best.score) == pytest.approx(
+        (alone.inliers, alone.score)), 'a part of a box on the same landmark'
 
 
 def test_a_second_box_of_an_explained_thing_is_not_unexplained():
     """Its class is another one in the map; a box elsewhere is unexplained."""
-    def unexplained(boxes):
+    def unexplained(boxes, frames=1):
         more = scenes.with_boxes(scenes.SEEN, boxes, scenes.ROOM.class_ids[1:2] * len(boxes))
-        return support_of(scenes.ROOM, more).unexplained
+        return support_of(scenes.ROOM, more, frames=frames).unexplained
 
     base, elsewhere = support_of(scenes.ROOM, scenes.SEEN).unexplained, [[2.0, 400.0, 60.0, 470.0]]
     assert unexplained(scenes.SEEN.bboxes_xyxy[:1]) == pytest.approx(base, abs=0.01)
     assert unexplained(elsewhere) == pytest.approx(base + 1.0)
     assert unexplained(elsewhere * 2) == pytest.approx(base + 1.0)
+    assert unexplained(elsewhere, 2) == pytest.approx(base + 1.0), 'in two frames'
 
 
 def arrangement(off_m):
