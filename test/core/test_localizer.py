@@ -17,6 +17,7 @@ from cliploc_ros.core.acceptance.depth_check import DepthCheck
 from cliploc_ros.core.acceptance.links import weakest_link
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence
+from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import SIFT
@@ -332,6 +333,14 @@ def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room, verif
     # refinement gives four verticals more weight than one, and the boxes less
     assert four == pytest.approx(one, rel=0.06)
     assert four >= 0.95 * one
+
+
+def test_the_deviations_of_odometry_grow_with_the_way_and_the_turn():
+    assert not odometry_deviations(np.eye(4)).any(), 'did not move'
+    for degrees, metres in ((10.0, 0.0), (10.0, 0.5)):
+        deviations = odometry_deviations(pose(degrees, metres))
+        assert deviations[:3] == pytest.approx(0.005 + 0.03 * metres)
+        assert deviations[3:] == pytest.approx(np.radians(0.25 + 0.03 * degrees + 0.15 * metres))
 
 
 def test_bad_odometry_is_named(room, walk):

@@ -210,6 +210,15 @@ def test_a_standing_robot_learns_little_from_more_of_the_same():
     assert 0.05 < belief.probability < 0.5
 
 
+def test_a_long_way_makes_a_sure_watch_unsure():
+    belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
+    belief.wait(seen, np.eye(4))
+    belief.add(seen, 3.0, is_full=True)
+    before, after = belief.probability, moved(np.eye(4), 100.0, 0.0)
+    belief.wait(replace(seen, odom_from_camera=after), after)
+    assert 0.5 < belief.probability < before - 0.02 and not belief.has_jumped
+
+
 @pytest.mark.parametrize('change', [(2.0, 0.0, 0.0), (0.0, 0.0, 60.0)])
 def test_a_jump_in_place_or_in_heading_alone_speaks_against_the_new_pose(change):
     belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=np.eye(4))
