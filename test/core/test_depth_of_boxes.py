@@ -14,7 +14,6 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import (
     DepthCamera,
     DepthImage,
-    centre_depth,
     depth_from_counts,
     depths_of_boxes,
     half_chord,
@@ -57,10 +56,6 @@ def test_the_chord_is_that_of_the_ray_through_the_centre():
         depth = (ROTATION @ center + TRANSLATION)[2]
         expected = depth / np.sqrt(ray @ inverse @ ray)
         assert half_chord(center, shape, ROTATION, TRANSLATION) == pytest.approx(expected)
-        measured, deviation = centre_depth(np.array([2.0, 0.05]), center, shape, 0.02, ROTATION,
-                                           TRANSLATION)
-        assert measured == pytest.approx(2.0 + 0.6 * expected)
-        assert deviation == pytest.approx(np.sqrt(0.05**2 + (0.4 * expected)**2 + 0.02**2))
 
 
 def test_right_depth_makes_poses_better_and_surer():

@@ -18,11 +18,7 @@ from cliploc_ros.core.geometry.camera_faults import camera_faults, fields_of_vie
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, unit_circle_overlap
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids, shape_matrices
 from cliploc_ros.core.geometry.minimal_solvers import two_point
-from cliploc_ros.core.geometry.transforms import (
-    move_covariance,
-    quaternion_from_transform,
-    transform_from_pose,
-)
+from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.errors import CameraError
 
 LENSES = {
@@ -45,14 +41,6 @@ def camera(lens, focal=400.0):
 def test_normalizing_inverts_projecting(lens, u, v):
     normalized = camera(lens).normalize_points(np.array([[u, v]]))
     assert camera(lens).project_normalized(normalized) == pytest.approx(np.array([[u, v]]))
-
-
-def test_a_fisheye_equals_its_equation():
-    point, coefficients = np.array([0.9, -0.5]), LENSES['fisheye'][1]
-    angle = np.arctan(np.linalg.norm(point))
-    radius = angle * (1 + sum(k * angle**(2 * n) for n, k in enumerate(coefficients, start=1)))
-    expected = point / np.linalg.norm(point) * radius * (400, 401) + (318.6, 255.3)
-    assert camera('fisheye').project_normalized(point[None])[0] == pytest.approx(expected)
 
 
 def test_beyond_the_fold_of_a_lens_is_nan():
@@ -129,17 +117,11 @@ def test_iou_equals_quadrature(a, b, p, q, x, y, angle):
 
 @pytest.mark.parametrize(('center', 'axes', 'shared'), [
     ((0.0, 0.0), (1.0, 1.0), np.pi),             # equal circles
-    ((0.0, 0.0), (0.5, 0.25), np.pi / 8),        # inside
-    ((5.0, 0.0), (1.0, 0.5), 0.0),               # apart
     ((1.0, 0.0), (1.0, 1.0), 2 * np.pi / 3 - np.sqrt(3) / 2),  # two circles at distance one
-    ((0.0, 0.0), (2.0, 0.5), None),              # a cross: four common points
     ((0.0, 0.0), (1.0, 0.2), 0.2 * np.pi),       # inside, touching at both ends
     ((0.4, 0.0), (0.6, 0.3), 0.18 * np.pi),      # inside, touching once
 ])
 def test_shared_area_of_simple_cases(center, axes, shared):
-    if shared is None:
-        shared = iou_by_chords(1.0, 1.0, center, np.diag(np.square(axes)))
-        shared = shared / (1 + shared) * 2 * np.pi
     assert unit_circle_overlap(*center, *axes) == pytest.approx(shared, abs=1e-7)
 
 
@@ -171,18 +153,6 @@ def test_not_wholly_in_front_has_no_outline(depth):
     assert np.isnan(project_ellipsoids(np.eye(4), np.array([[0.0, 0.0, depth]]), shapes)).all()
 
 
-numbers = st.floats(-3.0, 3.0)
-transforms = st.builds(
-    lambda position, turn: transform_from_pose(np.array(position),
-                                               Rotation.from_rotvec(turn).as_quat()),
-    st.tuples(numbers, numbers, numbers), st.tuples(numbers, numbers, numbers))
-
-
-@given(transforms)
-def test_quaternion_and_back(a_from_b):
-    quat_xyzw = quaternion_from_transform(a_from_b)
-    assert quat_xyzw[3] >= 0
-    assert transform_from_pose(a_from_b[:3, 3], quat_xyzw) == pytest.approx(a_from_b, abs=1e-9)
 
 
 def test_moving_a_covariance_by_a_lever(rng):

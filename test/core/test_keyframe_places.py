@@ -348,11 +348,7 @@ def test_features_are_found_in_any_image():
     for empty in (np.zeros((480, 640, 3), np.uint8), np.zeros((1, 1, 3), np.uint8),
                   np.full((1, 1, 3), 255, np.uint8), np.full((2, 3000, 3), 90, np.uint8)):
         assert extract(empty, 300).pixels.shape == (0, 2)
-
-
-@pytest.mark.parametrize('shape', [(1, 1), (2, 2000), (2000, 2)])
-def test_an_image_of_any_shape_is_searched_for_features(shape, rng):
-    image = rng.integers(0, 255, (*shape, 3), dtype=np.uint8)
-    features = extract(image, 100, 400)
-    assert len(features) <= 100
-    assert ((features.pixels > -1.0) & (features.pixels < shape[::-1])).all()
+    for shape in ((1, 1), (2, 2000), (2000, 2)):
+        features = extract(rng.integers(0, 255, (*shape, 3), dtype=np.uint8), 100, 400)
+        assert len(features) <= 100
+        assert ((features.pixels > -1.0) & (features.pixels < shape[::-1])).all()

@@ -95,7 +95,6 @@ def test_it_ends_where_the_exhaustive_search_ends(room):
     assert (progress.coverage, progress.reach) == (1.0, len(scene.pairs))
     assert progress.tried == np.einsum('ij,jk,ki', *[compatible.astype(int)] * 3) / 6
     assert progress.tried < 0.8 * all_tried.tried
-    print(f'\n{progress.tried} of {all_tried.tried} samples tried')
     best = [leaders.ranked()[0] for leaders in (whole, gated)]
     assert gated.scores[best[1]] == pytest.approx(whole.scores[best[0]], rel=1e-6)
     assert pose_error(pose_of(gated, best[1]), MAP_FROM_CAMERA)[0] < 1e-2

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 import walk
 import yaml
-from scene import rigid
-from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import MappingError, ModelError
@@ -22,12 +19,7 @@ from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.evidence import explained_boxes
-from cliploc_ros.offline.mapping.landmarks import (
-    landmarks_of_map,
-    linearize_box,
-    move_ellipsoid,
-    project_box,
-)
+from cliploc_ros.offline.mapping.landmarks import landmarks_of_map
 from cliploc_ros.offline.mapping.make_map import find_labeller, make_map, update_map
 from cliploc_ros.offline.mapping.options import MappingOptions, PoseErrors
 from cliploc_ros.offline.mapping.views import make_views
@@ -86,7 +78,6 @@ def test_an_object_that_was_taken_away_is_left_out_with_the_reason():
     assert left_out.class_id == table.class_ids[taken]
     assert left_out.center == pytest.approx(table.centers[taken], abs=0.02)
     assert 'or moved' in left_out.reason
-    assert built.report.lines()[-2] == 'left out: 1'
 
 
 def test_joint_refinement_corrects_poses_and_landmarks():
@@ -229,25 +220,6 @@ def test_far_landmarks_are_passed_over_without_a_loss():
         expected)
     assert len(expected) > 900
     assert len(find_overlaps(views.between(0, 0), landmarks, 0.2).boxes) == 0
-
-
-def test_derivatives_of_a_box_are_those_of_small_steps():
-    center, there = np.array([0.4, -0.3, 0.2]), rigid((0.1, 0.2, 2.0), 'xyz', (0.2, 0.4, -0.3))
-    basis = rigid(axis='xyz', degrees=(17.0, -30.0, 45.0))[:3, :3] * (0.3, 0.1, 0.2)
-    box, by_landmark, by_pose = np.empty(4), np.empty((4, 9)), np.empty((4, 6))
-    assert linearize_box(there[:3, :3].copy(), there[:3, 3].copy(), center, basis, box,
-                         by_landmark, by_pose)
-
-    def box_after(step):
-        """Return the box after a step of the landmark (9,) and the pose (6,)."""
-        moved, turned, found = np.empty(3), np.empty((3, 3)), np.empty(4)
-        move_ellipsoid(center, basis, step[:9], moved, turned)
-        pose = make_transform(Rotation.from_rotvec(step[12:]).as_matrix(), step[9:12]) @ there
-        assert project_box(pose[:3, :3].copy(), pose[:3, 3].copy(), moved, turned, found)
-        return found
-
-    for step, expected in zip(1e-6 * np.eye(15), np.hstack([by_landmark, by_pose]).T, strict=True):
-        assert (box_after(step) - box_after(-step)) / 2e-6 == pytest.approx(expected, abs=1e-7)
 
 
 # ---- maps of a real office, compared with the limits in test/thresholds.yaml

