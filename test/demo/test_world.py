@@ -51,15 +51,10 @@ def test_boxes_are_where_the_ellipsoids_project(room, renderer):
             centers = np.array([entry['center']])
             outline = ellipsoid.project_ellipsoids(invert_transform(pose), centers, shape)
             box = ellipsoid.ellipse_bboxes(ellipsoid.ellipses_in_pixels(outline, CAMERA))[0]
-            overlaps.append(_iou(box, np.array(seen['bbox_xyxy'])))
+            overlaps.append(ellipsoid.box_ious(
+                box[None], np.array([seen['bbox_xyxy']])).item())
     print(f'{len(overlaps)} whole objects: box IoU median {np.median(overlaps):.2f}, '
           f'least {min(overlaps):.2f}')
     assert len(overlaps) > 40
     assert np.median(overlaps) > 0.75
     assert np.percentile(overlaps, 5) > 0.5
-
-
-def _iou(a, b):
-    low, high = np.maximum(a[:2], b[:2]), np.minimum(a[2:], b[2:])
-    shared = np.prod(np.clip(high - low, 0, None))
-    return shared / (np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2]) - shared)

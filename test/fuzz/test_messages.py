@@ -58,10 +58,6 @@ def images():
         data=or_sound(bytes(SIZE), st.one_of(st.binary(max_size=100), st.just(bytes(3 * SIZE)))))
 
 
-def sound_info():
-    return CameraInfo(d=[], distortion_model='plumb_bob', **INFO)
-
-
 def compressed_images():
     starts = st.sampled_from([b'', b'\xff\xd8\xff\xc0\x00\x11\x08', b'\x89PNG\r\n\x1a\n',
                               b'\xff\xd8\xff\xe0\x00\x02', b'GIF89a'])
@@ -143,5 +139,6 @@ def test_images_raw_and_compressed(loaded, image, info, found):
 @given(likely_detections())
 @CASES
 def test_likely_boxes(loaded, found):
-    result = localize(*loaded, sound_image(), sound_info(), found)
+    result = localize(*loaded, sound_image(),
+                      CameraInfo(d=[], distortion_model='plumb_bob', **INFO), found)
     assert result is not None and not result.accepted

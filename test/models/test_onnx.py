@@ -12,6 +12,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 from scene import unit_rows
+from scipy.special import expit
 from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
 from cliploc_ros.errors import ModelError, OptionsError
@@ -58,15 +59,11 @@ def queries(load, tmp_path):
     return find
 
 
-def sigmoid(*logits):
-    return 1.0 / (1.0 + np.exp(-np.array(logits)))
-
-
 def test_the_pairs_of_a_query_and_a_class_compete(queries):
     """As in transformers: as many pairs as queries, by the sigmoid of their logits."""
     found = queries()
     assert found.class_ids == ('mug', 'box', 'mug', 'mug')
-    assert found.scores == pytest.approx(sigmoid(2.0, 1.5, 1.0, 0.0), abs=1e-6)
+    assert found.scores == pytest.approx(expit([2.0, 1.5, 1.0, 0.0]), abs=1e-6)
     np.testing.assert_allclose(found.bboxes_xyxy, [
         [40, 20, 80, 40], [140, 70, 200, 100], [42, 20, 82, 40], [80, 30, 120, 70]], atol=1e-4)
 
