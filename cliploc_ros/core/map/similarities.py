@@ -103,7 +103,7 @@ def nearest_landmarks(similarities: Similarities, k: int, rows: slice = slice(No
         raise OptionsError('similarities contain values that are not finite')
     # sort only the landmarks that are among the best of some crop
     place = -min(k, alike.shape[1])
-    least = np.partition(alike, place, axis=1)[:, place, None]
+    least = np.partition(alike, place, axis=1)[:, place, None] if alike.size else alike
     landmarks = np.nonzero((alike >= least).any(axis=0)[columns])[0]
     values = alike[:, columns[landmarks]]
     order = np.argsort(-values, axis=1, kind='stable')[:, :k]
