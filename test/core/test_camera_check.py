@@ -159,10 +159,12 @@ def test_errors_of_the_map_do_not_average_out_over_many_views():
     assert log_odds[2] == pytest.approx(log_odds[1])
 
 
-def test_poor_fits_name_a_wrong_camera_and_hardly_change_a_confidence():
-    good, poor = views_of(4), views_of(4, careful=0.1)
-    assert good.odds().is_wrong and poor.odds().is_wrong
-    assert good.careful_odds().log_odds > poor.careful_odds().log_odds + 3.0
+def test_poor_fits_name_a_wrong_camera_and_do_not_verify_a_right_one():
+    assert views_of(4, careful=0.1).odds().is_wrong
+    looks = [look_at((0, 0, 0), focal, careful=careful)._replace(moves=100.0 * np.eye(6, ERRORS))
+             for focal in (0.0, 0.3) for careful in (0.01, 1.0)]
+    poor, good, *wrong = (CameraCheck().judge([look], np.eye(6))[0] for look in looks)
+    assert poor < 0.8 * good and wrong[0] == wrong[1] < good
 
 
 def test_a_wrong_camera_is_mended_by_views_of_several_places(rng):

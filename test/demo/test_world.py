@@ -53,8 +53,6 @@ def test_boxes_are_where_the_ellipsoids_project(room, renderer):
             box = ellipsoid.ellipse_bboxes(ellipsoid.ellipses_in_pixels(outline, CAMERA))[0]
             overlaps.append(ellipsoid.box_ious(
                 box[None], np.array([seen['bbox_xyxy']])).item())
-    print(f'{len(overlaps)} whole objects: box IoU median {np.median(overlaps):.2f}, '
-          f'least {min(overlaps):.2f}')
     assert len(overlaps) > 40
     assert np.median(overlaps) > 0.75
     assert np.percentile(overlaps, 5) > 0.5
