@@ -333,8 +333,9 @@ class KeyframeLocalizer:
         seen = _count(look.features.pixels, look.camera)
         comparable = (seen >= _LEAST_SEEN) & self._expects(used, pose, look.camera)
         cells = int(np.count_nonzero(place.cells[comparable])), int(comparable.sum())
-        confirmed, expected = (cells[0] / cells[1], place.agreed / (cells[1] + place.agreed)) \
-            if cells[1] else (0.0, 0.0)
+        confirmed = expected = 0.0
+        if cells[1]:
+            confirmed, expected = cells[0] / cells[1], place.agreed / (cells[1] + place.agreed)
         among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
         free = free_focal(among.points, look.bearings[among.features], invert_transform(pose))
         ratio, aspect, deviation, of_aspect = 1.0, 1.0, np.inf, np.inf

@@ -73,7 +73,7 @@ class CropSimilarities:
 Similarities = NDArray[np.float32] | CropSimilarities
 
 
-def nearest_landmarks(similarities: Similarities, k: int, rows: slice = slice(None)
+def nearest_landmarks(similarities: Similarities, k: int
                       ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return the k landmarks (n, k) most similar to each crop, best first, and their similarities.
 
@@ -82,8 +82,6 @@ def nearest_landmarks(similarities: Similarities, k: int, rows: slice = slice(No
     Parameters
     ----------
     similarities : ndarray (n, L) or CropSimilarities
-    rows : slice
-        The landmarks of one of several maps: only they are compared, and counted from the first.
 
     Raises
     ------
@@ -92,13 +90,9 @@ def nearest_landmarks(similarities: Similarities, k: int, rows: slice = slice(No
     """
     if isinstance(similarities, CropSimilarities):
         alike = similarities.crops @ similarities.labels.unique.T
-        columns = similarities.labels.of_landmarks[rows]
-        if len(columns) < similarities.shape[1]:
-            own, columns = np.unique(columns, return_inverse=True)
-            alike = alike[:, own]
+        columns = similarities.labels.of_landmarks
     else:
-        alike = similarities[:, rows]
-        columns = np.arange(alike.shape[1])
+        alike, columns = similarities, np.arange(similarities.shape[1])
     if not np.isfinite(alike).all():
         raise OptionsError('similarities contain values that are not finite')
     # sort only the landmarks that are among the best of some crop

@@ -104,14 +104,13 @@ def class_candidates(index: ClassIndex, classes: NDArray[np.int64], limit: int |
     return Candidates(pairs[:, 0], pairs[:, 1], zeros.astype(np.int64), zeros)
 
 
-def nearest_candidates(similarities: Similarities, k: int, rows: slice = slice(None)
-                       ) -> Candidates:
+def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
     """Return the k most similar landmarks of each detection as candidates, best first.
 
-    They are among `rows`, at least k landmarks; see nearest_landmarks.
+    The map has at least k landmarks.
     """
     detection_count, _ = similarities.shape
-    landmarks, values = nearest_landmarks(similarities, k, rows)
+    landmarks, values = nearest_landmarks(similarities, k)
     return Candidates(np.repeat(np.arange(detection_count), k), landmarks.ravel(),
                       np.tile(np.arange(k), detection_count), values.ravel().astype(np.float64))
 
@@ -221,11 +220,13 @@ def _nearest(landmark_map: LandmarkMap, observation: Observation, options: Reloc
         found = 'none' if similarities is None else f'{similarities.shape}'
         raise OptionsError(f"matching '{options.matching}' needs similarities of shape "
                            f'{shape}, found {found}')
+    parts, pieces = parts_of(landmark_map), [similarities]
+    if len(parts) > 1:
+        pieces = np.split(np.asarray(similarities), [part.first for part in parts[1:]], axis=1)
     # k landmarks from each map, so that the labels of one map do not hide rivals in other maps
     nearest = concatenated([
-        nearest_candidates(similarities, min(options.k, len(part.landmark_map)), slice(
-            part.first, part.first + len(part.landmark_map))).moved(part.first)
-        for part in parts_of(landmark_map)])
+        nearest_candidates(piece, min(options.k, len(part.landmark_map))).moved(part.first)
+        for part, piece in zip(parts, pieces, strict=True)])
     nearest = nearest._replace(detections=compared[nearest.detections])
     return nearest.select(sound[nearest.detections])
 
