@@ -113,7 +113,8 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
             chosen.append((keyframe, points[rows], rows))
     if not chosen:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
-                           f'{_LEAST_POINTS} points; record depth or overlapping images 5 cm apart')
+                           f'{_LEAST_POINTS} points; record depth, or overlapping '
+                           'images 5 cm apart')
     cameras, kind = [keyframe.camera for keyframe, _, _ in chosen], options.kind
     descriptors = np.concatenate([keyframe.posed.descriptors[rows]
                                   for keyframe, _, rows in chosen])
