@@ -453,7 +453,7 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     if share_before < _LEAST_AS_GIVEN * share_settled:
         raise MappingError(
             f'the map does not match the boxes: it explains {share_before:.0%} of them as given, '
-            f"{share_settled:.0%} after fitting; transform it to the recording's frame, in metres")
+            f"{share_settled:.0%} after fitting; transform it to the recording's coordinate frame")
     if not (is_fitted | ~chosen).any():
         raise MappingError(
             f'no landmark can be fitted; for the first one, {reasons[0]}; as given, the map '
