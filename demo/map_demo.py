@@ -16,7 +16,7 @@ from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.evaluation.methods import Method
-from cliploc_ros.offline.evaluation.recording import make_queries_of
+from cliploc_ros.offline.evaluation.recorded_queries import make_queries_of
 from cliploc_ros.offline.evaluation.run import run_methods
 from cliploc_ros.offline.evaluation.summary import Summary, summarize
 from cliploc_ros.offline.evaluation.trials import make_queries

@@ -115,9 +115,9 @@ def _play(player: 'Player', options: argparse.Namespace, stop: command.Interrupt
               disable=None) as bar:  # draws on a terminal only
         counts, passes, unread, late_s = player.play(lambda message: bar.update(
             (message.stamp_ns - player.start_ns) / NS_PER_S - bar.n))
+    times = f', {passes} passes' if passes > 1 else ''
     print(f'{"stopped: " if stop.is_set() else ""}published {counts.total()} messages on '
-          f'{len(counts)} topics in {time.monotonic() - begin:.1f} s'
-          f'{f", {passes} passes" if passes > 1 else ""}; '
+          f'{len(counts)} topics in {time.monotonic() - begin:.1f} s{times}; '
           f'at most {late_s * 1000:.1f} ms late', flush=True)
     if unread:
         print(f'warning: {unread} messages that the recording lists were not found in it; '

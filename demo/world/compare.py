@@ -28,7 +28,7 @@ from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import Queries, save_queries
 from cliploc_ros.offline.evaluation.methods import parse_methods
-from cliploc_ros.offline.evaluation.recording import make_queries_of
+from cliploc_ros.offline.evaluation.recorded_queries import make_queries_of
 from cliploc_ros.offline.evaluation.run import compare_methods
 from cliploc_ros.offline.evaluation.trials import make_queries
 from cliploc_ros.offline.posed_query import PosedQuery

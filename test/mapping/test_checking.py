@@ -225,7 +225,7 @@ def test_too_few_views_are_named_as_the_cause(detections):
     # two of nine objects are not in the map
     part = TABLE.select(range(7))
     few = check_map(part, detections.select_frames(range(0, 120, 12)), options=QUICK)
-    assert 'more views: of 10' in few.advice[0] and '22%' in few.advice[0]
+    assert 'more views: 10 frames' in few.advice[0] and '22%' in few.advice[0]
     many = check_map(part, detections, options=QUICK)
     assert not any('more views' in text for text in many.advice)
 

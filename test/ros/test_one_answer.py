@@ -21,7 +21,7 @@ from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import load_queries
 from cliploc_ros.offline.evaluation.methods import AUTO, Method
-from cliploc_ros.offline.evaluation.recording import make_queries_of, with_images
+from cliploc_ros.offline.evaluation.recorded_queries import make_queries_of, with_images
 from cliploc_ros.offline.evaluation.trials import make_queries, run_trial
 from cliploc_ros.offline.mapping.check.relocalization import Fold, RecordedKeyframes, try_recording
 from cliploc_ros.offline.mapping.landmarks import landmarks_of_map

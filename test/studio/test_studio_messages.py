@@ -52,7 +52,7 @@ def page(tmp_path_factory):
     ('show_view', [{'view': view} for view in ('x', None, [1], {}, NAN, 10**400, 1e300, -1e300)]),
     *((name, [{'ids': ids} for ids in ('mug_1', {'mug_1': 1}, [1], [['mug_1']], 5, ['more'])])
       for name in ('lock', 'hide')),
-    ('fly', [{'name': 1}, {}]), ('mode', [{'mode': {}}, {}]),
+    ('look_at_landmark', [{'name': 1}, {}]), ('mode', [{'mode': {}}, {}]),
     ('relocalize_robot', [{}]), ('reload_robot', [{}]), ('check_map', [{'limit_s': NAN}]),
     ({'x': []}, [{}]), ('x' * 100_000, [{}]), ('_start', [{'name': 'save', 'values': {}}])],
     ids=lambda value: '' if isinstance(value, list) else str(value)[:20])

@@ -228,7 +228,8 @@ def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat
         except DatasetError as error:
             problem = str(error).removeprefix(f'{reader.path}: ')
     raise DatasetError(f"{reader.path}: depth is in frame '{depth}', the image in '{image}', and "
-                       f'{problem}: register depth, or give `depth_intrinsics`, `depth_baseline`')
+                       f'{problem}: register depth, or give `depth_intrinsics` and '
+                       '`depth_baseline`')
 
 
 def _sampled(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Cameras

@@ -309,8 +309,7 @@ class _Builder(NamedTuple):
                 steps, link_note = link_frames(given, odometry, errors,
                                                self.options.odometry_errors)
             # Errors of the poses split objects in two. Poses and parts are refined in turn until
-            # the
-            # parts merge.
+            # the parts merge.
             for _ in range(REFINEMENTS):
                 views, landmarks = joint.refine_jointly(given, views, draft.landmarks, draft.shown,
                                                         errors, steps=steps)
@@ -409,10 +408,9 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     """Fit the chosen landmarks of a given map to the boxes of a recording that show them.
 
     No landmarks are added: the map gives their classes and approximate positions, and the boxes
-    refine them.
-    Ids, labels, classes and class weights are kept; a landmark that is the same object as others
-    also gets theirs. Landmarks that are not chosen are unchanged, and keep the boxes that show
-    them.
+    refine them. Ids, labels, classes and class weights are kept; a landmark that is the same
+    object as others also gets theirs. Landmarks that are not chosen are unchanged, and keep the
+    boxes that show them.
 
     Parameters
     ----------
@@ -455,7 +453,7 @@ def refit_map(detections: PosedDetections, landmark_map: LandmarkMap,
     if share_before < _LEAST_AS_GIVEN * share_settled:
         raise MappingError(
             f'the map does not match the boxes: it explains {share_before:.0%} of them as given, '
-            f'{share_settled:.0%} after fitting; transform it to their coordinate frame first')
+            f"{share_settled:.0%} after fitting; transform it to the recording's coordinate frame")
     if not (is_fitted | ~chosen).any():
         raise MappingError(
             f'no landmark can be fitted; for the first one, {reasons[0]}; as given, the map '

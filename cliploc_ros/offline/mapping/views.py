@@ -182,7 +182,10 @@ def thin_out(views: Views, most: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class KeyframeOptions:
-    """Spacing of keyframes; exceeding one limit is sufficient."""
+    """Spacing of keyframes; reaching one limit is sufficient.
+
+    The defaults are the spacing of viewpoints.
+    """
 
     #: [m] [deg]. 0: every frame with a pose.
     distance_m: float = 0.1
@@ -190,7 +193,10 @@ class KeyframeOptions:
 
 
 class KeyframeFilter:
-    """Chooses keyframes among the frames of a camera, which are passed in order."""
+    """Chooses keyframes among the frames of a camera, which are passed in order.
+
+    It counts all frames as `asked`, and those without a pose.
+    """
 
     def __init__(self, options: KeyframeOptions) -> None:
         self._options = options
@@ -214,8 +220,8 @@ class KeyframeFilter:
 def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:
     """Return the number of the viewpoint (F,) of each frame, ascending from 0, camera by camera.
 
-    A new viewpoint begins as soon as a frame differs from the first frame of the current one by
-    more than 10 cm or 5 degrees.
+    A new viewpoint begins where a keyframe with the default spacing would: as soon as a frame
+    differs from the first frame of the current one by 10 cm or 5 degrees.
     """
     poses, order = detections.map_from_camera, detections.by_camera
     filters = [KeyframeFilter(KeyframeOptions()) for _ in detections.cameras]

@@ -24,7 +24,7 @@ from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
 _MOST_FOUND = 2000
 # A larger image is scaled down first.
 _LONGEST_PX = 800
-# An image with fewer points is not a keyframe.
+# An image with fewer points is not a keyframe. Both limit --keyframe-points of build_map.
 _LEAST_POINTS = 20
 # Stored images are for visual inspection; each takes 7 to 9 kB.
 _IMAGE_PX, _JPEG_QUALITY = 256, 60
@@ -113,7 +113,8 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
             chosen.append((keyframe, points[rows], rows))
     if not chosen:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
-                           f'{_LEAST_POINTS} points; record depth, or images 5 cm apart')
+                           f'{_LEAST_POINTS} points; record depth, or overlapping '
+                           'images 5 cm apart')
     cameras, kind = [keyframe.camera for keyframe, _, _ in chosen], options.kind
     descriptors = np.concatenate([keyframe.posed.descriptors[rows]
                                   for keyframe, _, rows in chosen])

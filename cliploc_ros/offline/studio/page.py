@@ -77,7 +77,7 @@ class Desk:
     """
 
     ACTIONS = ('show_layer', 'export')
-    LOOKS = ('fly', 'overview', 'from_above', 'look_through', 'look_at_robot')
+    LOOKS = ('look_at_landmark', 'overview', 'from_above', 'look_through', 'look_at_robot')
 
     def __init__(self, studio: Studio, server: viser.ViserServer):
         self.studio, self.server = studio, server
@@ -105,7 +105,7 @@ class Desk:
             # show_view is no action of the user: pages send it after each selection
             self.act(lambda: self._start(name, values), name != 'show_view')
             if name in _BRING_ANOTHER and not values.get('joins'):
-                self.look(self._client_of(person), 'fly')
+                self.look(self._client_of(person), 'look_at_landmark')
 
     def _start(self, name: str, values: dict[str, Any]) -> str | None:
         """Run an action; slow actions run in a thread."""
@@ -196,20 +196,18 @@ class Desk:
             None if source is None else source.map_from_camera)
 
     def look(self, client: viser.ClientHandle | None, name: str) -> None:
-        """Move the camera of a user in a thread, as it fails until the browser has reported it."""
+        """Move the camera of a user, unless the user's scene is not open yet."""
         if client is not None:
-            threading.Thread(target=self._look, args=(client, name), daemon=True).start()
+            self.act(lambda: self._look(client, name), makes_old=False)
 
     def _look(self, client: viser.ClientHandle, name: str) -> None:
-        studio = self.studio
-        with studio.document.lock:
-            extent, selected = self.extent(), studio.document.selected
+        studio, extent, selected = self.studio, self.extent(), self.studio.document.selected
         pose = None if studio.live is None else studio.live.state.pose
-        if name == 'fly' and selected is not None:
-            viewpoint.fly_to(client, selected[1].center, selected[1].semi_axes.max(), extent.up)
+        if name == 'look_at_landmark' and selected is not None:
+            viewpoint.look_at(client, selected[1].center, selected[1].semi_axes.max(), extent.up)
         elif name in ('overview', 'from_above'):
             position = viewpoint.overview(extent, client.camera.aspect, name == 'from_above')
-            viewpoint.fly(client, position, extent.middle, extent.up)
+            viewpoint.move_to(client, position, extent.middle, extent.up)
         elif name == 'look_through' and studio.recording is not None:
             viewpoint.look_through(client, studio.map_from_camera, studio.camera)
         elif name == 'look_at_robot' and pose is not None:
@@ -286,7 +284,7 @@ class Page:
         key, now = (event.client_id, landmark_id), time.monotonic()
         before, self._clicked = self._clicked, (key, now)
         if before[0] == key and now - before[1] < _DOUBLE_CLICK_S:
-            self.desk.look(event.client, 'fly')
+            self.desk.look(event.client, 'look_at_landmark')
         else:
             self.desk.act(lambda: self._studio.select(landmark_id, event.modifier == 'shift'))
 

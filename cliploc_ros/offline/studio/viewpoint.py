@@ -84,19 +84,19 @@ def overview(extent: Bounds, aspect: float, is_from_above: bool = False) -> NDAr
     return np.asarray(extent.middle + distance * direction / np.linalg.norm(direction))
 
 
-def fly_to(client: Any, center: NDArray[np.float64], radius_m: float, up: NDArray[np.float64]
-           ) -> None:
+def look_at(client: Any, center: NDArray[np.float64], radius_m: float, up: NDArray[np.float64]
+            ) -> None:
     """Move the camera of a browser to an object, keeping its viewing direction if possible."""
     camera = client.camera
     direction = camera.position - camera.look_at
     direction = direction / max(float(np.linalg.norm(direction)), 1e-9)
     direction = direction + max(0.0, _LEAST_RISE - float(direction @ up)) * up
     distance = _AROUND * max(radius_m, _LEAST_RADIUS_M) / np.tan(FOV_RAD / 2.0)
-    fly(client, center + distance * direction / np.linalg.norm(direction), center, up)
+    move_to(client, center + distance * direction / np.linalg.norm(direction), center, up)
 
 
-def fly(client: Any, position: NDArray[np.float64], look_at: NDArray[np.float64],
-        up: NDArray[np.float64]) -> None:
+def move_to(client: Any, position: NDArray[np.float64], look_at: NDArray[np.float64],
+            up: NDArray[np.float64]) -> None:
     """Move the camera of a browser to a position (3,), looking at a point (3,).
 
     From then on it orbits that point.

@@ -265,8 +265,8 @@ def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
         unexplained = 1.0 - report.recording.as_given.explained
         if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
             yield Advice(
-                f'record more views: of {report.recording.frames} frames, {frames:.0f} show a '
-                f'landmark, {_FEW_FRAMES} should; {unexplained:.0%} of the boxes belong to none')
+                f'record more views: {frames:.0f} frames show a landmark (median), {_FEW_FRAMES} '
+                f'should; {unexplained:.0%} of the boxes belong to none')
     yield from _some([
         Advice(f'{one.landmark_id} {one.faults[0]}', (one.landmark_id,))
         for one in report.landmarks

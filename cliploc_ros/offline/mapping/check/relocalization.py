@@ -129,7 +129,7 @@ def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, vie
         expected = frames[(is_expected(views, cameras, center, basis, reach[row])
                            & (distances > 0.0))[frames]]
         sightings.append(simulation.Sightings(offsets[expected] / distances[expected, None],
-                                    np.isin(expected, views.frames[rows])))
+                                              np.isin(expected, views.frames[rows])))
     own = detections.frame_cameras == 0
     sides = np.diff(detections.bboxes_xyxy[own[views.frames]].reshape(-1, 2, 2), axis=1
                     ).min(axis=(1, 2))

@@ -207,7 +207,7 @@ function showCard() {
     el('div', {className: 'head'}, el('span', {}, one.id),
        toggle(one.is_locked ? 'locked' : 'open', one.is_locked ? 'Unlock' : 'Lock', 'L',
               doing('lock', {ids})),
-       toggle('fly', 'Fly to the landmark', 'G', doing('fly'))),
+       toggle('look', 'Look at the landmark', 'G', doing('look_at_landmark'))),
     field('Label', [one.label], set('label'), {isText: true, ...off}),
     mode === 'edit' && one.phrases.length ? el('div', {className: 'chips'}, ...one.phrases.map(
       text => button(text, () => set('label')(text), {off: one.is_locked, hint: text}))) : null,
@@ -518,7 +518,7 @@ function showLayers() {
   fill($('layers'), [
     buttons(button('Whole map', doing('overview'), {key: 'O'}),
             button('From above', doing('from_above'), {key: 'B'}),
-            button('Selection', doing('fly'), {key: 'G'})),
+            button('Selection', doing('look_at_landmark'), {key: 'G'})),
     ...Object.keys(state.layers).map(layerBox),
     ...(state.file.views ? [box('Follow the view', follows, followView),
                             button(film ? 'Stop' : 'Play the recording', playOrStop)] : [])]);
@@ -553,7 +553,7 @@ const KEYS = {
   all: {'ctrl+z': ['undo', doing('undo')], 'ctrl+y': ['redo', doing('redo')], 'ctrl+s': ['save', doing('save')],
         ',': ['previous view', () => stepView(-1)], '.': ['next view', () => stepView(1)],
         v: ['best view of the landmark, then the next best', bestView], t: ['move the scene\'s camera to the view', doing('look_through')],
-        g: ['fly to the landmark', doing('fly')], o: ['show the whole map', doing('overview')],
+        g: ['look at the landmark', doing('look_at_landmark')], o: ['show the whole map', doing('overview')],
         b: ['show the map from above', doing('from_above')], l: ['lock, unlock', () => send('lock')],
         h: ['hide, show', () => send('hide', {ids: state.selection.ids})], 0: ['whole image', () => { zoom = null; showView(); }],
         '/': ['find', () => $('find').focus()], '?': ['keyboard shortcuts', () => showKeys()], n: ['next landmark', doing('step', {count: 1})],
