@@ -149,7 +149,7 @@ def encoded_once(key: str, labels: Sequence[str], embed_dim: int, cache_dir: str
     """Return the embeddings of labels from the cache, or encode and cache them; see LabelCache."""
     cache = LabelCache(resolve_cache_dir(cache_dir) / 'labels')
     embeddings = cache.load(key, labels, embed_dim)
-    logger.info('%d labels %s', len(labels), 'encoded' if embeddings is None else 'cached')
+    logger.info('%d labels %s', len(labels), 'to encode' if embeddings is None else 'cached')
     if embeddings is None:
         embeddings = encode(labels)
         cache.store(key, labels, embeddings)

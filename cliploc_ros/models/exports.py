@@ -105,7 +105,7 @@ def exported(cache_dir: str, kind: str, name: str, identity: Sequence[str],
         try:
             cache.mkdir(parents=True, exist_ok=True)
             remove_unused(cache, _MOST_EXPORTS - 1)
-            with tempfile.TemporaryDirectory(dir=cache, prefix='.', suffix='.tmp',
+            with tempfile.TemporaryDirectory(dir=cache, prefix=f'.{folder.name}.', suffix='.tmp',
                                              ignore_cleanup_errors=True) as beside:
                 whole = Path(shutil.copytree(written, Path(beside) / folder.name))
                 if folder.exists():  # damaged, or from another process

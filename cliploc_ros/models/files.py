@@ -92,14 +92,19 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
 
 
 def remove_unused(folder: Path, most: int) -> None:
-    """Remove the least recently used entries of a cache, and hidden files of killed writers."""
+    """Remove the least recently used entries of a cache, and hidden files of killed writers.
+
+    Entries have a digest in their names. Other files stay: cache_dir may be a folder of the user
+    with networks of his own.
+    """
     def modified(entry: Path) -> float:
         try:
             return entry.stat().st_mtime
         except OSError:  # another process has removed it
             return -1.0
 
-    entries = sorted(folder.iterdir(), key=modified, reverse=True)
+    ours = [entry for entry in folder.iterdir() if re.search('-[0-9a-f]{32}', entry.name)]
+    entries = sorted(ours, key=modified, reverse=True)
     unused = [entry for entry in entries if not entry.name.startswith('.')][most:]
     for entry in unused + [entry for entry in entries if entry.name.startswith('.')
                            and 0.0 <= modified(entry) < time.time() - _STALE_S]:

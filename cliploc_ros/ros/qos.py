@@ -151,7 +151,6 @@ class AdaptiveSubscription:
         self._callback(message)
 
 
-
 class Listener(ABC):
     """Stores messages while its subscription is open."""
 

@@ -27,7 +27,7 @@ from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.similarities import CropSimilarities
+from cliploc_ros.core.map.similarities import pair_similarities
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.ros import qos
@@ -257,10 +257,9 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
             similarities, row = seen.observation.similarities, \
                 seen.observation.similarity_rows[match.detection]
             if similarities is not None and row >= 0:
-                similarity = similarities.crops[row] @ similarities.labels.unique[
-                    similarities.labels.of_landmarks[match.landmark]] if isinstance(
-                        similarities, CropSimilarities) else similarities[row, match.landmark]
-                label = f'{label} CLIP {float(similarity):.2f}'
+                similarity, = pair_similarities(similarities, np.array([row]),
+                                                np.array([match.landmark]))
+                label = f'{label} CLIP {similarity:.2f}'
             _write_near(canvas, f'{label} IoU {match.iou:.2f}', boxes[match.detection], taken)
     if seen.layer is not None and found.recognized is not None:
         canvas = beside_keyframe(canvas, found.recognized, seen.layer)

@@ -197,8 +197,6 @@ def test_other_programs_do_not_cut_a_search_but_the_end_of_its_request_does():
     assert cut.reason.endswith('; raise timeout_s') and 'budget' not in cut.reason
 
 
-
-
 def see(classes) -> Observation:
     """Return a perfect view of the room by a detector with these classes."""
     return Observation(scenes.CAMERA, replace(scenes.SEEN, class_ids=tuple(classes)))

@@ -153,8 +153,6 @@ def test_not_wholly_in_front_has_no_outline(depth):
     assert np.isnan(project_ellipsoids(np.eye(4), np.array([[0.0, 0.0, depth]]), shapes)).all()
 
 
-
-
 def test_moving_a_covariance_by_a_lever(rng):
     """The covariance about the moved origin equals that of moved samples."""
     spread = np.diag([0.01, 0.02, 0.03, 0.001, 0.002, 0.003])

@@ -317,8 +317,6 @@ def test_a_constraint_tells_how_far_the_vertical_is_off():
     assert known.tilt_error(tilted(0.0), covariance) == pytest.approx(0.0)
 
 
-
-
 def test_rays_of_equal_features_meet_in_their_point():
     rng = np.random.default_rng(4)
     points = rng.uniform((-1, -1, 2), (1, 1, 4), (50, 3))

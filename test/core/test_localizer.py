@@ -317,8 +317,6 @@ def test_the_same_view_again_is_no_more_evidence(refine, room):
         np.testing.assert_allclose(often.cameras[-1].moves, once.cameras[0].moves, atol=0.1)
 
 
-
-
 @pytest.mark.parametrize('deviation_deg', [0.1, 0.5])
 def test_the_verticals_of_several_frames_count_as_one(deviation_deg, room, verified_camera):
     """The verticals come from one sensor on one mount, so their error does not average out."""

@@ -194,8 +194,6 @@ def test_a_malformed_array_is_refused(tmp_path, embeddings, name, value, message
         load_landmark_embeddings(path)
 
 
-
-
 def floor(name, seed=0):
     """Return a map with this name of twelve objects near the camera, placed by seed."""
     rng = np.random.default_rng(seed)

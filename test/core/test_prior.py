@@ -47,12 +47,13 @@ SURE, AHEAD = region(sigma_m=1e-6, probability=1.0), region(yaw=math.pi - 0.05, 
 
 
 @pytest.mark.parametrize(('known', 'pose', 'odds'), [
+    # the mixture: 85.73 m2 of the map times the density at 4 m, exp(-8 / 9.09) / (2 pi 9.09 m2)
+    (region(probability=0.5, sigma_m=3.0), looking(0.0, 4.0), math.log(0.5 + 0.5 * 0.6225)),
     (region(probability=0.5), looking(0.0, 9.0), math.log(0.5)),
     # never surer than its limits
     (SURE, looking(0.0), 0.0), (SURE, looking(0.0, 9.0), -TERMS.most),
     # a region that says nothing
-    (region(5.0, sigma_m=1e4), looking(0.0, 3.0), 0.0),
-    (region(probability=0.0), looking(0.0, 3.0), 0.0),
+    (region(5.0, sigma_m=1e4), looking(0.0), 0.0), (region(probability=0.0), looking(0.0, 3.0), 0),
     (region(frame_id='elsewhere'), looking(0.0, 3.0), 0.0),
     # the yaw counts across the seam, and a camera that looks up has none
     (AHEAD, looking(0.05 - math.pi), 0.0), (AHEAD, looking(0.0), -TERMS.most),

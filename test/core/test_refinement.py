@@ -99,10 +99,6 @@ def test_derivatives_are_those_of_differences(room, rng):
                                        atol=1e-4)
 
 
-
-
-
-
 UNSHARED, EXACT = np.zeros((len(ROOM), 2)), np.zeros(ERRORS)
 
 

@@ -228,15 +228,20 @@ def test_a_jump_in_place_or_in_heading_alone_speaks_against_the_new_pose(change)
     assert belief.has_jumped and belief.probability < 0.5
 
 
-def test_without_odometry_the_watch_learns_more_slowly(room):
-    chances = []
-    for odom in (True, False):
-        watch = Watch(Relocalizer(room, BY_CLASS))
-        wrong = moved(np.eye(4), 2.0, 0.5)
-        chances.append([report.probability for report in follow(watch, room, drive(12), wrong,
-                                                          odom=odom)])
-    assert chances[0][3] < chances[1][3]
-    assert chances[1][-1] < 0.05
+@pytest.mark.parametrize(('odom', 'seconds', 'odds', 'apart'), [
+    (np.eye(4), 9, 3.0, 0.0), (np.eye(4), 9, -3.0, 6.0 / TERMS.most),
+    (None, 5, 3.0, 5.0 / TERMS.correlated_s)])
+def test_looks_share_errors_unless_they_differ(odom, seconds, odds, apart):
+    """In what they say, or, without odometry, in their time: the robot may have been carried."""
+    belief, seen = Belief(), Observation(CAMERA, NOTHING, odom_from_camera=odom)
+    belief.add(seen, 3.0, is_full=True)
+    weight = belief.add(replace(seen, stamp_ns=seconds * NS_PER_S), odds, is_full=True)
+    assert weight == pytest.approx(1.0 - TERMS.correlated * np.exp(-apart))
+
+
+def test_a_wrong_pose_is_noticed_without_odometry(watch, room):
+    reports = follow(watch, room, drive(12), moved(np.eye(4), 2.0, 0.5), odom=False)
+    assert reports[-1].probability < 0.05
 
 
 def test_missing_landmarks_are_named(watch, room):

@@ -284,8 +284,6 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([CHECK, CHECK_DATA])
 
 
-
-
 def layer_at(*poses):
     return replace(make_layer(ROOM, len(poses), points=5), map_from_camera=np.array(poses))
 

@@ -33,8 +33,6 @@ _LEVER_M, _STEP_S = 0.3, 0.5
 ERRORS = PoseErrors(0.05, 1.5, 3.0)
 
 
-
-
 def mount_of(name):
     return rigid(degrees=RIG[name][1]) @ level(_LEVER_M)
 

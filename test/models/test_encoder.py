@@ -39,21 +39,23 @@ def rows_of(count: int, size: int = 16) -> np.ndarray:
     lambda file: np.savez(file, other=np.zeros(3)),
     lambda file: np.savez(file, identity=np.zeros(3, np.uint8), embeddings=rows_of(3))])
 def test_the_cache_finds_what_it_stored_and_nothing_else(tmp_path, damage, caplog):
-    cache = clip_encoder.LabelCache(tmp_path / 'deep' / 'labels')
+    """It keeps one file, and leaves the user's own files alone."""
+    own = tmp_path / 'deep' / 'labels' / 'image_7.txt'
+    cache = clip_encoder.LabelCache(own.parent, most_files=1)
     for _ in range(2):
+        cache.store(KEY, LABELS[:2], rows_of(2))
+        own.touch()
         cache.store(KEY, LABELS, rows_of(3))
         assert np.array_equal(cache.load(KEY, LABELS, 16), rows_of(3))
         for key, labels in (('ViT-B-32:gelu:0124', LABELS), (KEY, LABELS[:2]),
                             (KEY, LABELS[::-1]), (KEY, ['a red mug', 'tasse', "it's \0 odd"])):
             assert cache.load(key, labels, 16) is None
         assert not caplog.records
-        file, = (tmp_path / 'deep' / 'labels').iterdir()
+        file, _ = sorted(own.parent.iterdir(), reverse=True)  # and the user's own
         damage(file)
         assert cache.load(KEY, LABELS, 16) is None
         assert 'cannot be used' in caplog.text and str(file) in caplog.text
         caplog.clear()
-
-
 
 
 @pytest.fixture(scope='module')

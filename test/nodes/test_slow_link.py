@@ -55,7 +55,7 @@ def ask(camera, frame):
 
 @pytest.mark.needs('ip')
 @pytest.mark.skipif(not POSSIBLE, reason='network namespaces with taps need root and /dev/net/tun')
-def test_every_request_over_a_slow_link_is_answered_once(room_map):
+def test_every_request_over_a_slow_link_is_answered(room_map):
     here = PROJECT / 'test/nodes'
     parameters = [argument for name, value in (
         ('map_file', room_map), ('matching', 'class'), ('algorithm', 'bf'), ('timeout_s', 20.0),
@@ -76,7 +76,6 @@ def test_every_request_over_a_slow_link_is_answered_once(room_map):
     print(f'\n50 ms, 5 % loss, 10 Mbit/s: answers after '
           f'{[answer["seconds"] for answer in answers]} s; {lost} packets lost')
     assert lost > 0
-    assert len(answers) == REQUESTS
     for answer, x in zip(answers, 0.3 + 0.05 * np.arange(REQUESTS), strict=True):
         # a request without an image fails; no answer has a wrong pose
         assert answer['message'].startswith((f'accepted: x {x:.2f} y -0.20 z -0.50 m in map, ',

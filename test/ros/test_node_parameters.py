@@ -160,9 +160,8 @@ def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'matching': 'class', 'algorithm': 'b-prosac'}, "'b-prosac' needs "),
     *(({'class_map': text}, 'class_map') for text in ('tv', 'tv=', '=tv', 'a=b, a=c')),
-    ({'height_range_m': [2.0, 1.0]}, 'height_range_m'),
-    ({'gravity': 'base_frame'}, 'base_frame'),
-    ({'publish_tf': True}, 'publish_tf'),
+    ({'height_range_m': [2.0, 1.0]}, 'height_range_m'), ({'gravity': 'base_frame'}, 'base_frame'),
+    ({'publish_tf': True}, 'publish_tf'), ({'mount_deviation': [-1.0, 0.0]}, 'mount_deviation'),
     ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera')])
 def test_values_that_do_not_fit_together(changes, message):
     with pytest.raises(OptionsError, match=message):
