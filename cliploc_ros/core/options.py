@@ -113,8 +113,8 @@ class RelocalizerOptions:
             raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a higher '
                                'height')
         mounts = self.mount_deviation
-        if len(mounts) != 2 or not all(0.0 <= mount < math.inf for mount in mounts):
-            raise OptionsError(f'mount_deviation: {list(mounts)} must be two numbers, 0 or more')
+        if len(mounts) != 2 or not all(0.0 <= mount <= 1e3 for mount in mounts):
+            raise OptionsError(f'mount_deviation: {list(mounts)} must be two numbers, 0 to 1000')
 
     @property
     def needs_similarities(self) -> bool:

@@ -137,7 +137,7 @@ def read_case(path: Path) -> Case:
         _expect(isinstance(report.get('parameters', {}), dict), 'parameters')
         return Case((first, *others), report)
     except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError,
-            RecursionError, cv2.error, CliplocError) as error:
+            RuntimeError, cv2.error, CliplocError) as error:  # next() in a generator
         raise CASE.invalid(path, f'is damaged: {error!r}') from error
 
 
@@ -153,9 +153,9 @@ def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
                     for frame in frames if about['has_images'])
     run, rooms, cameras = about['run'], tuple(map(_count, about['rooms'])), about['cameras']
     _expect(bool(frames) and (not rooms or frames[-1].compared is not None), 'frames')
-    return Query(frames, decoded, None if run is None else _count(run), _count(about['limit']),
-                 float(_numbers(about['length_s'])), bool(about['by_keyframes']),
-                 bool(about.get('is_thorough')),
+    return Query(frames, decoded, None if run is None else _count(run),
+                 1 + _count(about['limit'] - 1), float(_numbers(about['length_s'])),
+                 bool(about['by_keyframes']), bool(about.get('is_thorough')),
                  None if cameras is None else CameraCheck.of_fields(cameras), rooms)
 
 

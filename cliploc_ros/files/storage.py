@@ -52,6 +52,8 @@ def open_file(path: str | os.PathLike[str]) -> BinaryIO:
             file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb')
             mode = os.fstat(file.fileno()).st_mode
             if stat.S_ISREG(mode):
+                # OSError: a stream of the kernel, such as /proc/kmsg, with nothing to read now
+                os.pread(file.fileno(), 1, 0)
                 return file
             file.close()
     except ValueError as error:  # a null byte, or invalid UTF-8
@@ -66,9 +68,7 @@ def read_file(path: str | os.PathLike[str], most_bytes: int = MOST_BYTES) -> byt
     with open_file(path) as file:
         # check the size first: that of a sparse file is not limited by the disk
         size = os.fstat(file.fileno()).st_size
-        content: bytes | None = file.read(most_bytes + 1) if size <= most_bytes else b''
-    if content is None:  # a stream of the kernel, such as /proc/kmsg, with nothing to read now
-        raise OSError(errno.EINVAL, 'not a regular file')
+        content = file.read(most_bytes + 1) if size <= most_bytes else b''
     if max(size, len(content)) > most_bytes:
         raise OSError(errno.EFBIG, f'larger than {most_bytes // 2**20} MiB')
     return content

@@ -69,7 +69,7 @@ def describe_export(folder: Path, key: str) -> None:
 def export_key(folder: Path) -> str:
     """Return the key of the weights in an export; '' for other folders and changed exports."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError,
-                             RecursionError):
+                             RecursionError, ModelError):
         about: dict[str, Any] = parse_json(read_file(folder / _ABOUT))
         if all(fingerprint_file(folder / name) == fingerprint
                for name, fingerprint in about['files'].items()):

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import BinaryIO
 
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import open_file, read_file, replace_file, resolve_cache_dir
@@ -36,17 +37,25 @@ def fingerprint_file(path: Path) -> str:
 
     It is the SHA-256 of the size and of 66 evenly spaced blocks of 64 KiB, including head and
     tail. Training changes all tensors, and thus the blocks. The hash misses an edit of a few bytes
-    between the blocks.
+    between the blocks. ModelError: the file cannot be read.
     """
-    size = path.stat().st_size
-    last = max(size - _BLOCK_BYTES, 0)
-    offsets = sorted({last * index // (_BLOCK_COUNT - 1) for index in range(_BLOCK_COUNT)})
-    digest = hashlib.sha256(str(size).encode())
-    with open_file(path) as file:
-        for offset in offsets:
+    with _opened(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        last = max(size - _BLOCK_BYTES, 0)
+        digest = hashlib.sha256(str(size).encode())
+        for offset in sorted({last * index // (_BLOCK_COUNT - 1)
+                              for index in range(_BLOCK_COUNT)}):
             file.seek(offset)
             digest.update(file.read(_BLOCK_BYTES))
     return digest.hexdigest()
+
+
+def _opened(path: Path) -> BinaryIO:
+    try:
+        return open_file(path)
+    except OSError as error:
+        raise ModelError(f'{path} cannot be read: {error.strerror}; check the path of the weights'
+                         ) from error
 
 
 def check_weights_file(path: Path) -> None:
@@ -54,12 +63,8 @@ def check_weights_file(path: Path) -> None:
 
     The loader checks the content.
     """
-    try:
-        with open_file(path) as file:
-            head = file.read(512)
-    except OSError as error:
-        raise ModelError(f'{path} cannot be read: {error.strerror}; check the path of the weights'
-                         ) from error
+    with _opened(path) as file:
+        head = file.read(512)
     if head.startswith(b'version https://git-lfs'):
         raise ModelError(f"{path} is a pointer of git-lfs, not the weights: run 'git lfs pull'")
     if path.suffix not in ('.onnx', '.safetensors') and not head.startswith(_HEADS):

@@ -215,13 +215,9 @@ def test_looks_from_one_view_count_once(rng):
 
 @pytest.mark.parametrize('mended', ['camera_info', 'detector'])
 def test_a_mended_camera_is_accepted_again(mended, rng):
-    localizer = Localizer(RELOCALIZER)
-    queries = [query(rng) for _ in range(LOOKS)]
-    if mended == 'camera_info':
-        wrong = wrong_sensors.scaled_focal(queries, 1.4)
-    else:
-        wrong = wrong_sensors.scaled_boxes(queries, 0.7)
-    localized(localizer, wrong)
+    localizer, queries = Localizer(RELOCALIZER), [query(rng) for _ in range(LOOKS)]
+    localized(localizer, wrong_sensors.scaled_focal(queries, 1.4) if mended == 'camera_info'
+              else wrong_sensors.scaled_boxes(queries, 0.7))
     assert localizer.cameras.faults
     found = localized(localizer, [query(rng) for _ in range(LOOKS)])
     assert localizer.cameras.faults == []
@@ -255,8 +251,7 @@ def test_the_check_hears_of_boxes_and_goes_on_with_slightly_other_intrinsics(rng
         boxes = drawn(rng, 8, (0.0, 0.0), high)
         check.see(Observation(camera, Detections(boxes, ('a',) * 8, np.full(8, 0.9))))
         return len(check.faults)
-    faults = [see(CAMERA, (300.0, 300.0)) for _ in range(8)]
-    assert faults[-1] == 1
+    assert [see(CAMERA, (300.0, 300.0)) for _ in range(8)][-1] == 1
     focused = replace(CAMERA, fx=1.005 * CAMERA.fx, fy=1.005 * CAMERA.fy)
     assert see(focused, (300.0, 300.0)) == 1
     assert see(replace(CAMERA, cx=CAMERA.cx + 20.0), (300.0, 300.0)) == 0, 'another camera'
@@ -332,6 +327,11 @@ def test_with_what_was_known_before_the_same_answer_comes_again(focal, rng):
     for record in older.values():
         record |= {some: record[some][:4] for some in ('views', 'since')}
     assert CameraCheck.of_fields(older).values == localizer.cameras.values
+    for part, rows, factor in ((0, 1, 1), (1, LOOKS, 0), (2, LOOKS, -1e9), (3, LOOKS, 1e9)):
+        older[''] = record | {'views': [*map(np.array, record['views'])]}
+        older['']['views'][part] = factor * older['']['views'][part][:rows]
+        with pytest.raises(ValueError, match=r'views|definite'):
+            CameraCheck.of_fields(older)
 
 
 NOTHING_FOUND = Relocalization(False, '5 detections are too few; turn the camera to more objects',

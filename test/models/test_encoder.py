@@ -169,9 +169,9 @@ def test_box(bbox, bounds):
 
 
 def test_fingerprint(tmp_path):
-    file = tmp_path / 'weights'
-    content = np.random.default_rng(0).bytes(20_000_000)
-    found = set()
+    file, found, content = tmp_path / 'weights', set(), np.random.default_rng(0).bytes(20_000_000)
+    with pytest.raises(CliplocError, match='weights cannot be read'):
+        fingerprint_file(file)
     # A retrained tensor is longer than the gap between two blocks.
     for offset in (0, len(content) // 2, len(content) - 1):
         file.write_bytes(content[:offset] + bytes(400_000) + content[offset + 400_000:])

@@ -78,8 +78,9 @@ _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
 _WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
 _UNVERIFIED = math.log(_TERMS.unverified / (1.0 - _TERMS.unverified))
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
-# The largest coordinate of a recorded box [px]. A file with a larger one is damaged.
-_FAR = 1e9
+# Limits of the numbers and of the mean errors of a recorded state. A file with larger ones is
+# damaged.
+_FAR, _LARGE = 1e12, 100.0
 
 
 class CameraLook(NamedTuple):
@@ -356,9 +357,14 @@ class _Record:
                 # earlier releases did not weigh looks
                 [*parts, [1.0] * len(parts[1])][:len(Views())], Views(), strict=True))
             for parts in (fields['views'], fields['since']))
-        if not (np.abs(record.extent.boxes) < _FAR).all() or not all(
-                np.isfinite(part).all() for part in (*record.views, *record.since)):
-            raise ValueError(f'values must be finite, and box coordinates below {_FAR:g} px')
+        for views in (record.views, record.since):
+            # LinAlgError, a ValueError: it is no information matrix, up to rounding
+            np.linalg.cholesky(views.informations + 0.01 * np.diag(_WRONG ** -2.0))
+            if len({*map(len, views)}) > 1 or len(views.poses) > _TERMS.most_views or not all(
+                    (np.abs(part) < _FAR).all() for part in (*views, record.extent.boxes)) or (
+                    np.minimum(views.counts, views.careful) <= 0.0).any() or (
+                    np.abs(views.odds().means) >= _LARGE).any():
+                raise ValueError('views have different lengths, invalid numbers, or are too many')
         record.by_extent = record.extent.log_odds(record.camera)
         record.odds = record.views.odds(record.by_extent)
         record.by_looks = record.views.odds()

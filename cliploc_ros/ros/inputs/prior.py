@@ -183,7 +183,7 @@ def planar_of(msg: PoseWithCovarianceStamped
     covariance = np.reshape(msg.pose.covariance, (6, 6))[np.ix_(_PLANAR, _PLANAR)]
     if pose is None:
         raise OptionsError('the pose has NaN or a quaternion that is not of unit length')
-    covariance = 0.5 * (covariance + covariance.T)
+    covariance = 0.5 * covariance + 0.5 * covariance.T  # a sum could overflow
     covariance[2, :2] = covariance[:2, 2] = 0.0
     check_planar(covariance)
     return pose, covariance
