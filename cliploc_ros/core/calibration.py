@@ -32,4 +32,5 @@ Calibration = Named[Named[float]]
 #: The installed numbers.
 CALIBRATION: Calibration = Named({
     name: Named({term: entry['value'] for term, entry in section['terms'].items()})
-    for name, section in yaml.safe_load(FILE.read_text()).items()})
+    for name, section in yaml.load(
+        FILE.read_text(), getattr(yaml, 'CSafeLoader', yaml.SafeLoader)).items()})

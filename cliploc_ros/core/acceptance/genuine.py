@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import odometry_deviations
@@ -28,7 +28,7 @@ from cliploc_ros.core.keyframes.point_pose import find_pose
 
 _TERMS = CALIBRATION.genuine
 #: Largest plausible squared Mahalanobis distance between right poses and odometry (dof 6).
-SURE_MOTION = float(chi2.ppf(_TERMS.sure_motion, 6))
+SURE_MOTION = float(chdtri(6, 1.0 - _TERMS.sure_motion))
 
 
 class Motion(NamedTuple):

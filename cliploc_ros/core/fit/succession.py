@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import moved_pose
@@ -27,7 +27,7 @@ _DRIFT = CALIBRATION.covariance.odometry_drift
 # The following are not in calibration.yaml, because the input of a filter affects no decision
 # about a pose.
 # Answers further apart than this quantile contradict each other.
-_CONTRADICTION = float(chi2.ppf(0.99, 6))
+_CONTRADICTION = float(chdtri(6, 0.01))
 # The share of its information that an answer keeps in directions without new information, because
 # a covariance must be finite.
 _LEAST_SHARE = 1e-4

@@ -40,7 +40,6 @@ from cliploc_ros.offline.studio.edits import KNOWN_FIELDS, Landmark, Landmarks, 
 _PARAMETERS = 'ros__parameters'
 _GEOMETRY = ('center', 'semi_axes', 'orientation')
 _PLAIN = {*KNOWN_FIELDS, 'text', 'weight', '/**', _PARAMETERS, 'map', 'frame_id', 'landmarks'}
-_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
@@ -196,7 +195,7 @@ def patched(text: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     LookupError, ValueError or YAMLError: it is not the text of the tree `old`.
     """
     pieces, done = [], 0
-    patches = _patches(text, yaml.compose(text, Loader=_LOADER), old, new)
+    patches = _patches(text, yaml.compose(text, Loader=parameter_file.LOADER), old, new)
     for start, end, piece in sorted(patches, key=lambda patch: patch[:2]):
         pieces += [text[done:start], piece]
         done = end

@@ -16,7 +16,7 @@ import trimesh.creation
 import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from cliploc_ros.core.geometry.camera import Camera, frusta
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
@@ -44,7 +44,7 @@ _CURRENT_RGB, _OLD_RGB = (30, 170, 60), (150, 150, 150)
 _FOV_RAD, _ASPECT = 0.85, 4.0 / 3.0
 _ROBOT_M = 0.25
 # Radius of the 95 % ellipsoid for a standard deviation of 1 m [m]; limits of its semi-axes [m].
-_RADIUS_95 = float(np.sqrt(chi2.ppf(0.95, 3)))
+_RADIUS_95 = float(np.sqrt(chdtri(3, 0.05)))
 _LEAST_M, _GREATEST_M = 1e-3, 100.0
 
 #: Draws something into a scene, and returns the handles of the nodes.
