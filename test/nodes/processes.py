@@ -18,10 +18,9 @@ import pytest
 PROJECT = Path(__file__).resolve().parents[2]
 # Time limit of a wait. Only a failing test takes this long.
 PATIENCE_S = 60.0
-# These imports take most of the start-up time: two seconds, nine with PyTorch.
-_IMPORTS = ['torch', 'torchvision', 'open_clip', 'cliploc_ros.cli.replay',
-            'cliploc_ros.nodes.detector', 'cliploc_ros.nodes.relocalizer',
-            'cliploc_ros.ros.clients']
+# These imports take most of the start-up time.
+_IMPORTS = ['cliploc_ros.cli.replay', 'cliploc_ros.nodes.detector',
+            'cliploc_ros.nodes.relocalizer', 'cliploc_ros.ros.clients']
 
 
 @cache
@@ -31,7 +30,6 @@ def _forked():
     context.set_forkserver_preload(_IMPORTS)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(PROJECT)  # so that it imports the source tree
-        patch.setenv('OMP_WAIT_POLICY', 'PASSIVE')  # as run_node does; PyTorch reads it on import
         forkserver.ensure_running()
     return context
 

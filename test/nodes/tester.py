@@ -176,9 +176,11 @@ class Tester(Node):
         """Send a request, publish a frame until the answer arrives, and return the answer."""
         future = self.ask()
         self.feed_until(future.done, frame)
-        # else the frame may still arrive during the next request, and answer it
-        for publisher in (self.images, self.infos, self.detections):
-            publisher.wait_for_all_acked(Duration(seconds=1))
+        # else the frame may still arrive during the next request, and answer it; small messages
+        # arrive at once, but are acknowledged up to three seconds later
+        for publisher, patience_s in ((self.images, 1.0), (self.infos, 0.1),
+                                      (self.detections, 0.1)):
+            publisher.wait_for_all_acked(Duration(seconds=patience_s))
         return future.result()
 
 

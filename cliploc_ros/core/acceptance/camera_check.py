@@ -75,7 +75,9 @@ _UNKNOWN_INFO = 1 + list(_KINDS).index('stretched image')
 _DEVIATIONS = np.array([_RIGHT, *(np.where(np.isin(np.arange(ERRORS), errors), _WRONG, _RIGHT)
                                   for errors in _KINDS.values())])
 _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
-_WEIGHTS = np.array([1.0 - _TERMS.wrong, *[_TERMS.wrong / len(_KINDS)] * len(_KINDS)])
+_WEIGHTS = np.array([1.0 - _TERMS.wrong, *(_TERMS.wrong * (
+    _TERMS.focal_share if kind == 'focal length' else
+    (1.0 - _TERMS.focal_share) / (len(_KINDS) - 1)) for kind in _KINDS)])
 _UNVERIFIED = math.log(_TERMS.unverified / (1.0 - _TERMS.unverified))
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
 # Limits of the numbers and of the mean errors of a recorded state. A file with larger ones is
@@ -440,7 +442,7 @@ class CameraCheck:
         """Return the effect of camera errors on a pose, without adding its looks.
 
         The effect is the factor and the covariance (6, 6) with the errors of its cameras, see
-        CameraOdds.effect, and a description of what is certainly wrong with a camera, empty if
+        CameraOdds.effect, and a description of what is very likely wrong with a camera, empty if
         nothing is. The given covariance is that of the pose if its cameras are right.
         """
         share, wider, fault = 1.0, covariance, ''
@@ -453,7 +455,7 @@ class CameraCheck:
             near, added = views.careful_odds(extent).effect(covariance, moves)
             share = min(share, near, odds.effect(covariance, moves)[0])
             wider = wider + added
-            if record is not None and odds.is_wrong:
+            if record is not None and odds.log_odds > _TERMS.doubted:
                 fault = record.in_words(odds)
         return share, wider, fault or '; '.join(self.faults)
 
