@@ -7,6 +7,7 @@ COLMAP's models are written by pycolmap itself.
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +34,13 @@ class Shot(NamedTuple):
     stamp_ns: int
     pose: np.ndarray
     camera: Camera
+
+
+def once_for_each(function):
+    """Return a function of an image (h, w, 3) that computes the result of equal pixels once."""
+    found = cache(lambda data, shape, *options: function(
+        np.frombuffer(data, np.uint8).reshape(shape), *options))
+    return lambda image, *options: found(image.tobytes(), image.shape, *options)
 
 
 def shots_of(folder=WALK):

@@ -3,20 +3,13 @@
 """Many folders have the same images: their features are extracted once."""
 
 import pytest
+from capture_folders import once_for_each
 
 from cliploc_ros.offline.datasets import agreement
 
 
 @pytest.fixture(autouse=True, scope='session')
 def extracted_once():
-    extract, seen = agreement.extract, {}
-
-    def once(image, *options):
-        key = image.tobytes(), image.shape, *options
-        if key not in seen:
-            seen[key] = extract(image, *options)
-        return seen[key]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(agreement, 'extract', once)
+        patch.setattr(agreement, 'extract', once_for_each(agreement.extract))
         yield
-    print(len(seen))

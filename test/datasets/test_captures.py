@@ -45,14 +45,8 @@ OPTIONS = MappingOptions(min_baseline_deg=5.0, estimate_pose_errors=False)
 @pytest.fixture(scope='session')
 def look():
     """Return the demo's detector, which runs once on equal pixels."""
-    network, seen = load_detector(DetectorOptions(model=str(captures.ASSETS / 'yolo.onnx'))), {}
-
-    def once(image):
-        key = image.tobytes()
-        if key not in seen:
-            seen[key] = network.detect(image)
-        return seen[key]
-    return RunNetworks(once)
+    network = load_detector(DetectorOptions(model=str(captures.ASSETS / 'yolo.onnx')))
+    return RunNetworks(captures.once_for_each(network.detect))
 
 
 @pytest.fixture(scope='session')
@@ -337,6 +331,7 @@ def test_false_counts_cost_nothing(few, tmp_path):
 
 @pytest.mark.parametrize(('edit', 'expected'), [
     (lambda v: v.update(fl_y=0), 'fy=0 .* focal lengths must be positive'),
+    (lambda v: v.update(fl_y=1e-158), 'all values plausible pixels'),
     (lambda v: v.update(depth_unit_scale_factor=-1), 'unit of depth is -1'),
     (lambda v: v.update(applied_scale=1e-300), 'm from the origin'),
     (lambda v: v.pop('frames'), 'lists no frames'),

@@ -57,7 +57,7 @@ def test_a_relocalizer_that_hears_everything_nothing_and_half(own_relocalizer, t
 
 def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
     detector = start('nodes.detector', parameters={
-        'model': PROJECT / 'demo/assets/yolo.onnx', 'stale_after_s': 1.0})
+        'model': PROJECT / 'demo/assets/yolo.onnx', 'stale_after_s': 0.5})
     detector.wait_for_output('ready after')
     values = status.wait(OK, 'active')
     assert values['listened to'] == 'False'

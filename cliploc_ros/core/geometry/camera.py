@@ -56,10 +56,11 @@ class Camera:
         if not (0 < self.width < np.inf and 0 < self.height < np.inf):
             raise CameraError(f'image size {self.width}x{self.height} is not positive and finite')
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
-        if not np.all(np.isfinite(intrinsics)) or self.fx <= 0.0 or self.fy <= 0.0:
+        # squares of normalized points must not overflow
+        if not (min(self.fx, self.fy) > 1e-6 and np.all(np.abs(intrinsics) < 1e9)):
             raise CameraError(
                 f'fx={self.fx:g} fy={self.fy:g} cx={self.cx:g} cy={self.cy:g}: focal lengths must '
-                'be positive and all values finite (is the camera calibrated?)')
+                'be positive, and all values plausible pixels (is the camera calibrated?)')
         if not np.all(np.isfinite(self.distortion)):
             raise CameraError(f'distortion {self.distortion} has values that are not finite')
         model, counts = self.distortion_model, _COEFFICIENT_COUNTS.get(self.distortion_model)
