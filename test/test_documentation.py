@@ -162,7 +162,8 @@ CONSTANTS = [
     ('trust.md', r'reaches `min_confidence` \(([.\d]+)\)', [RelocalizerOptions.min_confidence]),
     ('trust.md', r'give it a confidence of ([.\d]+) on average',
      [CALIBRATION.looks.mean_confidence]),
-    ('trust.md', r'At odds of (\d+) to 1', [round(math.exp(CALIBRATION.camera.sure), -2)]),
+    ('trust.md', r'At odds of (\d+) to 1, .*; at (\d+) to 1',
+     [float(f'{math.exp(CALIBRATION.camera[name]):.1g}') for name in ('doubted', 'sure')]),
     ('trust.md', r'probability is below ([.\d]+) and two or three', [CALIBRATION.watch.lost]),
     ('trust.md', r'`position_sigma` \(([.\d]+) m without it\)', [DEFAULT_SIGMA_M]),
     ('trust.md', r'Poses within (\d+) m and (\d+) degrees count',
@@ -176,7 +177,8 @@ CONSTANTS = [
     ('interface.md', r'The last images \(at most (\d+)\) .* confidence of ([.\d]+) on average',
      [CALIBRATION.looks.most, CALIBRATION.looks.mean_confidence]),
     ('interface.md', r'off by more than (\d+) %', [100 * (CALIBRATION.depth.most_ratio - 1)]),
-    ('interface.md', r'\((6\.9) refuses\)', [CALIBRATION.camera.sure])]
+    ('interface.md', r'\((4\.6) refuses poses by objects, (6\.9) reports', [
+        CALIBRATION.camera.doubted, CALIBRATION.camera.sure])]
 
 
 @pytest.mark.parametrize(('page', 'pattern', 'values'), CONSTANTS,

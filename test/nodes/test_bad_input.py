@@ -85,8 +85,7 @@ def test_a_request_without_fresh_frames(relocalizer, tester, topics, reason):
     assert tester.set_parameter('timeout_s', 1.0).successful
     answer = tester.relocalize([messages[topic] for topic in topics])
     assert tester.set_parameter('timeout_s', 10.0).successful
-    assert not answer.success
-    assert 'no new frame' in answer.message and reason in answer.message
+    assert not answer.success and 'no new frame' in answer.message and reason in answer.message
     assert tester.relocalize(make_frame(stamp_s=6.0)).success
 
 
@@ -107,8 +106,7 @@ def test_stamps_that_name_no_image_pair_nothing(relocalizer, tester):
     wait_for(future.done, 'an answer', work=work)
     assert tester.set_parameter('timeout_s', 10.0).successful
     answer = future.result()
-    assert not answer.success
-    assert 'for several of them' in answer.message and 'must copy' in answer.message
+    assert not answer.success and 'for several of them' in answer.message and 'must copy' in answer.message
     assert not tester.poses and not tester.initial_poses
     image, info, boxes = make_frame(stamp_s=2000.0)
     info.header = Header(frame_id=image.header.frame_id)
