@@ -128,7 +128,7 @@ def outcomes(tmp_path_factory):
                     cv2.resize(coarse, (640, 480)))
     done = subprocess.run(
         [sys.executable, '-m', 'studies.rooms', folder / 'demo', folder / 'elsewhere', '--model',
-         ASSETS / 'yolo.onnx', '--kinds', 'in turn', 'phone to robot', '--images', '3',
+         ASSETS / 'yolo.onnx', '--kinds', 'in turn', '--images', '3',
          '--elsewhere', '2', '--out', folder / 'out'], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads((folder / 'out/outcomes.json').read_text())
@@ -138,17 +138,14 @@ def test_images_between_the_mapped_ones_are_found(outcomes):
     for way, least in (('objects', 0.4), ('both', 0.75)):  # half of the images are mapped
         errors = [outcome['error_m'] for outcome in outcomes
                   if outcome['way'] == way and outcome['known'] == '-'
-                  and outcome['kind'] == 'in turn' and outcome['asked'] == 'demo']
+                  and outcome['asked'] == 'demo']
         assert len(errors) == 6
         assert np.mean(np.array(errors) < 0.25) >= least
-    robot = [outcome['error_m'] for outcome in outcomes
-             if outcome['kind'] == 'phone to robot' and outcome['way'] == 'both']
-    assert np.mean(np.array(robot) < 0.5) > 0.5
 
 
 def test_nothing_is_accepted_elsewhere(outcomes):
     elsewhere = [outcome for outcome in outcomes if outcome['asked'] == 'elsewhere']
-    assert len(elsewhere) == 4 * 2 * 3  # parts, images, ways
+    assert len(elsewhere) == 2 * 2 * 3  # parts, images, ways
     assert not any(outcome['accepted'] for outcome in elsewhere)
 
 
