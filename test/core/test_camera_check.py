@@ -167,9 +167,14 @@ def test_poor_fits_name_a_wrong_camera_and_do_not_verify_a_right_one():
     assert poor < 0.8 * good and wrong[0] == wrong[1] < good
 
 
-def test_a_wrong_camera_is_mended_by_views_of_several_places(rng):
-    check = CameraCheck()
+def test_a_doubted_camera_gives_no_pose_and_a_wrong_one_is_mended_by_several_places(rng):
+    check, doubts = CameraCheck(), []
     check.see(query(rng).observation)
+    for number in range(12):
+        look = look_at((number, 0, 0), 0.12, size=300.0)
+        doubts.append(check.judge([look], np.eye(6))[2])
+        check.add([look])
+    assert not any(doubts[:8]) and doubts[-1] and not check.faults
     check.add([look_at((number, 0, 0), 0.2) for number in range(6)])
     check.add([look_at((0, 1, 0.1 * number), 0.0) for number in range(4)])
     assert check.faults, 'poses at one place may fit by chance'

@@ -221,8 +221,6 @@ def test_the_form_of_the_shipped_sources():
     for download in (*sources.networks, *sources.recordings.values()):
         assert download.url.startswith('https://')
         assert re.fullmatch('([0-9a-f]{64})?', download.sha256)
-    for name in ('fr2', 'fr3'):
-        assert (*sources.recordings[name].paper,) == PAPER_METHODS
     networks = [*sources.options, *(word for network in sources.networks
                                     for word in (network.option, network.file))]
     build_map.make_parser().parse_args(
