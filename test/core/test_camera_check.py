@@ -259,6 +259,9 @@ def test_the_check_hears_of_boxes_and_goes_on_with_slightly_other_intrinsics(rng
     assert [see(CAMERA, (300.0, 300.0)) for _ in range(8)][-1] == 1
     focused = replace(CAMERA, fx=1.005 * CAMERA.fx, fy=1.005 * CAMERA.fy)
     assert see(focused, (300.0, 300.0)) == 1
+    for focal in (0.2, 0.0):
+        check.add([look_at((number, number // 3, number % 3), focal) for number in range(9)])
+    assert see(focused, (300.0, 300.0)) == 1, 'boxes still end at a line: it is not mended'
     assert see(replace(CAMERA, cx=CAMERA.cx + 20.0), (300.0, 300.0)) == 0, 'another camera'
 
 
@@ -301,6 +304,17 @@ def test_the_error_of_a_wrong_camera_is_named(error, size, said, rng):
     (fault,) = check.faults
     assert said in fault
     assert check.judge([], np.eye(6))[2] == fault, 'whatever the next pose depends on'
+
+
+def test_edges_at_the_border_of_the_image_do_not_count(rng):
+    seen = query(rng).observation
+    inside = ((seen.detections.bboxes_xyxy > 3.0)
+              & (seen.detections.bboxes_xyxy < [*SIZE - 3.0, *SIZE - 3.0])).all(axis=1)
+    seen = replace(seen, detections=seen.detections.select(np.nonzero(inside)[0]))
+    looks = [localized(Localizer(RELOCALIZER), [PosedQuery(0, replace(
+        seen, camera=replace(CAMERA, width=width, height=height)), np.eye(4))])[0].cameras[0]
+        for width, height in ((640, 480), (2000, 2000))]
+    np.testing.assert_allclose(looks[0].information, looks[1].information, rtol=1e-6)
 
 
 def test_each_camera_of_a_rig_may_be_wrong(rng):

@@ -17,6 +17,7 @@ from cliploc_ros.core.acceptance.depth_check import DepthCheck
 from cliploc_ros.core.acceptance.links import weakest_link
 from cliploc_ros.core.acceptance.looks import Look, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence
+from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import odometry_deviations
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import pose_error
@@ -424,6 +425,9 @@ def test_any_link_may_be_broken_and_keyframes_and_inexact_odometry_hold_it(room,
     assert old.holds == pytest.approx(new.holds)
     assert link_of(room, walk, 'gggn', (0, 1, 2, 30)).holds < last.holds, 'time for a carry'
     assert link_of(room, walk, 'bbgg').holds < link_of(room, walk, 'bggg').holds
+    none, lost = (np.log(chance / (1.0 - chance)) for chance in (
+        link_of(room, walk, shown, (0, 1, 21, 22)).holds for shown in ('nngg', 'bbgg')))
+    assert lost - none == pytest.approx(3 * CALIBRATION.objects.unexplained)
     elsewhere, here = (link_of(room, walk, 'gggn', met=(5.0, where)).holds
                        for where in ('elsewhere', 'here'))
     assert elsewhere < last.holds < here

@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from cliploc_ros.core.acceptance.confidence import (
     Setting,
     Support,
+    _of_group,
     confidences,
     none_right,
     objects_utility,
@@ -392,6 +393,10 @@ def test_four_things_of_one_desk_are_less_evidence_than_things_of_the_room(rng):
     groups = [ask(scenes.see_room(replace(desk, centers=desk.centers + shift), camera))[0]
               for shift in shifts]
     assert min(groups) >= terms.unmapped and np.sum(np.array(groups) > 1.0) >= 3
+    # soft inliers between four and five
+    assert [_of_group(np.zeros((4, 3)), inliers, terms.fits * inliers + more)
+            for inliers, more in ((4.0, -1.0), (4.5, 0.0), (4.0, 1.0))] == pytest.approx(
+                [terms.unmapped, terms.unmapped / 2.0, terms.unmapped + terms.misfit])
     most = CALIBRATION.keyframes.most_objects
     assert objects_utility(Support(99.0)) == objects_utility(Support(most))
 
