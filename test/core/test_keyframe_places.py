@@ -45,8 +45,7 @@ def rewrite(path, header=None, **changes):
 def test_a_layer_comes_back_as_it_was(file):
     assert file.name == 'room.keyframes.npz'
     before, after = make_layer(ROOM), load_layer_of_map(file, ROOM)
-    assert after.cameras == before.cameras
-    assert after.landmark_ids == before.landmark_ids
+    assert after.cameras == before.cameras and after.landmark_ids == before.landmark_ids
     for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words',
                  'vocabulary'):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name

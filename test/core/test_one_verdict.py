@@ -102,14 +102,12 @@ def test_the_fewer_cells_match_the_farther_away_a_keyframe_must_be(apart, accept
     (0.0, RefusalKind.CHANGED), (0.9, None), (1.5, None)])
 def test_a_part_of_an_image_next_to_a_keyframe_may_be_a_picture(apart, kind):
     found = ask(Says(place(3.0, confirmed=0.5, reach=0.5, apart=apart)), objects=0)
-    assert found.refusal_kind == kind
-    assert found.evidence.signs.apart == min(apart, 1.0)
+    assert found.refusal_kind == kind and found.evidence.signs.apart == min(apart, 1.0)
 
 
 def test_the_pose_of_many_points_stays_as_it_is_and_a_few_are_fused():
     strong, weak = ask(Says(place(0.05))), ask(Says(place(0.05, inliers=9)))
-    assert strong.accepted and weak.accepted
-    assert strong.source == weak.source == 'both'
+    assert strong.accepted and weak.accepted and strong.source == weak.source == 'both'
     assert error_m(strong, 0.05) < 1e-12
     assert error_m(weak) < 0.02, 'a few points hardly change the pose from objects'
     assert [len(seen.cameras) for seen in (strong, weak)] == [0, 1], \
@@ -232,8 +230,7 @@ def test_the_twin_of_a_place_without_keyframes_stays_a_rival(lacking):
         return float(pose[0, 3] < 10.0)
 
     found = ask(Says(place(), covers=covers), room=two_rooms(lacking))
-    assert not found.accepted
-    assert found.refusal_kind == RefusalKind.LOOK_ALIKE
+    assert not found.accepted and found.refusal_kind == RefusalKind.LOOK_ALIKE
 
 
 @pytest.mark.parametrize(('covered', 'objects', 'is_sure'), [
@@ -344,8 +341,7 @@ def test_where_a_picture_moves_like_the_room_nothing_is_claimed(seen_points, mot
     first = look(points, bearings, rng)
     for second in (seen_from(points, pose @ motion), on_picture(bearings, motion, 2.0)):
         found = compare_motion(FROM_DEPTH, first, look(points, second, rng), motion)
-        assert found.picture < chi2.isf(0.05, 6)
-        assert found.square < SURE
+        assert found.picture < chi2.isf(0.05, 6) and found.square < SURE
 
 
 def test_a_picture_that_the_camera_passes_is_not_seen_again(seen_points):
@@ -354,8 +350,7 @@ def test_a_picture_that_the_camera_passes_is_not_seen_again(seen_points):
     first = look(points, seen_from(points, pose), rng)
     found = compare_motion(FROM_DEPTH, first, first._replace(map_from_camera=pose @ motion),
                            motion)
-    assert found.picture == np.inf
-    assert found.square < SURE
+    assert found.picture == np.inf and found.square < SURE
 
 
 def test_what_looks_at_the_same_keyframes_share_does_not_count(seen_points):
@@ -368,8 +363,7 @@ def test_what_looks_at_the_same_keyframes_share_does_not_count(seen_points):
     same, other = (compare_motion(FROM_DEPTH, first,
                                   look(points, moved, rng, keyframe, wrong), motion)
                    for keyframe in (0, 1))
-    assert other.square < SURE < same.square
-    assert other.picture < 0.7 * same.picture
+    assert other.square < SURE < same.square and other.picture < 0.7 * same.picture
     first = look(points, bearings, rng, wrong=wrong)
     both = compare_motion(FROM_DEPTH, first, look(points, moved, rng, wrong=wrong), motion)
     assert both.square < SURE

@@ -114,8 +114,7 @@ def test_no_prior_gives_more_than_the_objects_give_without_rivals(contenders):
     poses = np.array([level(5.0 * row) for row in range(len(odds))])
     told = confidences(odds, poses, 2.0, prior=prior)
     alone = [confidences(odds[[row]], poses[[row]], 2.0)[0] for row in range(len(odds))]
-    assert (told <= np.array(alone) + 1e-9).all()
-    assert told.sum() <= 1.0 + 1e-9
+    assert (told <= np.array(alone) + 1e-9).all() and told.sum() <= 1.0 + 1e-9
 
 
 UP_IN_CAMERA = MAP_FROM_CAMERA[2, :3]

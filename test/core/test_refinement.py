@@ -75,8 +75,7 @@ def test_a_perfect_view_leads_to_the_truth_and_a_noisy_one_near_it(room, rng):
 def test_nothing_to_go_by_changes_nothing(room):
     away = np.diag([-1.0, 1.0, -1.0])
     found = refine(scene_of(room), away, np.zeros(3), VERTICAL_UNKNOWN)
-    assert found.score == 0.0
-    assert not found.information.any()
+    assert found.score == 0.0 and not found.information.any()
     np.testing.assert_array_equal(found.rotation, away)
     np.testing.assert_array_equal(found.translation, np.zeros(3))
 
@@ -168,8 +167,7 @@ def test_errors_are_covered_where_they_are_stated(what, frames):
             rng=np.random.default_rng(seed)), poses[-1]) for known in (stated, unknown)])
     within = (np.array(squares) < chi2.ppf(0.95, 6)).mean(axis=0)
     print(f'\n{what}, {frames} frames: {within} in the 95 % ellipsoids, stated and not')
-    assert within[0] >= 0.87
-    assert within[1] <= most
+    assert within[0] >= 0.87 and within[1] <= most
 
 
 def test_the_covariance_holds_the_chance_that_an_object_is_wrong():

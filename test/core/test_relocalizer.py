@@ -55,8 +55,7 @@ def test_three_boxes_give_a_pose_that_is_refused_and_fewer_none(rows, options, r
     result = Relocalizer(room, RelocalizerOptions(**options)).relocalize([replace(
         observation, detections=observation.detections.select(rows),
         similarities=observation.similarities[rows])])
-    assert not result.accepted
-    assert result.solved == (len(rows) == 3)
+    assert not result.accepted and result.solved == (len(rows) == 3)
     assert result.solved or f'{len(rows)} detections' in result.reason
 
 

@@ -272,6 +272,5 @@ def test_the_exhaustive_optimum_is_found_in_every_query(golden_scenes):
     for scene, _, _, values in golden_scenes:
         leaders = strategies.Leaders.none_yet()
         *_, last = strategies.search_exhaustively(scene, leaders)
-        assert last.tried > 0
-        assert last.coverage == 1.0
+        assert last.tried > 0 and last.coverage == 1.0
         assert leaders.scores.max() == pytest.approx(float(values['bestS']), abs=1e-3)

@@ -147,8 +147,7 @@ def test_the_true_pose_of_a_mirrored_image_is_a_rival(office_map, queries, algor
         assert found.accepted, found.reason
         assert found.evidence.not_mirrored > 0.95
         wrong = relocalizer.relocalize([mirrored(observation)])
-        assert wrong.evidence.likely > 0.9
-        assert wrong.evidence.not_mirrored < 0.4
+        assert wrong.evidence.likely > 0.9 and wrong.evidence.not_mirrored < 0.4
 
 
 def test_each_number_states_its_unit_and_meaning_and_the_command_that_fits_it():

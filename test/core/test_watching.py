@@ -144,8 +144,7 @@ def test_a_localizer_that_drifts_is_right(watch, room):
     for number, pose in enumerate(drive(30)):
         x, y = rng.uniform(-0.2, 0.2, 2)
         report = watch.look(see(room, pose, number, rng=rng), moved(pose, x, y, rng.normal()))
-        assert report.state != WatchState.LOST
-        assert report.matched >= report.expected
+        assert report.state != WatchState.LOST and report.matched >= report.expected
     assert report.state == WatchState.LOCALIZED
     assert report.probability > 0.99
     assert report.matched
@@ -172,8 +171,7 @@ def test_a_robot_that_is_carried_away_is_noticed(watch, room):
     for number, (there, here) in enumerate(zip(drive(30)[20:], poses[10:], strict=True), 10):
         seen = replace(see(room, moved(there, -0.7, 1.2, 80.0), number), odom_from_camera=here)
         report = watch.look(seen, here)
-    assert report.state == WatchState.LOST
-    assert report.probability < 0.05
+    assert report.state == WatchState.LOST and report.probability < 0.05
 
 
 def test_minutes_without_objects_end_in_uncertain(watch, room):
@@ -193,8 +191,7 @@ def test_a_place_that_the_map_does_not_show_is_uncertain(watch, room):
     follow(watch, room, near, first=10, rows=[])
     states = {watch.look(see(annex, pose, 40 + number), pose).state
               for number, pose in enumerate(way)}
-    assert WatchState.LOST not in states
-    assert WatchState.UNCERTAIN in states
+    assert WatchState.LOST not in states and WatchState.UNCERTAIN in states
 
 
 NOTHING = Detections(np.empty((0, 4)), (), np.empty(0))
@@ -253,8 +250,7 @@ def test_missing_landmarks_are_named(watch, room):
     expected = {row for pose in drive(18)
                 for row in expect(room, CAMERA, pose, np.arange(COUNT)).landmarks}
     named = {room.landmark_ids.index(landmark) for landmark in reports[-1].missing}
-    assert named
-    assert named <= set(gone)
+    assert named and named <= set(gone)
     assert named >= set(gone) & expected - {25} or len(named) >= 2
 
 
