@@ -103,6 +103,9 @@ def test_a_right_camera_is_verified(focal, noise_px, rng):
         assert localizer.cameras.faults == []
     # evidence on the camera from earlier looks makes a pose more certain
     assert found.evidence.camera > 0.99
+    strict = Localizer(Relocalizer(ROOM, replace(RELOCALIZER.options, min_confidence=0.9999)))
+    found, = localized(strict, queries[:1])
+    assert found.cameras and not found.accepted, 'a likely pose is evidence about the camera'
 
 
 WRONG = {

@@ -304,8 +304,7 @@ def test_places_without_a_keyframe_are_counted_and_named():
     assert full.reached_positions == 1.0 and not len(full.without)
     assert (full.headings == grid.headings).all()
     nowhere = check_keyframes(layer_at(level(500.0)), grid, np.array([level(), level(500.0)]))
-    assert nowhere.reached_positions == 0.0
-    assert nowhere.recorded.tolist() == [False, True]
+    assert nowhere.reached_positions == 0.0 and nowhere.recorded.tolist() == [False, True]
     assert len(nowhere.without) == len(grid.positions)
     text = 'no keyframe is'
     assert any(text in hint.text for hint in give_advice(replace(room_report, keyframes=nowhere)))
@@ -388,8 +387,7 @@ def test_a_map_whose_objects_carry_nothing_is_keyframes_only(office_report):
     for measures, verdict in (((met,), 'passed'), ((met, missed), 'keyframes only'),
                               ((met._replace(value=0.8), missed), 'failed')):
         told = replace(office_report, measures=measures)
-        assert told.verdict == verdict
-        assert told.passed == (verdict == 'passed')
+        assert told.verdict == verdict and told.passed == (verdict == 'passed')
     accepted = int((office_report.grid.accepted[office_report.grid.is_near] > 0).sum())
     positions, = office_report.localized
     assert f': {accepted} localized by objects, 0 by keyframes only, ' in positions

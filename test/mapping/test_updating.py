@@ -243,8 +243,7 @@ def test_new_ids_are_unused():
     old = without(replace(FEW, landmark_ids=('book_1', 'cup_1', *FEW.landmark_ids[2:])), 3)
     updated = update_map(old, see(FEW, POSES))
     (one,) = updated.report.new
-    assert one.class_id == 'book'
-    assert one.landmark_id == 'book_2'
+    assert one.class_id == 'book' and one.landmark_id == 'book_2'
 
 
 @pytest.mark.parametrize('details', [
