@@ -83,8 +83,10 @@ def test_the_mount_moves_the_pose_and_its_covariance(relocalizer, tester):
     assert tester.set_parameter('base_from_camera', mount).successful
     assert tester.set_parameter('base_frame', 'base_link').successful
     try:
-        assert tester.relocalize(make_frame()).success
+        answer = tester.call_while(SelfTest, 'relocalizer/relocalize_fields', make_frame())
         tester.wait(lambda: len(tester.poses) == 2, 'the poses of camera and base')
+        shown, = (value.value for value in answer.status[0].values if value.key == 'covariance')
+        assert [*map(float, shown.split())] == [*tester.poses[1].pose.covariance]
         camera, base = (transform_of(pose.pose.pose) for pose in tester.poses)
         camera_from_base = transforms.invert_transform(
             transforms.transform_from_pose(np.array(mount[:3]), np.array(mount[3:])))
@@ -97,6 +99,13 @@ def test_the_mount_moves_the_pose_and_its_covariance(relocalizer, tester):
         np.testing.assert_allclose(of_base, moved, rtol=1e-6, atol=1e-12)
     finally:
         assert tester.set_parameter('base_frame', '').successful
+
+
+def test_a_refusal_states_one_confidence(relocalizer, tester):
+    assert tester.set_parameter('min_confidence', 0.9999).successful
+    message = tester.relocalize(make_frame(see_room(make_room()).select(np.arange(5)))).message
+    assert tester.set_parameter('min_confidence', 0.9).successful
+    assert re.match(r'refused: confidence 0\.\d+ < 0\.9999; .* \[score ', message), message
 
 
 def test_frames_out_of_order_and_time_going_back(relocalizer, tester):

@@ -116,8 +116,7 @@ def test_a_refused_request_searches_keyframes_as_far_as_its_time_allows(
     drive = Drive(cameras, 'all', tmp_path)
     drive.objects = 2
     found, _ = drive.localize(deadline=time.monotonic() + left_s)
-    assert not found.found.accepted
-    assert found.found.keyframe_search == searched
+    assert not found.found.accepted and found.found.keyframe_search == searched
     case, again = drive.recorded()
     assert again.keyframe_search == searched
     assert case.queries[-1].is_thorough == (searched == 'thorough')
@@ -128,8 +127,7 @@ def test_a_request_is_answered_and_its_record_is_answered_alike(cameras, known, 
     drive = Drive(cameras, known, tmp_path)
     for number in range(2):  # the second fuses the first, with odometry
         found, error_m = drive.localize(number)
-        assert found.found.accepted and error_m < 0.05
-        assert found.found.source == 'objects'
+        assert found.found.accepted and error_m < 0.05 and found.found.source == 'objects'
         assert len(found.query.frames) == cameras
         depths = found.query.newest.depths
         assert (depths is not None and np.isfinite(depths).sum() >= 6) == drive.has_depth

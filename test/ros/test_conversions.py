@@ -115,8 +115,7 @@ def test_binning_and_a_region_of_interest(changes, size, k, p):
     """For every image, a pixel of the sensor is the same ray through the same lens."""
     info = camera_info(**SENSOR | changes)
     raw, rectified = (camera_from_msg(info, size, is_rectified) for is_rectified in (False, True))
-    assert (raw.width, raw.height) == size
-    assert (raw.fx, raw.fy, raw.cx, raw.cy) == k
+    assert (raw.width, raw.height) == size and (raw.fx, raw.fy, raw.cx, raw.cy) == k
     assert (rectified.fx, rectified.fy, rectified.cx, rectified.cy) == p
     whole = camera_from_msg(camera_info(**SENSOR), (1280, 961), rectified=False)
     on_sensor = np.array([[210.0, 110.0], [590.0, 390.0]])
