@@ -107,7 +107,7 @@ class Evidence:
     twin_map: str = ''  #: Name of the twin's map if there are several
     near: float = 1.0  #: Probability, by the covariance, that a right pose is within 1 m
     #: Factor by which camera errors lower that probability, and a description of what is very
-    #: likely wrong with a camera, empty if nothing is, see cliploc_ros.core.acceptance.camera_check
+    #: likely wrong with a camera, or '', see cliploc_ros.core.acceptance.camera_check
     camera: float = 1.0
     camera_fault: str = ''
     deviation_m: float = 0.0  #: Standard deviation of the position [m]
