@@ -260,6 +260,12 @@ def test_the_check_hears_of_boxes_and_goes_on_with_slightly_other_intrinsics(rng
         check.see(Observation(camera, Detections(boxes, ('a',) * 8, np.full(8, 0.9))))
         return len(check.faults)
     assert [see(CAMERA, (300.0, 300.0)) for _ in range(8)][-1] == 1
+    verified = check.copied()
+    verified.add([look_at((number, 0, number), 0.0, size=4000.0) for number in range(9)])
+    for _ in range(8):
+        verified.see(Observation(CAMERA, Detections(
+            drawn(rng, 8, (0.0, 0.0), SIZE), ('a',) * 8, np.full(8, 0.9))))
+    assert float(verified.values['camera check'].split()[0]) < 0.0, 'boxes reach the border'
     focused = replace(CAMERA, fx=1.005 * CAMERA.fx, fy=1.005 * CAMERA.fy)
     assert see(focused, (300.0, 300.0)) == 1
     for focal in (0.2, 0.0):

@@ -257,8 +257,7 @@ def test_missing_landmarks_are_named(watch, room):
 def test_where_a_third_is_gone_the_map_is_out_of_date(watch, room):
     there = np.nonzero(np.arange(COUNT) % 3)[0]
     report = follow(watch, room, drive(36), rows=there)[-1]
-    assert report.state == WatchState.UNCERTAIN
-    assert report.probability > TERMS.localized
+    assert report.state == WatchState.UNCERTAIN and report.probability > TERMS.localized
     assert f'{len(report.missing)} landmarks' in report.reason
 
 
@@ -316,8 +315,7 @@ def test_what_an_image_should_show():
                   (30, 1, 1),  # too far
                   (3, -1, 1))  # in view
     found = expect(some, CAMERA, level(0, 0, 0), np.array([5]))
-    assert found.landmarks.tolist() == [0, 5]
-    assert found.was_seen.tolist() == [False, True]
+    assert found.landmarks.tolist() == [0, 5] and found.was_seen.tolist() == [False, True]
     assert found.in_sight.tolist() == [True, True]
     # no visible landmark is beside it, so a wall may hide it
     assert not expect(some, CAMERA, level(0, 0, 0), np.empty(0, dtype=int)).in_sight.any()

@@ -66,8 +66,7 @@ def test_what_strangers_write_is_quoted_in_a_line(relocalizer, tester):
     frame = make_frame()
     frame[0].encoding = '[FATAL] all is lost\n' * 50_000
     answer = refusal(tester, frame)
-    assert not answer.success
-    assert answer.message.startswith('image encoding ')
+    assert not answer.success and answer.message.startswith('image encoding ')
     assert 'bgra8' in answer.message and len(answer.message) < 1000
     assert '\n' not in answer.message
     tester.wait(lambda: 'image encoding' in relocalizer.output(), 'the log')

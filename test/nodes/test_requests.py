@@ -19,8 +19,7 @@ from cliploc_ros.ros.qos import LATCHED
 
 def test_a_request_is_answered_with_a_pose(relocalizer, tester):
     answer = tester.relocalize(make_frame(stamp_s=12.5))
-    assert answer.success
-    assert answer.message.startswith('accepted: x 0.3')
+    assert answer.success and answer.message.startswith('accepted: x 0.3')
     tester.wait(lambda: tester.poses and tester.initial_poses and tester.hypotheses, 'poses')
     pose = tester.poses[0]
     assert pose == tester.initial_poses[0]

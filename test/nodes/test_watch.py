@@ -70,8 +70,7 @@ class Watched:
         Earlier reports do not count as looks at the other place.
         """
         self.robot.carry(3.0)
-        assert self.until_state('uncertain') <= 3
-        assert self.until_state('lost') <= 12
+        assert self.until_state('uncertain') <= 3 and self.until_state('lost') <= 12
 
     def looks(self, count):
         """Drive for some looks; return their states."""

@@ -233,6 +233,9 @@ def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):
         showing.hand_over()
     assert len(showing.localizer.poses) == 1
     showing.localizer.may_answer.set()
+    showing.localizer.off_m = math.nan
+    with pytest.raises(handoff.NoLocalizerError, match='no message on'):
+        showing.hand_over(1.0)  # what it showed before does not count
 
 
 class RearTransforms:
