@@ -14,15 +14,16 @@ unset PYTHONDONTWRITEBYTECODE
 say() { printf '==> %s\n' "$*"; }
 die() { printf '%s: %s\n' "script/$(basename "$0")" "$*" >&2; exit 1; }
 
-# A lock allows only one setup per source tree. pip unpacks gigabytes beside the environment, because
-# /tmp is often a small, separate file system.
+# enter_build_folder [NAME]: a lock allows only one setup of this name per source tree. pip unpacks
+# gigabytes beside the environment, because /tmp is often a small, separate file system.
 enter_build_folder() {
+  local name=${1:-setup}
   mkdir -p "$logs" || die "cannot write to $root"
   touch "$root/build/COLCON_IGNORE"
-  exec 9>"$root/build/setup.lock"
+  exec 9>"$root/build/$name.lock"
   flock --nonblock 9 || { say 'waiting for another script/setup in this folder'; flock 9; }
-  export TMPDIR=$root/build/tmp
-  trap 'rm -rf "$root/build/tmp"' EXIT
+  export TMPDIR=$root/build/tmp_$name
+  trap 'rm -rf "$TMPDIR"' EXIT
   rm -rf "$TMPDIR" # left by a killed run
   mkdir "$TMPDIR"
 }
