@@ -196,8 +196,7 @@ def check_ros2(words: tuple[str, ...]) -> None:
         assert package == 'cliploc_ros'
         assert (PROJECT / 'launch' / file).is_file()  # the arguments are checked below
     elif verb == 'service':
-        assert rest[0] == 'call'
-        assert rest[1] in names_of_interface()
+        assert rest[0] == 'call' and rest[1] in names_of_interface()
     elif verb == 'param':
         action, node, name, *value = rest
         row = {row.name: row for row in NODES[node.removeprefix('/')]}[name]

@@ -143,8 +143,7 @@ def test_outline_touches_dense_surface_samples(semi_axes, quaternion, center):
     size = (box[2:] - box[:2]).max()
     assert np.abs(seen.min(axis=0) - box[:2]).max() < 2e-3 * size
     assert np.abs(seen.max(axis=0) - box[2:]).max() < 2e-3 * size
-    assert (seen >= box[:2] - 1e-9).all()
-    assert (seen <= box[2:] + 1e-9).all()
+    assert (seen >= box[:2] - 1e-9).all() and (seen <= box[2:] + 1e-9).all()
 
 
 @pytest.mark.parametrize('depth', [-3.0, 0.0, 0.2, 0.3])

@@ -115,6 +115,17 @@ def test_one_keyframe_and_one_without_points_are_searched(corridor, has_empty, f
     assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
 
 
+def test_a_place_tells_the_distance_of_its_nearest_keyframe(corridor):
+    one = corridor.select(np.arange(20) == 18)
+    doubled = {name: np.concatenate([getattr(one, name)] * 2)
+               for name in ('map_from_camera', 'pixels', 'points', 'descriptors', 'words')}
+    doubled['map_from_camera'][1, 0, 3] -= 1.0
+    doubled['points'][POINTS:, 0] += 1.0
+    layer = replace(one, offsets=np.array([0, POINTS, 2 * POINTS]), **doubled)
+    place, = KeyframeLocalizer(layer).localize_features(features_at(one, 0), CAMERA).places
+    assert set(place.keyframes) == {0, 1} and place.apart == pytest.approx(0.1 / 2.0, abs=1e-3)
+
+
 def test_a_pose_is_refined_by_points_that_matching_missed(corridor):
     """Each point of the second half looks like its neighbour, so none of its matches is clear."""
     layer = corridor.select(np.arange(20) == 18)
@@ -327,8 +338,7 @@ def test_rays_of_equal_features_meet_in_their_point():
         inside = (points - pose[:3, 3]) @ pose[:3, :3]
         images.append(PosedFeatures(pose, inside[:, :2] / inside[:, 2:], descriptors))
     images[2].bearings[:5] += 0.1  # mismatched there, but not in the second image
-    found = triangulate(images, 0)
-    assert np.abs(found - points).max() < 1e-6
+    assert np.abs(triangulate(images, 0) - points).max() < 1e-6
 
 
 def test_features_are_found_in_any_image():

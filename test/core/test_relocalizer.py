@@ -63,8 +63,7 @@ def test_bf_stops_when_its_time_is_over_and_says_so(room, observation):
     options = RelocalizerOptions(matching='class', algorithm='bf', time_budget_s=0.0)
     result = Relocalizer(room, options).relocalize([observation])
     assert 0.0 < result.coverage < 1.0
-    assert not result.accepted
-    assert result.reason.startswith('search stopped')
+    assert not result.accepted and result.reason.startswith('search stopped')
 
 
 def test_missing_or_misshaped_similarities_and_a_large_k_are_named(room, observation):

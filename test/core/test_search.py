@@ -109,8 +109,7 @@ def test_the_first_candidates_are_done_before_the_next(room):
     count = len(scene.pairs)
     for step in steps[:-1]:
         assert step.coverage == pytest.approx(comb(step.reach, 3) / comb(count, 3))
-    assert steps[-1].coverage == 1.0
-    assert steps[-1].tried == comb(count, 3)
+    assert steps[-1].coverage == 1.0 and steps[-1].tried == comb(count, 3)
 
 
 UP_IN_MAP = np.array([0.0, -1.0, 0.0])

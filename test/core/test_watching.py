@@ -61,8 +61,7 @@ def test_a_fault_that_lasts_is_named(images, change, word, looks):
     assert found[:looks] == [''] * looks
     assert word in found[looks]
     # one good image ends it
-    again = faults_of([*map(change, images), images[0]], poses(7))
-    assert again[-1] == ''
+    assert faults_of([*map(change, images), images[0]], poses(7))[-1] == ''
 
 
 def test_a_frozen_image_or_a_smooth_wall_is_a_fault_only_for_a_robot_that_moves(images):
@@ -145,10 +144,8 @@ def test_a_localizer_that_drifts_is_right(watch, room):
         x, y = rng.uniform(-0.2, 0.2, 2)
         report = watch.look(see(room, pose, number, rng=rng), moved(pose, x, y, rng.normal()))
         assert report.state != WatchState.LOST and report.matched >= report.expected
-    assert report.state == WatchState.LOCALIZED
-    assert report.probability > 0.99
-    assert report.matched
-    assert not report.missing
+    assert report.state == WatchState.LOCALIZED and report.probability > 0.99
+    assert report.matched and not report.missing
     assert report.camera_turn is None
 
 

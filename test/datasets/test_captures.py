@@ -231,8 +231,7 @@ def test_levelled_by_the_tilt_of_the_cameras(angles_deg, shots, tmp_path):
     assert any('--level corrects it' in note for note in plain.notes) == (tilt_deg > 5.0 + 1.0)
     frames = read_folder(folder, FolderOptions(scale=1.0, level=True))
     note, = (note for note in frames.notes if note.startswith('levelled'))
-    found_deg = float(note.split(' was ')[1].split()[0])
-    assert found_deg == pytest.approx(tilt_deg, abs=3.0)
+    assert float(note.split(' was ')[1].split()[0]) == pytest.approx(tilt_deg, abs=3.0)
     for raw, shot in zip(frames.read_raw(lambda *_: True), shots, strict=True):
         # the camera's tilt is that of the room, whose z axis is up
         down, true_down = raw.map_from_camera[2, :3], shot.pose[2, :3]

@@ -145,8 +145,7 @@ def test_embeddings_come_back(tmp_path):
     plain = observations.load_observations(save(tmp_path / 'o.npz', observation_arrays()))
     given = replace(plain, embeddings=rows)
     observations.save_observations(tmp_path / 'large.npz', given)
-    loaded = observations.load_observations(tmp_path / 'large.npz')
-    assert (loaded.embeddings == rows).all()
+    assert (observations.load_observations(tmp_path / 'large.npz').embeddings == rows).all()
     save(tmp_path / 'compressed.npz', observation_arrays() | {'embeddings': rows})
     assert (observations.load_observations(tmp_path / 'compressed.npz').embeddings == rows).all()
 

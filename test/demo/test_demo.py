@@ -153,8 +153,7 @@ def test_the_built_map_holds_the_room_and_localizes_as_the_true_one(tmp_path):
     success = {name: (float(quarter), int(wrong)) for name, quarter, wrong in re.findall(
         r'^(built|true) map +([.0-9]+) .* (\d+)$', output, re.MULTILINE)}
     assert success['built'][0] >= limits['success_at_a_quarter_metre']
-    assert success['true'][0] > 0.9
-    assert success['built'][1] == success['true'][1] == 0
+    assert success['true'][0] > 0.9 and success['built'][1] == success['true'][1] == 0
     assert '1 wake-ups: ' in output
 
 

@@ -27,8 +27,7 @@ def renderer(room):
 
 
 def test_a_room_is_repeatable_and_its_labels_tell_all_objects_apart(room):
-    again = make_room(3, dict.fromkeys(CLASSES, 8))
-    assert again.objects == room.objects
+    assert make_room(3, dict.fromkeys(CLASSES, 8)).objects == room.objects
     assert make_room(4).objects != room.objects
     labels = [item.look.label for item in room.objects]
     assert len(set(labels)) == len(labels) == 64

@@ -147,8 +147,7 @@ def test_the_watch_hears_keyframes(layer, queries, room):
             report = watch.look(Observation(
                 frame.camera, NO_OBJECTS, stamp_ns=number * 10**10,
                 odom_from_camera=frame.map_from_camera), pose, frame.image_rgb, recognizer)
-        assert report.state == state and report.looks == len(queries)
-        assert not report.fault
+        assert report.state == state and report.looks == len(queries) and not report.fault
 
 
 def test_a_second_room_that_looks_the_same_is_refused(layer, room, queries, answer):

@@ -78,6 +78,10 @@ def test_workers_do_not_matter_and_get_the_queries_once(results, room, questions
         found = run_methods(room, methods, Counted(questions), trials=3, workers=workers)
         assert without_times(found) == without_times(results)
     assert len(sent) == 2
+    parts = []
+    run_methods(room, parse_methods(['auto'], PAPER, len(room)), [*questions, *questions],
+                trials=1, advance=parts.append)
+    assert [len(part) for part in parts] == [2 * len(questions)], 'one localizer gets all'
 
 
 def test_similarities_follow_the_maps_order(room, recording, questions):

@@ -32,8 +32,7 @@ def test_every_landmark_is_found_where_it_is():
     built = build_map(walk.see(TABLE, walk.walk_around()))
     assert len(built.landmark_map) == len(TABLE)
     assert walk.nearest_errors(built.landmark_map, TABLE).max() < 0.003
-    assert built.report.explained == 1.0
-    assert built.report.median_iou > 0.97
+    assert built.report.explained == 1.0 and built.report.median_iou > 0.97
     assert built.report.left_out == ()
     assert set(np.unique(built.shown)) == set(range(len(TABLE)))
     for center, axes in zip(TABLE.centers, TABLE.semi_axes, strict=True):
@@ -52,8 +51,7 @@ def test_equal_seed_and_input_give_an_equal_map():
     detections = walk.see(TABLE, walk.walk_around(), noise_px=3.0)
     first, second = build_map(detections), build_map(detections)
     assert (first.landmark_map.centers == second.landmark_map.centers).all()
-    assert (first.shown == second.shown).all()
-    assert first.report == second.report
+    assert (first.shown == second.shown).all() and first.report == second.report
 
 
 def test_what_a_short_walk_shows_from_one_side_is_left_out_with_the_reason():

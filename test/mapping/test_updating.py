@@ -224,8 +224,7 @@ def test_looks_tell_a_moved_object_from_a_new_one():
     assert other.report.moved == ()
     assert ids(other.report.missing) == {'thing_4'}
     assert len(other.report.new) == 1
-    row = other.first_new
-    assert other.embeddings.means[row] @ looks[-1] > 0.9
+    assert other.embeddings.means[other.first_new] @ looks[-1] > 0.9
     assert other.embeddings.means[0] @ looks[0] > 0.99
 
 
