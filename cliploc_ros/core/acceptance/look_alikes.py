@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.confidence import Support, utilities
@@ -283,9 +284,8 @@ def _upright_moves(turns: NDArray[np.float64], before: NDArray[np.float64],
 def _are_same(moves: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which pairs of moves (m, m) take a point to the same place with the same turn."""
     ends = moves[:, :3, :3] @ point + moves[:, :3, 3]
-    cosines = moves[:, None, 0, 0] * moves[:, 0, 0] + moves[:, None, 1, 0] * moves[:, 1, 0]
-    near = np.linalg.norm(ends[:, None] - ends, axis=2) < SAME_MOVE.distance_m
-    return np.asarray(near & (cosines > _SAME_TURN))
+    cosines = moves[:, :2, 0] @ moves[:, :2, 0].T
+    return np.asarray((cdist(ends, ends) < SAME_MOVE.distance_m) & (cosines > _SAME_TURN))
 
 
 def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray[np.float64],
