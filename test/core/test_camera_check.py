@@ -292,9 +292,10 @@ def test_nothing_is_known_of_a_new_camera():
     share, covariance, fault = CameraCheck().judge([CameraLook(
         '', True, np.eye(4), np.zeros((ERRORS, ERRORS)), np.zeros(ERRORS), 1.0, moves)], np.eye(6))
     terms = CALIBRATION.camera
-    expected = np.diag([*(1.0 + terms.unverified * (100.0 * error) ** 2
-                          for error in (terms.wrong_focal, terms.wrong_aspect)), *[1.0] * 4])
-    np.testing.assert_allclose(covariance, expected)
+    factors = np.exp(np.random.default_rng(0).normal(0.0, terms.wrong_focal, 10**6))
+    expected = np.diag([*(1.0 + terms.wrong * 100.0**2 * square for square in (
+        np.square(factors - 1.0).mean(), terms.wrong_aspect**2)), *[1.0] * 4])
+    np.testing.assert_allclose(covariance, expected, rtol=0.01)
     # a right camera, whose errors are in the covariance, remains
     assert 1.0 - terms.wrong < share < 0.6 and not fault
 

@@ -129,5 +129,4 @@ def test_heights_and_verticals_reach_the_search(localizer, values):
     assert np.trace(upright.covariance[3:5, 3:5]) < np.trace(blind.covariance[3:5, 3:5])
     assert not localize(localizer, make_frame(), values, -MAP_FROM_CAMERA[2, :3]).accepted
     values = replace(values, height_range_m=[height + 5.0, height + 6.0])
-    outside = localize(localizer, make_frame(), values)
-    assert not outside.accepted
+    assert not localize(localizer, make_frame(), values).accepted

@@ -78,7 +78,6 @@ _LOG_DEVIATIONS = np.log(_DEVIATIONS).sum(axis=1)
 _WEIGHTS = np.array([1.0 - _TERMS.wrong, *(_TERMS.wrong * (
     _TERMS.focal_share if kind == 'focal length' else
     (1.0 - _TERMS.focal_share) / (len(_KINDS) - 1)) for kind in _KINDS)])
-_UNVERIFIED = math.log(_TERMS.unverified / (1.0 - _TERMS.unverified))
 _PRIORS = _DEVIATIONS[:, :, None] ** -2.0 * np.eye(ERRORS)
 # Limits of the numbers and of the mean errors of a recorded state. A file with larger ones is
 # damaged.
@@ -141,8 +140,7 @@ class CameraOdds(NamedTuple):
         ndarray (6, 6)
             What they add to the covariance: the errors of camera_info, weighted by the
             probability that the camera is wrong. Its kind does not matter, since few looks tell
-            the kinds apart. Before any look, this probability is `unverified`, which is smaller
-            than the caution that an acceptance needs.
+            the kinds apart.
         """
         weights = np.exp(self.odds - self.odds.max()) * _WEIGHTS
         weights /= weights.sum()
@@ -150,8 +148,13 @@ class CameraOdds(NamedTuple):
         added[0] = 0.0  # the covariance includes the errors of a right camera
         near = shares_within(RIGHT_M, (CALIBRATION.covariance.caution * covariance
                                        + added)[:, :3, :3])
-        wrong = 1.0 / (1.0 + math.exp(-min(self.log_odds + _UNVERIFIED, 50.0)))
-        return float(weights @ near / near[0]), wrong * added[_UNKNOWN_INFO]
+        mean, square = self.means[_UNKNOWN_INFO, 0], self.squares[_UNKNOWN_INFO]
+        variance = square[0, 0] - mean**2
+        # all distances grow by a factor, whose logarithm is the error of the focal length
+        grown = np.exp(min(2.0 * (mean + variance), _LARGE)) - 2.0 * np.exp(
+            mean + variance / 2.0) + 1.0
+        moves = moves * [math.sqrt(grown / square[0, 0]), *[1.0] * (ERRORS - 1)]
+        return float(weights @ near / near[0]), (1.0 - weights[0]) * (moves @ square @ moves.T)
 
 
 def odds_of(information: NDArray[np.float64], vector: NDArray[np.float64], extent: float = 0.0
