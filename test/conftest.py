@@ -158,14 +158,16 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.write_line(report.nodeid)
         for line in report.capstdout.strip().splitlines():
             terminalreporter.write_line(f'    {line}')
+    for report in terminalreporter.stats.get('rerun', []):
+        terminalreporter.write_line(f'ran again: {report.nodeid}\n{report.longreprtext}')
     for module, tests in sorted(config.stash[NOT_RUN].items()):
         terminalreporter.write_line(f'not run, {module} is not installed: {", ".join(tests)}')
     passed = count(terminalreporter, 'passed', 'xpassed')
     failed = count(terminalreporter, 'failed', 'error', 'xfailed')
     terminalreporter.write_line(
         f'ran {passed + failed}: {passed} passed, {failed} failed, '
-        f'{count(terminalreporter, "skipped")} skipped '
-        f'(NumPy {np.__version__}, OpenCV {cv2.__version__})'
+        f'{count(terminalreporter, "skipped")} skipped, {count(terminalreporter, "rerun")} run '
+        f'again (NumPy {np.__version__}, OpenCV {cv2.__version__})'
     )
 
 
