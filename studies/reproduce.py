@@ -341,8 +341,6 @@ def write_bags(recording: Recording, frames: Path, folder: Path) -> None:
     count = min(recording.queries, len(others))
     chosen = np.linspace(0, len(others) - 1, count).round().astype(int)
     for name, chosen_rows in ((_MAPPED, rows[::2]), (_ASKED, [others[place] for place in chosen])):
-        for partial_bag in folder.glob(f'.{name}.*.partial'):  # left by a killed run
-            shutil.rmtree(partial_bag, ignore_errors=True)
         if not (folder / name).exists():
             convert_tum(
                 replace(sequence, stamps_ns=tuple(sequence.stamps_ns[row] for row in chosen_rows),
