@@ -22,6 +22,7 @@ from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.core.relocalizer import Relocalization
     from cliploc_ros.offline.evaluation.methods import Method
     from cliploc_ros.offline.posed_query import PosedQuery
 
@@ -315,8 +316,21 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     print(f'{options.bag}: {len(case.queries)} frames, map {case.report.get("map_hash")}\n'
           f'recorded: {case.report.get("message")}\n'
           f'again:    {"accepted" if again.accepted else f"refused: {again.reason}"}\n'
+          f'pose:     {_in_words(again, landmark_map.frame_id)}\n'
           f'{"the same verdict" if is_same else "another verdict"}', flush=True)
     return 0 if is_same else 1
+
+
+def _in_words(found: 'Relocalization', frame_id: str) -> str:
+    """Describe the best pose of a camera, accepted or not, in one line."""
+    from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+
+    if (pose := found.map_from_camera) is None:
+        return 'none'
+    numbers = ' '.join(f'{number:.6f}' for number in quaternion_from_transform(pose))
+    x, y, z = pose[:3, 3]
+    return (f'the camera at x {x:.3f} y {y:.3f} z {z:.3f} m, quaternion (x y z w) {numbers}, in '
+            f'{frame_id}; confidence {found.confidence:.3f}')
 
 
 def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap',
