@@ -78,7 +78,7 @@ class Log:
 
         Raises CliplocError if the disk is full or gone; the entry is then not in the file.
         """
-        line = _line(entry)
+        line = json.dumps(entry).encode() + b'\n'
         try:
             if self._file.seek(0, os.SEEK_END) != self._end:
                 self._file.truncate(self._end)
@@ -98,7 +98,7 @@ class Log:
         """Replace all entries at once; CliplocError: the disk is full or gone, they are kept."""
         try:
             with replace_file(self.path) as partial:
-                partial.write_bytes(b''.join(map(_line, entries)))
+                partial.write_text(''.join(f'{json.dumps(entry)}\n' for entry in entries))
                 file = partial.open('a+b', buffering=0)
                 # shared, as replace_file holds it too; it still excludes the lock of __init__
                 with suppress(OSError):
@@ -136,7 +136,3 @@ class Log:
     def _unwritable(self, problem: OSError) -> CliplocError:
         return self._error(
             f'{self.path}: cannot be written: {problem.strerror}; {self._advice}')
-
-
-def _line(entry: Any) -> bytes:
-    return json.dumps(entry).encode() + b'\n'

@@ -35,8 +35,7 @@ _MOST_DIGITS = 20
 _TURN_S, _TURN_POLL_S = 30.0, 0.02
 # Not 0: an empty file can be created even on a full disk.
 _PROBE_BYTES = 4096
-# Names of unfinished files and folders, and of files that wait to complete their set, see _staged.
-_UNFINISHED, _STAGED = re.compile(r'\.[0-9a-f]{12}\.part\.'), r'\.[0-9a-f]{12}\.'
+_UNFINISHED = re.compile(r'\.[0-9a-f]{12}\.part\.')
 #: Advice for a file that cannot be written.
 MAKE_ROOM = 'make room, or choose another folder'
 #: Messages about files that this process could not cache, see warn_not_kept.
@@ -229,19 +228,14 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
             except OSError as error:
                 raise OptionsError(f'{other}: belongs to an older {path.name} and cannot be '
                                    f'removed ({error.strerror}); remove it') from error
-        if is_alone:
-            _remove_staged(path, {Path(os.path.realpath(other)) for other in besides})
-
-
-def _remove_staged(path: Path, besides: Collection[Path]) -> None:
-    """Remove files that killed writers of a set left; no other writer may be at work."""
-    # not NAME.OTHER.SUFFIX.SUFFIX: these may belong to the set of NAME.OTHER
-    names = '|'.join([rf'{re.escape(path.stem)}\.[^.]+\.[^.]+',
-                      *(re.escape(other.name) for other in besides)])
-    for folder in {other.parent for other in besides}:
-        for entry in folder.iterdir():
-            if re.fullmatch(f'{_STAGED}({names})', entry.name):
-                _remove(entry)
+        # Remove what killed writers left. NAME.OTHER.X.Y stays: NAME.OTHER may have a set, too.
+        names = '|'.join([rf'{re.escape(path.stem)}\.[^.]+\.[^.]+', *(
+            re.escape(place.name.removeprefix(f'.{digest}.')) for place in staged.values())])
+        for folder in {place.parent for place in staged.values()} if is_alone else ():
+            with suppress(OSError):  # it cannot be listed
+                for entry in folder.iterdir():
+                    if re.fullmatch(rf'\.[0-9a-f]{{12}}\.({names})', entry.name):
+                        _remove(entry)
 
 
 @contextmanager
