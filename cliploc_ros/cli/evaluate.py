@@ -315,8 +315,8 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     place = 'none' if (pose := again.map_from_camera) is None else (
         'the camera at x {:.3f} y {:.3f} z {:.3f} m, quaternion (x y z w) {:.6f} {:.6f} {:.6f} '
         '{:.6f}, in {}; confidence {:.3f}'.format(
-            *pose[:3, 3], *quaternion_from_transform(pose), landmark_map.frame_id,
-            again.confidence))
+            *pose[:3, 3], *quaternion_from_transform(pose),  # type: ignore[str-format]
+            landmark_map.frame_id, again.confidence))
     is_same = again.accepted == (case.report.get('found') == 'accepted')
     print(f'{options.bag}: {len(case.queries)} frames, map {case.report.get("map_hash")}\n'
           f'recorded: {case.report.get("message")}\n'
