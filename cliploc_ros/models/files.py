@@ -12,11 +12,18 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatch
+from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.files.storage import open_file, read_file, replace_file, resolve_cache_dir
+from cliploc_ros.files.storage import (
+    open_file,
+    parse_json,
+    read_file,
+    replace_file,
+    resolve_cache_dir,
+)
 
 _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
@@ -24,8 +31,15 @@ _BLOCK_COUNT = 66
 _HEADS = (b'PK', b'\x80', b'\x93NUMPY')
 # Partial files older than this are from killed writers [s].
 _STALE_S = 24 * 3600.0
-# OWNER/NAME[@REVISION][:FILE]; the revision is a branch, tag or commit.
-_NAME = re.compile(r'([\w-][\w.-]*/[\w-][\w.-]*)(?:@([\w][\w.-]*))?(?::([\w][\w./-]*\.onnx))?')
+# OWNER/NAME[@REVISION][:FILE]; the revision is a branch, tag, commit or refs/pr/NUMBER.
+_NAME = re.compile(r'([\w-][\w.-]*/[\w-][\w.-]*)(?:@(\w[\w.-]*(?:/\w[\w.-]*)*))?'
+                   r'(?::(\w[\w./-]*\.onnx))?')
+# Suffixes of local files, which are no names on the hub.
+_LOCAL = ('.onnx', '.pt', '.pth', '.ts', '.safetensors', '.bin', '.json')
+# The digests of the hub: SHA-256 for large files, otherwise git's SHA-1.
+_DIGEST = re.compile('[0-9a-f]{40}|[0-9a-f]{64}')
+# A file of weights as named in an ONNX file: the key of an entry, and the size of the name.
+_LOCATION, _MOST_NAME = re.compile(rb'\n\x08location\x12(?:([\x80-\xff]))?([\0-\x7f])'), 4096
 # Time-out of the first request, in case a firewall drops its packets [s].
 _PATIENCE_S = 10.0
 
@@ -48,6 +62,62 @@ def fingerprint_file(path: Path) -> str:
             file.seek(offset)
             digest.update(file.read(_BLOCK_BYTES))
     return digest.hexdigest()
+
+
+def digest_file(path: Path) -> str:
+    """Return the SHA-256 of a file.
+
+    It is computed again only after a change of the file. ModelError: the file cannot be read, or
+    is in the hub's cache under another digest.
+    """
+    found, blob = _content(path)[0], _blob(path)
+    if len(blob) == 64 and blob != found:
+        raise ModelError(f'{path} is damaged, its SHA-256 differs from that on the hub: remove '
+                         f'{os.path.realpath(path)}')
+    return found
+
+
+def digest_network(file: Path) -> str:
+    """Return a hash of each byte of an ONNX file and of the files of weights that it names."""
+    depends = [digest_file(file), *(digest_file(path) if path.is_file() else ''
+                                    for path in weights_beside(file))]
+    return hashlib.sha256(repr(depends).encode()).hexdigest()
+
+
+def weights_beside(file: Path) -> list[Path]:
+    """Return the files of weights that an ONNX file names; ModelError: it cannot be read."""
+    return [file.parent / name for name in _content(file)[1]]
+
+
+def _content(path: Path) -> tuple[str, list[str]]:
+    with _opened(path) as file:
+        status = os.fstat(file.fileno())
+    return _read(path, status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns,
+                 status.st_ctime_ns)
+
+
+@lru_cache(64)
+def _read(path: Path, *_unchanged: int) -> tuple[str, list[str]]:
+    """Return the SHA-256 of a file, and the names of the files of weights in an ONNX file."""
+    digest, names, end = hashlib.sha256(), set[str](), b''
+    with _opened(path) as file:
+        while block := file.read(2**20):
+            digest.update(block)
+            if path.suffix == '.onnx':
+                end += block
+                for match in _LOCATION.finditer(end) if b'\n\x08location' in end else ():
+                    high, low = match[1], match[2][0]
+                    size = low if high is None else (high[0] & 127) + 128 * low
+                    if match.end() + size <= len(end):
+                        names.add(os.fsdecode(end[match.end():match.end() + size]))
+                end = end[-_MOST_NAME:]
+    return digest.hexdigest(), sorted(names)
+
+
+def _blob(path: Path) -> str:
+    """Return the digest in the name of a file in the hub's cache, which is a link to it; or ''."""
+    blob = path.readlink() if path.is_symlink() else path
+    return blob.name if blob.parent.name == 'blobs' and _DIGEST.fullmatch(blob.name) else ''
 
 
 def _opened(path: Path) -> BinaryIO:
@@ -127,8 +197,9 @@ def first_line(error: Exception) -> str:
 
 def is_hub_name(name: str) -> bool:
     """Return whether a name is OWNER/NAME[@REVISION][:FILE], and not a local file or folder."""
-    return (not Path(name).expanduser().exists() and _NAME.fullmatch(name) is not None
-            and Path(name).suffix not in ('.pt', '.ts', '.safetensors', '.bin', '.json'))
+    match = _NAME.fullmatch(name)
+    return (match is not None and Path(match[1]).suffix not in _LOCAL
+            and not Path(name).expanduser().exists())
 
 
 def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequence[str],
@@ -136,8 +207,9 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
     """Return a folder with networks and the files next to them; download it if necessary.
 
     A complete download is marked, and no further request is sent. Each file is compared with the
-    digest given by the hub, and interrupted downloads are continued. Proxy, mirror and offline
-    mode are those of huggingface_hub: HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE.
+    digest given by the hub, at the download and at each use. A damaged file is downloaded again,
+    and interrupted downloads are continued. Proxy, mirror and offline mode are those of
+    huggingface_hub: HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE.
 
     ModelError: the name is neither a folder nor a name on the hub, or the download fails.
 
@@ -163,20 +235,8 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
     request = json.dumps([repository, revision, [*map(list, wanted)], list(beside)])
     digest = hashlib.sha256(request.encode()).hexdigest()
     marker = own / f'{repository.replace("/", "--")}-{digest[:16]}.json'
-    try:
-        found = own / str(json.loads(read_file(marker)))
-    except (OSError, ValueError):
-        found = own / 'missing'
-    if found.is_dir():
-        return found
 
-    def fetch() -> Path:
-        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
-        import huggingface_hub
-
-        info = huggingface_hub.HfApi().model_info(repository, revision=revision,
-                                                  timeout=_PATIENCE_S)
-        files = [sibling.rfilename for sibling in info.siblings or ()]
+    def choose(files: Sequence[str]) -> list[str]:
         chosen = [file for file in files if any(fnmatch(file, pattern) for pattern in beside)]
         for patterns in wanted:
             main = next((file for pattern in patterns for file in files
@@ -185,13 +245,42 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
                 raise ModelError(f'{name} has none of {", ".join(patterns)}: it has '
                                  f'{", ".join(files)}')
             chosen += [file for file in files if file.startswith(main)]
-        for file in chosen:
-            path = Path(huggingface_hub.hf_hub_download(
-                repository, file, revision=info.sha, cache_dir=own))
-            _check_content(path)
-        snapshot = Path(str(path)[:-len(file)])
+        return chosen
+
+    try:
+        place = Path(str(parse_json(read_file(marker))))
+        if place.is_absolute() or '..' in place.parts:
+            raise ValueError('not a folder of this cache')
+        found = own / place
+        for part in choose([str(path.relative_to(found)) for path in found.rglob('*')]):
+            for path in (found / part, *weights_beside(found / part)):
+                _check_content(path, _blob(path))
+        return found
+    except (OSError, ValueError, ModelError) as error:
+        if marker.exists():
+            logger.warning('%s in %s cannot be used (%s): downloading it again', name, own, error)
+
+    def fetch() -> Path:
+        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
+        import huggingface_hub as hub
+
+        info = hub.HfApi().model_info(repository, revision=revision, timeout=_PATIENCE_S)
+        commit, files = info.sha, [sibling.rfilename for sibling in info.siblings or ()]
+        chosen = choose(files)
+        for part in chosen:
+            # before the download, which uses both as names of files
+            stated = hub.get_hf_file_metadata(hub.hf_hub_url(
+                repository, part, revision=commit), timeout=_PATIENCE_S)
+            if not all(map(_DIGEST.fullmatch, (str(stated.etag), str(commit)))):
+                raise ValueError(f'the hub states no digest of {part}, but {stated.etag!r:.80} '
+                                 f'and the commit {commit!r:.80}')
+            path = Path(hub.hf_hub_download(repository, part, revision=commit, cache_dir=own))
+            _check_content(path, str(stated.etag))
+            snapshot = Path(str(path)[:-len(part)])
+            chosen += [file for file in files if file not in chosen
+                       and snapshot / file in weights_beside(path)]
         with replace_file(marker) as partial:
-            partial.write_text(json.dumps(str(snapshot.relative_to(own))))
+            partial.write_text(json.dumps(str(snapshot.resolve().relative_to(own.resolve()))))
         return snapshot
 
     listed = ', '.join([*(patterns[0] for patterns in wanted), *beside])
@@ -203,27 +292,22 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
 def find_network(folder: Path, name: str, networks: Sequence[str]) -> Path:
     """Return the ONNX file in a folder of `resolve_folder`; ModelError: there is none."""
     match = _NAME.fullmatch(name)
-    if match is not None and match[3] and (folder / match[3]).is_file():
-        return folder / match[3]
-    for pattern in networks:
+    for pattern in [match[3]] if match is not None and match[3] else networks:
         for file in sorted(folder.glob(pattern)):
             return file
     raise ModelError(f'{folder} has none of {", ".join(networks)}: put an ONNX file there')
 
 
-def _check_content(file: Path) -> None:
-    """Compare a file with its digest on the hub; ValueError: it differs, and was removed.
-
-    The hub's cache names each file after its digest: SHA-256 for large files, otherwise git's
-    SHA-1.
-    """
-    blob = file.resolve()
-    content = hashlib.sha256 if len(blob.name) == 64 else hashlib.sha1
-    head = b'' if len(blob.name) == 64 else b'blob %d\0' % blob.stat().st_size
-    digest = content(head, usedforsecurity=False)
-    with blob.open('rb') as opened:
-        while block := opened.read(2**20):
-            digest.update(block)
-    if len(blob.name) in (40, 64) and digest.hexdigest() != blob.name:
-        blob.unlink()
+def _check_content(file: Path, stated: str) -> None:
+    """Compare a file with its digest on the hub; ValueError: it differs, and was removed."""
+    if not stated:
+        return
+    if len(stated) == 64:
+        found = _content(file)[0]
+    else:
+        content = read_file(file)
+        found = hashlib.sha1(b'blob %d\0' % len(content) + content,
+                             usedforsecurity=False).hexdigest()
+    if found != stated:
+        file.resolve().unlink()
         raise ValueError(f'the digest of {file.name} differs from that on the hub')
