@@ -10,20 +10,15 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatch
 from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.files.storage import (
-    open_file,
-    parse_json,
-    read_file,
-    replace_file,
-    resolve_cache_dir,
-)
+from cliploc_ros.files.storage import open_file, read_file, replace_file, resolve_cache_dir
 
 _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
@@ -39,7 +34,7 @@ _LOCAL = ('.onnx', '.pt', '.pth', '.ts', '.safetensors', '.bin', '.json')
 # The digests of the hub: SHA-256 for large files, otherwise git's SHA-1.
 _DIGEST = re.compile('[0-9a-f]{40}|[0-9a-f]{64}')
 # A file of weights as named in an ONNX file: the key of an entry, and the size of the name.
-_LOCATION, _MOST_NAME = re.compile(rb'\n\x08location\x12(?:([\x80-\xff]))?([\0-\x7f])'), 4096
+_LOCATION, _MOST_NAME = re.compile(rb'\n\x08location\x12([\x80-\xff]?[\0-\x7f])'), 4096
 # Time-out of the first request, in case a firewall drops its packets [s].
 _PATIENCE_S = 10.0
 
@@ -65,23 +60,14 @@ def fingerprint_file(path: Path) -> str:
 
 
 def digest_file(path: Path) -> str:
-    """Return the SHA-256 of a file.
-
-    It is computed again only after a change of the file. ModelError: the file cannot be read, or
-    is in the hub's cache under another digest.
-    """
-    found, blob = _content(path)[0], _blob(path)
-    if len(blob) == 64 and blob != found:
-        raise ModelError(f'{path} is damaged, its SHA-256 differs from that on the hub: remove '
-                         f'{os.path.realpath(path)}')
-    return found
+    """Return the SHA-256 of a file, computed once; ModelError: the file cannot be read."""
+    return _content(path)[0]
 
 
 def digest_network(file: Path) -> str:
-    """Return a hash of each byte of an ONNX file and of the files of weights that it names."""
-    depends = [digest_file(file), *(digest_file(path) if path.is_file() else ''
-                                    for path in weights_beside(file))]
-    return hashlib.sha256(repr(depends).encode()).hexdigest()
+    """Return the digests of an ONNX file and of all files of weights that it names."""
+    return ':'.join(digest_file(path) if path.is_file() else ''
+                    for path in (file, *weights_beside(file)))
 
 
 def weights_beside(file: Path) -> list[Path]:
@@ -103,14 +89,12 @@ def _read(path: Path, *_unchanged: int) -> tuple[str, list[str]]:
     with _opened(path) as file:
         while block := file.read(2**20):
             digest.update(block)
-            if path.suffix == '.onnx':
-                end += block
-                for match in _LOCATION.finditer(end) if b'\n\x08location' in end else ():
-                    high, low = match[1], match[2][0]
-                    size = low if high is None else (high[0] & 127) + 128 * low
-                    if match.end() + size <= len(end):
-                        names.add(os.fsdecode(end[match.end():match.end() + size]))
-                end = end[-_MOST_NAME:]
+            for text in (end + block[:_MOST_NAME], block) if path.suffix == '.onnx' else ():
+                for match in _LOCATION.finditer(text) if b'\n\x08location' in text else ():
+                    size = sum((byte & 127) << 7 * place for place, byte in enumerate(match[1]))
+                    if len(name := text[match.end():match.end() + size]) == size:
+                        names.add(os.fsdecode(name))
+            end = block[-_MOST_NAME:]
     return digest.hexdigest(), sorted(names)
 
 
@@ -120,9 +104,11 @@ def _blob(path: Path) -> str:
     return blob.name if blob.parent.name == 'blobs' and _DIGEST.fullmatch(blob.name) else ''
 
 
-def _opened(path: Path) -> BinaryIO:
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
     try:
-        return open_file(path)
+        with open_file(path) as file:
+            yield file
     except OSError as error:
         raise ModelError(f'{path} cannot be read: {error.strerror}; check the path of the weights'
                          ) from error
@@ -248,7 +234,7 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
         return chosen
 
     try:
-        place = Path(str(parse_json(read_file(marker))))
+        place = Path(str(json.loads(read_file(marker))))
         if place.is_absolute() or '..' in place.parts:
             raise ValueError('not a folder of this cache')
         found = own / place
@@ -256,7 +242,7 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
             for path in (found / part, *weights_beside(found / part)):
                 _check_content(path, _blob(path))
         return found
-    except (OSError, ValueError, ModelError) as error:
+    except (OSError, ValueError, RecursionError, ModelError) as error:
         if marker.exists():
             logger.warning('%s in %s cannot be used (%s): downloading it again', name, own, error)
 
@@ -302,12 +288,8 @@ def _check_content(file: Path, stated: str) -> None:
     """Compare a file with its digest on the hub; ValueError: it differs, and was removed."""
     if not stated:
         return
-    if len(stated) == 64:
-        found = _content(file)[0]
-    else:
-        content = read_file(file)
-        found = hashlib.sha1(b'blob %d\0' % len(content) + content,
-                             usedforsecurity=False).hexdigest()
-    if found != stated:
+    content = b'' if len(stated) == 64 else read_file(file)
+    if stated != (digest_file(file) if len(stated) == 64 else hashlib.sha1(
+            b'blob %d\0' % len(content) + content, usedforsecurity=False).hexdigest()):
         file.resolve().unlink()
         raise ValueError(f'the digest of {file.name} differs from that on the hub')

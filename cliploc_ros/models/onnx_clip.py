@@ -43,7 +43,7 @@ from cliploc_ros.models.files import (
     is_hub_name,
     resolve_folder,
 )
-from cliploc_ros.models.onnx_network import ANY, MOST, OnnxNetwork, numbers_in, one_of, read_config
+from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, colours, numbers, one_of, read_config
 from cliploc_ros.models.protocols import ClipOptions
 
 # Pillow's numbers of filters by open_clip's names, the default first.
@@ -156,37 +156,29 @@ class CropPreparation:
     """
 
     def __init__(self, folder: Path, fixed: Sequence[int]) -> None:
-        file = folder / PREPROCESS
-        purpose, mean, std = 'it defines the preparation of images', 'mean', 'std'
-        if file.exists():  # the format of open_clip
-            about = read_config(file, purpose)
-            size, self._mode = about.get('size'), one_of(
-                about, file, 'resize_mode', ('shortest', 'longest', 'squash'))
+        is_open_clip = (folder / PREPROCESS).exists()
+        file = folder / (PREPROCESS if is_open_clip else PREPROCESSOR)
+        about = read_config(file, 'it defines the preparation of images')
+        size = about.get('size')
+        if is_open_clip:
+            about |= {'image_mean': about.get('mean'), 'image_std': about.get('std')}
+            self._mode = one_of(about, file, 'resize_mode', ('shortest', 'longest', 'squash'))
             number = _FILTERS[one_of(about, file, 'interpolation', tuple(_FILTERS))]
         else:
-            file, mean, std = folder / PREPROCESSOR, 'image_mean', 'image_std'
-            about = read_config(file, purpose)
-            size, default = about.get('size'), {'rescale_factor': 1 / 255}
             crops = isinstance(size, dict) and 'shortest_edge' in size
             crops = one_of(about, file, 'do_center_crop', (crops, not crops))
-            size = about.get('crop_size') if crops else size
-            self._mode = 'shortest' if crops else 'squash'
+            size, self._mode = (about.get('crop_size'), 'shortest') if crops else (size, 'squash')
             number = one_of(about, file, 'resample', (3, 0, 1, 2, 4, 5))
-            if not one_of(about, file, 'do_rescale', (True, False)):
-                default, about = {}, about | {'rescale_factor': 1.0}
-            numbers_in(default | about, file, 'rescale_factor', 1, 1 / 256, 1 / 254)
-            if not one_of(about, file, 'do_normalize', (True, False)):
-                about |= {mean: 0.0, std: 1.0}
         if isinstance(size, dict):
             size = size.get('shortest_edge', [size.get('height'), size.get('width')])
-        height, width = map(int, numbers_in({'size': size}, file, 'size', 2, 1, _MOST_PX))
-        self._mean = numbers_in(about, file, mean, 3, -MOST, MOST).reshape(3, 1, 1)
-        self._std = numbers_in(about, file, std, 3, 1 / MOST, MOST).reshape(3, 1, 1)
+        height, width = map(int, numbers({'size': size}, file, 'size', 2, 1, _MOST_PX))
+        scale, mean, std = (found[:, None, None] for found in colours(about, file))
+        self._range, self._mean, self._std = map(np.float32, (1 / scale, mean, std))
         if any(want not in (ANY, has) for want, has in zip(fixed, (height, width), strict=True)):
             raise ModelError(f'{file} has an image size of {height} x {width}, but the network '
                              f'takes {fixed[0]} x {fixed[1]}: they are not from the same CLIP')
         self._height, self._width, self._filter = height, width, Image.Resampling(number)
-        self._fill = int(numbers_in({'fill_color': 0} | about, file, 'fill_color', 1, 0, 255)[0])
+        self._fill = int(numbers({'fill_color': 0} | about, file, 'fill_color', 1, 0, 255)[0])
 
     def __call__(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Convert a crop (h, w, 3) to the input (3, H, W) of the tower.
@@ -210,7 +202,7 @@ class CropPreparation:
                                 max(self._height - image.height, 0) // 2))
             image, left, top = frame, 0, 0
         image = image.crop((left, top, left + self._width, top + self._height))
-        pixels = np.asarray(image, dtype=np.float32).transpose(2, 0, 1) / np.float32(255)
+        pixels = np.asarray(image, dtype=np.float32).transpose(2, 0, 1) / self._range
         return np.asarray((pixels - self._mean) / self._std)
 
     def _scaled(self, width: int, height: int) -> tuple[int, int]:

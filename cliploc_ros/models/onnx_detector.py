@@ -27,7 +27,7 @@ from cliploc_ros.models.files import (
     is_hub_name,
     resolve_folder,
 )
-from cliploc_ros.models.onnx_network import ANY, MOST, OnnxNetwork, numbers_in, one_of, read_config
+from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, colours, numbers, one_of, read_config
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 
 _CONFIG, _PREPROCESSOR = 'config.json', 'preprocessor_config.json'
@@ -142,10 +142,8 @@ class YoloHead:
         # several texts of a class
         self.has_doubles = len(set(self.names.values())) < len(self.names)
         stride = about.get('stride', '')[:9]
-        self._stride = int(stride) if stride.isdecimal() else _STRIDE
-        if not 0 < self._stride <= _MOST_STRIDE:
-            raise ModelError(f'{network.file} has the stride {stride} in its metadata, expected 1 '
-                             f'to {_MOST_STRIDE}: export the network again')
+        self._stride = int(numbers({'stride': int(stride) if stride.isdecimal() else _STRIDE},
+                                   network.file, 'stride', 1, 1, _MOST_STRIDE)[0])
         height, width = self._input.shape[2:]
         self._size = None if ANY in (height, width) else (height, width)
         self._is_end2end = self._removes_doubles(self._run(np.zeros((1, 3, *(
@@ -222,7 +220,7 @@ class DetrHead:
         about = read_config(file, 'it defines the preparation of images')
         size, fixed = about.get('size'), self._input.shape[2:]
         if isinstance(size, dict):
-            size = {side: int(numbers_in(size, file, side, 1, 1, _MOST_PX)[0])
+            size = {side: int(numbers(size, file, side, 1, 1, _MOST_PX)[0])
                     for side in _SIDES if size.get(side) is not None}
         if not isinstance(size, dict) or not ({'height', 'width'} <= size.keys()
                                               or 'shortest_edge' in size):
@@ -234,14 +232,8 @@ class DetrHead:
                                  f'{fixed[0]} x {fixed[1]}: they are not from the same network')
             size = {'height': fixed[0], 'width': fixed[1]}
         self._size: dict[str, int] = size
-        if not one_of(about, file, 'do_rescale', (True, False)):
-            about |= {'rescale_factor': 1.0}
-        if not one_of(about, file, 'do_normalize', (True, False)):
-            about |= {'image_mean': 0.0, 'image_std': 1.0}
-        self._scale = numbers_in({'rescale_factor': 1 / 255} | about, file, 'rescale_factor', 1,
-                                 1 / 2**16, 1.0)
-        self._mean = numbers_in(about, file, 'image_mean', 3, -MOST, MOST)
-        self._deviation = numbers_in(about, file, 'image_std', 3, 1 / MOST, MOST)
+        self._scale, self._mean, self._deviation = (
+            found.astype(np.float32) for found in colours(about, file))
         self._resample = Image.Resampling(one_of(about, file, 'resample', (2, 0, 1, 3, 4, 5)))
         probe = self._run(np.zeros((64, 64, 3), dtype=np.uint8))[_LOGITS]
         #: Whether the last logit of a query means 'no object'

@@ -19,6 +19,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,8 +53,8 @@ _TYPES: dict[str, type[np.number[Any]]] = {
     'f32': np.float32, 'f16': np.float16, 'i64': np.int64, 'i32': np.int32}
 #: Marks a variable size of an input.
 ANY = -1
-#: Greatest mean and deviation of colours, which are at most 255.
-MOST = 1000.0
+# Greatest mean and deviation of colours, which are at most 255.
+_MOST = 1000.0
 
 logger = logging.getLogger(__name__)
 
@@ -108,11 +109,14 @@ class OnnxNetwork:
 
     def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
         check_weights_file(file)
-        openvino = import_openvino()
         self.file = file
-        # A compiled network is named by a hash of all that it depends on.
-        depends = [_FORMAT, digest_network(file), precision, openvino.get_version(),
-                   openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME')]
+        # A compiled network is named by a hash of all that it depends on. The import takes as long
+        # as the digest of 500 MB.
+        with ThreadPoolExecutor(1) as pool:
+            content = pool.submit(digest_network, file)
+            openvino = import_openvino()
+            depends = [_FORMAT, openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME'),
+                       openvino.get_version(), precision, content.result()]
         digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
         stored = resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}.blob'
         try:
@@ -177,8 +181,8 @@ def one_of(about: dict[str, Any], file: Path, name: str, choices: Sequence[Any])
     return value
 
 
-def numbers_in(about: dict[str, Any], file: Path, name: str, count: int, least: float, most: float
-               ) -> NDArray[np.float32]:
+def numbers(about: dict[str, Any], file: Path, name: str, count: int, least: float, most: float
+            ) -> NDArray[np.float64]:
     """Return the numbers (count,) of a field of a file; a single number counts for all.
 
     ModelError: it is missing, has another type or length, or a number is out of range.
@@ -190,7 +194,22 @@ def numbers_in(about: dict[str, Any], file: Path, name: str, count: int, least: 
             and least <= number <= most for number in found):
         raise ModelError(f"{file}: the field '{name}' is {str(value)[:80]!r}, expected {count} "
                          f'number(s) from {least:.4g} to {most:.4g}: download the file again')
-    return np.array(found, dtype=np.float32)
+    return np.array(found, dtype=np.float64)
+
+
+def colours(about: dict[str, Any], file: Path) -> list[NDArray[np.float64]]:
+    """Return scale (1,), mean (3,) and deviation (3,) of the colours, as transformers states them.
+
+    ModelError: a field is missing or wrong.
+    """
+    if not one_of(about, file, 'do_rescale', (True, False)):
+        about = about | {'rescale_factor': 1.0}
+    if not one_of(about, file, 'do_normalize', (True, False)):
+        about = about | {'image_mean': 0.0, 'image_std': 1.0}
+    return [numbers({'rescale_factor': 1 / 255} | about, file, name, count, least, most)
+            for name, count, least, most in (
+                ('rescale_factor', 1, 1 / 2**16, 1.0), ('image_mean', 3, -_MOST, _MOST),
+                ('image_std', 3, 1 / _MOST, _MOST))]
 
 
 # ---- the process --------------------------------------------------------------------------------
@@ -250,8 +269,8 @@ def _without_links(file: Path) -> Iterator[Path]:
 
     The hub's cache has links to files in another folder, which OpenVINO refuses to follow.
     """
-    beside = [path for path in weights_beside(file) if path.is_file()
-              and path.absolute().is_relative_to(file.parent)]
+    beside = [path for path in weights_beside(file) if path.is_file() and '..' not in path.parts
+              and path.is_relative_to(file.parent)]
     if not any(path.is_symlink() for path in beside):
         yield file
         return
