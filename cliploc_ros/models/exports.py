@@ -16,7 +16,13 @@ from typing import Any
 
 from cliploc_ros.errors import CliplocError, ModelError
 from cliploc_ros.files.storage import MAKE_ROOM, parse_json, read_file, resolve_cache_dir
-from cliploc_ros.models.files import digest_file, fingerprint_file, first_line, remove_unused
+from cliploc_ros.models.files import (
+    digest_file,
+    digest_files,
+    fingerprint_file,
+    first_line,
+    remove_unused,
+)
 from cliploc_ros.models.onnx_network import free_memory
 
 # Version of these folders and of the export; a change makes new folders.
@@ -74,6 +80,7 @@ def export_key(folder: Path) -> str:
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError,
                              RecursionError, ModelError):
         about: dict[str, Any] = parse_json(read_file(folder / _ABOUT))
+        digest_files([folder / name for name in about['files']])
         changed = [name for name, digest in about['files'].items()
                    if digest not in (digest_file(folder / name), fingerprint_file(folder / name))]
         if not changed:

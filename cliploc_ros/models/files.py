@@ -11,6 +11,7 @@ import re
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from fnmatch import fnmatch
 from functools import lru_cache
@@ -62,6 +63,12 @@ def fingerprint_file(path: Path) -> str:
 def digest_file(path: Path) -> str:
     """Return the SHA-256 of a file, computed once; ModelError: the file cannot be read."""
     return _content(path)[0]
+
+
+def digest_files(files: Sequence[Path]) -> None:
+    """Compute the SHA-256 of files side by side; ModelError: a file cannot be read."""
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(digest_file, files))
 
 
 def digest_network(file: Path) -> str:
@@ -139,7 +146,9 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
     logger.info('downloading %s into %s', what, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        return Path(fetch())
+        file = Path(fetch())
+        _check_content(file, _blob(file))
+        return file
     except ModelError:
         raise
     except Exception as error:  # each library has different exceptions
@@ -238,9 +247,11 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
         if place.is_absolute() or '..' in place.parts:
             raise ValueError('not a folder of this cache')
         found = own / place
-        for part in choose([str(path.relative_to(found)) for path in found.rglob('*')]):
-            for path in (found / part, *weights_beside(found / part)):
-                _check_content(path, _blob(path))
+        parts = [found / part for part in choose(
+            [str(path.relative_to(found)) for path in found.rglob('*')])]
+        digest_files(parts)
+        for path in [*parts, *(path for part in parts for path in weights_beside(part))]:
+            _check_content(path, _blob(path))
         return found
     except (OSError, ValueError, RecursionError, ModelError) as error:
         if marker.exists():
