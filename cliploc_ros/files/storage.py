@@ -351,6 +351,19 @@ def is_foreign(status: os.stat_result, owners: Collection[int]) -> bool:
             or (bool(status.st_mode & stat.S_IWGRP) and status.st_gid not in (os.getgid(), 0)))
 
 
+def check_owners(folder: Path) -> None:
+    """Raise a PermissionError if other users may have written to a folder of a cache.
+
+    Trusted are this user, root and the owner of the package, which all can change it anyway.
+    """
+    trusted, is_ours = {os.getuid(), 0, Path(__file__).stat().st_uid}, True
+    with suppress(OSError):  # reported by the first write
+        is_ours = not any(is_foreign(path.stat(), trusted)
+                          for path in (folder, *folder.iterdir()))
+    if not is_ours:
+        raise PermissionError(errno.EACCES, 'other users own its folder or can write to it')
+
+
 @cache
 def _process_cache(reason: str) -> Path:
     folder = Path(tempfile.mkdtemp(prefix='cliploc_ros_cache_'))

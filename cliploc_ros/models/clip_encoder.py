@@ -32,7 +32,13 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.arrays import Check, Field, Schema
-from cliploc_ros.files.storage import MAKE_ROOM, replace_file, resolve_cache_dir, warn_not_kept
+from cliploc_ros.files.storage import (
+    MAKE_ROOM,
+    check_owners,
+    replace_file,
+    resolve_cache_dir,
+    warn_not_kept,
+)
 from cliploc_ros.models.files import remove_unused
 from cliploc_ros.models.observer import crop_bounds
 from cliploc_ros.models.onnx_clip import (
@@ -94,7 +100,7 @@ def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequen
     rows = {description: row for row, description in enumerate(unique)}
 
     def encode(texts: Sequence[str]) -> NDArray[np.float32]:
-        return encoded_once(weights.key, texts, weights.embed_dim, options.cache_dir,
+        return encoded_once(weights.text_key, texts, weights.embed_dim, options.cache_dir,
                             lambda missing: encode_labels(weights, missing, options))
     labels = LabelEmbeddings(mixed_rows(unique, encode), np.array(
         [rows[description] for description in landmark_map.weighted_labels], dtype=np.int64))
@@ -244,12 +250,13 @@ class LabelCache:
         if not file.exists():
             return None
         try:
+            check_owners(self._folder)
             arrays = _SCHEMA.read(file)
             embeddings = arrays['embeddings']
             if (bytes(arrays['identity']), embeddings.shape) != (
                     _identity(key, labels), (len(labels), embed_dim)):
                 raise ModelError('it is for other weights or labels')
-        except ModelError as error:
+        except (ModelError, PermissionError) as error:
             logger.warning('label embeddings in %s cannot be used (%s): encoding the labels again',
                            file, error)
             return None
@@ -262,6 +269,7 @@ class LabelCache:
         file = self._file(key, labels)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
+            check_owners(self._folder)
             remove_unused(self._folder, self._most_files - 1)
             with replace_file(file) as partial:
                 np.savez(partial, embeddings=embeddings,

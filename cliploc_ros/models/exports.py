@@ -22,7 +22,13 @@ from cliploc_ros.files.storage import (
     resolve_cache_dir,
     unfinished,
 )
-from cliploc_ros.models.files import fingerprint_file, first_line, remove_unused
+from cliploc_ros.models.files import (
+    digest_file,
+    digest_files,
+    fingerprint_file,
+    first_line,
+    remove_unused,
+)
 from cliploc_ros.models.onnx_network import free_memory
 
 # Version of these folders and of the export; a change makes new folders.
@@ -66,20 +72,27 @@ def needs_pytorch(what: str, otherwise: str = '') -> Iterator[None]:
 
 
 def describe_export(folder: Path, key: str) -> None:
-    """Complete a folder: write the fingerprints of its files, and the key of the weights."""
+    """Complete a folder: write the SHA-256 of its files, and the key of the weights."""
     files = sorted(file for file in folder.rglob('*') if file.is_file())
     (folder / _ABOUT).write_text(json.dumps({'key': key, 'files': {
-        str(file.relative_to(folder)): fingerprint_file(file) for file in files}}))
+        str(file.relative_to(folder)): digest_file(file) for file in files}}))
 
 
 def export_key(folder: Path) -> str:
-    """Return the key of the weights in an export; '' for other folders and changed exports."""
+    """Return the key of the weights in an export; '' for other folders and changed exports.
+
+    A changed export causes a warning. Exports of older versions have fingerprints.
+    """
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError,
                              RecursionError, ModelError):
         about: dict[str, Any] = parse_json(read_file(folder / _ABOUT))
-        if all(fingerprint_file(folder / name) == fingerprint
-               for name, fingerprint in about['files'].items()):
+        digest_files([folder / name for name in about['files']])
+        changed = [name for name, digest in about['files'].items()
+                   if digest not in (digest_file(folder / name), fingerprint_file(folder / name))]
+        if not changed:
             return str(about['key'])
+        logger.warning('%s differs from its digest in %s: it is damaged or was edited; export the '
+                       'network again, or remove %s', folder / changed[0], _ABOUT, _ABOUT)
     return ''
 
 

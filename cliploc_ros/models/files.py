@@ -9,8 +9,11 @@ import logging
 import os
 import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from fnmatch import fnmatch
+from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,8 +24,15 @@ _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
 # A zip archive, a bare pickle (PyTorch before 1.6), a NumPy array.
 _HEADS = (b'PK', b'\x80', b'\x93NUMPY')
-# OWNER/NAME[@REVISION][:FILE]; the revision is a branch, tag or commit.
-_NAME = re.compile(r'([\w-][\w.-]*/[\w-][\w.-]*)(?:@([\w][\w.-]*))?(?::([\w][\w./-]*\.onnx))?')
+# OWNER/NAME[@REVISION][:FILE]; the revision is a branch, tag, commit or refs/pr/NUMBER.
+_NAME = re.compile(r'([\w-][\w.-]*/[\w-][\w.-]*)(?:@(\w[\w.-]*(?:/\w[\w.-]*)*))?'
+                   r'(?::(\w[\w./-]*\.onnx))?')
+# Suffixes of local files, which are no names on the hub.
+_LOCAL = ('.onnx', '.pt', '.pth', '.ts', '.safetensors', '.bin', '.json')
+# The digests of the hub: SHA-256 for large files, otherwise git's SHA-1.
+_DIGEST = re.compile('[0-9a-f]{40}|[0-9a-f]{64}')
+# A file of weights as named in an ONNX file: the key of an entry, and the size of the name.
+_LOCATION, _MOST_NAME = re.compile(rb'\n\x08location\x12([\x80-\xff]?[\0-\x7f])'), 4096
 # Time-out of the first request, in case a firewall drops its packets [s].
 _PATIENCE_S = 10.0
 
@@ -47,9 +57,62 @@ def fingerprint_file(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _opened(path: Path) -> BinaryIO:
+def digest_file(path: Path) -> str:
+    """Return the SHA-256 of a file, computed once; ModelError: the file cannot be read."""
+    return _content(path)[0]
+
+
+def digest_files(files: Sequence[Path]) -> None:
+    """Compute the SHA-256 of files side by side; ModelError: a file cannot be read."""
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(digest_file, files))
+
+
+def digest_network(file: Path) -> str:
+    """Return the digests of an ONNX file and of all files of weights that it names."""
+    return ':'.join(digest_file(path) if path.is_file() else ''
+                    for path in (file, *weights_beside(file)))
+
+
+def weights_beside(file: Path) -> list[Path]:
+    """Return the files of weights that an ONNX file names; ModelError: it cannot be read."""
+    return [file.parent / name for name in _content(file)[1]]
+
+
+def _content(path: Path) -> tuple[str, list[str]]:
+    with _opened(path) as file:
+        status = os.fstat(file.fileno())
+    return _read(path, status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns,
+                 status.st_ctime_ns)
+
+
+@lru_cache(64)
+def _read(path: Path, *_unchanged: int) -> tuple[str, list[str]]:
+    """Return the SHA-256 of a file, and the names of the files of weights in an ONNX file."""
+    digest, names, end = hashlib.sha256(), set[str](), b''
+    with _opened(path) as file:
+        while block := file.read(2**20):
+            digest.update(block)
+            for text in (end + block[:_MOST_NAME], block) if path.suffix == '.onnx' else ():
+                for match in _LOCATION.finditer(text) if b'\n\x08location' in text else ():
+                    size = sum((byte & 127) << 7 * place for place, byte in enumerate(match[1]))
+                    if len(name := text[match.end():match.end() + size]) == size:
+                        names.add(os.fsdecode(name))
+            end = block[-_MOST_NAME:]
+    return digest.hexdigest(), sorted(names)
+
+
+def _blob(path: Path) -> str:
+    """Return the digest in the name of a file in the hub's cache, which is a link to it; or ''."""
+    blob = path.readlink() if path.is_symlink() else path
+    return blob.name if blob.parent.name == 'blobs' and _DIGEST.fullmatch(blob.name) else ''
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
     try:
-        return open_file(path)
+        with open_file(path) as file:
+            yield file
     except OSError as error:
         raise ModelError(f'{path} cannot be read: {error.strerror}; check the path of the weights'
                          ) from error
@@ -80,7 +143,9 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
     logger.info('downloading %s into %s', what, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        return Path(fetch())
+        file = Path(fetch())
+        _check_content(file, _blob(file))
+        return file
     except ModelError:
         raise
     except Exception as error:  # each library has different exceptions
@@ -122,8 +187,9 @@ def first_line(error: Exception) -> str:
 
 def is_hub_name(name: str) -> bool:
     """Return whether a name is OWNER/NAME[@REVISION][:FILE], and not a local file or folder."""
-    return (not Path(name).expanduser().exists() and _NAME.fullmatch(name) is not None
-            and Path(name).suffix not in ('.pt', '.ts', '.safetensors', '.bin', '.json'))
+    match = _NAME.fullmatch(name)
+    return (match is not None and Path(match[1]).suffix not in _LOCAL
+            and not Path(name).expanduser().exists())
 
 
 def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequence[str],
@@ -131,8 +197,9 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
     """Return a folder with networks and the files next to them; download it if necessary.
 
     A complete download is marked, and no further request is sent. Each file is compared with the
-    digest given by the hub, and interrupted downloads are continued. Proxy, mirror and offline
-    mode are those of huggingface_hub: HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE.
+    digest given by the hub, at the download and at each use. A damaged file is downloaded again,
+    and interrupted downloads are continued. Proxy, mirror and offline mode are those of
+    huggingface_hub: HTTPS_PROXY, HF_ENDPOINT, HF_HUB_OFFLINE.
 
     ModelError: the name is neither a folder nor a name on the hub, or the download fails.
 
@@ -158,20 +225,8 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
     request = json.dumps([repository, revision, [*map(list, wanted)], list(beside)])
     digest = hashlib.sha256(request.encode()).hexdigest()
     marker = own / f'{repository.replace("/", "--")}-{digest[:16]}.json'
-    try:
-        found = own / str(json.loads(read_file(marker)))
-    except (OSError, ValueError):
-        found = own / 'missing'
-    if found.is_dir():
-        return found
 
-    def fetch() -> Path:
-        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
-        import huggingface_hub
-
-        info = huggingface_hub.HfApi().model_info(repository, revision=revision,
-                                                  timeout=_PATIENCE_S)
-        files = [sibling.rfilename for sibling in info.siblings or ()]
+    def choose(files: Sequence[str]) -> list[str]:
         chosen = [file for file in files if any(fnmatch(file, pattern) for pattern in beside)]
         for patterns in wanted:
             main = next((file for pattern in patterns for file in files
@@ -180,13 +235,44 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
                 raise ModelError(f'{name} has none of {", ".join(patterns)}: it has '
                                  f'{", ".join(files)}')
             chosen += [file for file in files if file.startswith(main)]
-        for file in chosen:
-            path = Path(huggingface_hub.hf_hub_download(
-                repository, file, revision=info.sha, cache_dir=own))
-            _check_content(path)
-        snapshot = Path(str(path)[:-len(file)])
+        return chosen
+
+    try:
+        place = Path(str(json.loads(read_file(marker))))
+        if place.is_absolute() or '..' in place.parts:
+            raise ValueError('not a folder of this cache')
+        found = own / place
+        parts = [found / part for part in choose(
+            [str(path.relative_to(found)) for path in found.rglob('*')])]
+        digest_files(parts)
+        for path in [*parts, *(path for part in parts for path in weights_beside(part))]:
+            _check_content(path, _blob(path))
+        return found
+    except (OSError, ValueError, RecursionError, ModelError) as error:
+        if marker.exists():
+            logger.warning('%s in %s cannot be used (%s): downloading it again', name, own, error)
+
+    def fetch() -> Path:
+        os.environ.setdefault('HF_HUB_DISABLE_TELEMETRY', '1')
+        import huggingface_hub as hub
+
+        info = hub.HfApi().model_info(repository, revision=revision, timeout=_PATIENCE_S)
+        commit, files = info.sha, [sibling.rfilename for sibling in info.siblings or ()]
+        chosen = choose(files)
+        for part in chosen:
+            # before the download, which uses both as names of files
+            stated = hub.get_hf_file_metadata(hub.hf_hub_url(
+                repository, part, revision=commit), timeout=_PATIENCE_S)
+            if not all(map(_DIGEST.fullmatch, (str(stated.etag), str(commit)))):
+                raise ValueError(f'the hub states no digest of {part}, but {stated.etag!r:.80} '
+                                 f'and the commit {commit!r:.80}')
+            path = Path(hub.hf_hub_download(repository, part, revision=commit, cache_dir=own))
+            _check_content(path, str(stated.etag))
+            snapshot = Path(str(path)[:-len(part)])
+            chosen += [file for file in files if file not in chosen
+                       and snapshot / file in weights_beside(path)]
         with replace_file(marker) as partial:
-            partial.write_text(json.dumps(str(snapshot.relative_to(own))))
+            partial.write_text(json.dumps(str(snapshot.resolve().relative_to(own.resolve()))))
         return snapshot
 
     listed = ', '.join([*(patterns[0] for patterns in wanted), *beside])
@@ -198,27 +284,18 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
 def find_network(folder: Path, name: str, networks: Sequence[str]) -> Path:
     """Return the ONNX file in a folder of `resolve_folder`; ModelError: there is none."""
     match = _NAME.fullmatch(name)
-    if match is not None and match[3] and (folder / match[3]).is_file():
-        return folder / match[3]
-    for pattern in networks:
+    for pattern in [match[3]] if match is not None and match[3] else networks:
         for file in sorted(folder.glob(pattern)):
             return file
     raise ModelError(f'{folder} has none of {", ".join(networks)}: put an ONNX file there')
 
 
-def _check_content(file: Path) -> None:
-    """Compare a file with its digest on the hub; ValueError: it differs, and was removed.
-
-    The hub's cache names each file after its digest: SHA-256 for large files, otherwise git's
-    SHA-1.
-    """
-    blob = file.resolve()
-    content = hashlib.sha256 if len(blob.name) == 64 else hashlib.sha1
-    head = b'' if len(blob.name) == 64 else b'blob %d\0' % blob.stat().st_size
-    digest = content(head, usedforsecurity=False)
-    with blob.open('rb') as opened:
-        while block := opened.read(2**20):
-            digest.update(block)
-    if len(blob.name) in (40, 64) and digest.hexdigest() != blob.name:
-        blob.unlink()
+def _check_content(file: Path, stated: str) -> None:
+    """Compare a file with its digest on the hub; ValueError: it differs, and was removed."""
+    if not stated:
+        return
+    content = b'' if len(stated) == 64 else read_file(file)
+    if stated != (digest_file(file) if len(stated) == 64 else hashlib.sha1(
+            b'blob %d\0' % len(content) + content, usedforsecurity=False).hexdigest()):
+        file.resolve().unlink()
         raise ValueError(f'the digest of {file.name} differs from that on the hub')

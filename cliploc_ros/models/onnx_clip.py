@@ -35,17 +35,19 @@ from cliploc_ros.models.exports import (
     exported,
 )
 from cliploc_ros.models.files import (
+    digest_file,
+    digest_network,
     find_network,
     fingerprint_file,
     first_line,
     is_hub_name,
     resolve_folder,
 )
-from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
+from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, colours, numbers, one_of, read_config
 from cliploc_ros.models.protocols import ClipOptions
 
-# Pillow's numbers of filters, as written by transformers.
-_FILTERS = {2: 'bilinear', 3: 'bicubic'}
+# Pillow's numbers of filters by open_clip's names, the default first.
+_FILTERS = {'bicubic': 3, 'random': 3, 'bilinear': 2}
 # Defaults of CLIP's configuration.
 _DEFAULTS = {'max_position_embeddings': 77, 'vocab_size': 49_408}
 # Greatest side of an input; the largest published towers take 1024 px.
@@ -66,7 +68,12 @@ class ClipWeights:
     image_tower: Path
     text_tower: Path
     embed_dim: int  #: Length of an embedding
-    key: str  #: Identifies model and weights
+    key: str  #: Identifies model and weights, in maps
+
+    @property
+    def text_key(self) -> str:
+        """Identify each byte of the text tower, for the cache of label embeddings."""
+        return f'{self.key}:{digest_network(self.text_tower)}'
 
 
 def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
@@ -84,12 +91,12 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
         given, config = Path(named).expanduser().absolute(), ''
         name = options.model.replace('/', '-')  # OpenAI's spelling is ViT-L/14
         if name.endswith('.json') and (file := Path(options.model).expanduser()).is_file():
-            name, config = file.stem, fingerprint_file(file)
+            name, config = file.stem, digest_file(file)
         tag = options.pretrained if options.checkpoint_path or not given.is_file() else ''
 
         from cliploc_ros.models.export import export_clip
         folder = exported(options.cache_dir, name, f'CLIP {name}', (
-            'CLIP', name, config, tag, fingerprint_file(given) if given.is_file() else ''),
+            'CLIP', name, config, tag, digest_file(given) if given.is_file() else ''),
             partial(export_clip, options), WITHOUT_CLIP)
     image_tower = find_network(folder, named, IMAGE_TOWERS)
     text_tower = find_network(folder, '', TEXT_TOWERS)
@@ -149,34 +156,29 @@ class CropPreparation:
     """
 
     def __init__(self, folder: Path, fixed: Sequence[int]) -> None:
-        file = folder / PREPROCESS
-        if file.exists():  # the format of open_clip
-            about = read_config(file, 'it defines the preparation of images')
-        else:
-            file = folder / PREPROCESSOR
-            about = _in_the_form_of_open_clip(
-                read_config(file, 'it defines the preparation of images'))
+        is_open_clip = (folder / PREPROCESS).exists()
+        file = folder / (PREPROCESS if is_open_clip else PREPROCESSOR)
+        about = read_config(file, 'it defines the preparation of images')
         size = about.get('size')
+        if is_open_clip:
+            about |= {'image_mean': about.get('mean'), 'image_std': about.get('std')}
+            self._mode = one_of(about, file, 'resize_mode', ('shortest', 'longest', 'squash'))
+            number = _FILTERS[one_of(about, file, 'interpolation', tuple(_FILTERS))]
+        else:
+            crops = isinstance(size, dict) and 'shortest_edge' in size
+            crops = one_of(about, file, 'do_center_crop', (crops, not crops))
+            size, self._mode = (about.get('crop_size'), 'shortest') if crops else (size, 'squash')
+            number = one_of(about, file, 'resample', (3, 0, 1, 2, 4, 5))
         if isinstance(size, dict):
-            size = size.get('shortest_edge', (size.get('height'), size.get('width')))
-        try:
-            height, width = map(int, (size, size) if isinstance(size, int) else tuple(size))  # type: ignore[arg-type]
-            mean, std = (np.array(about[name], np.float32).reshape(3, 1, 1)
-                         for name in ('mean', 'std'))
-            if not (0 < height <= _MOST_PX and 0 < width <= _MOST_PX and np.isfinite(mean).all()
-                    and np.isfinite(std).all() and (std > 0.0).all()):
-                raise ValueError('a number is out of range')
-        except (LookupError, ValueError, TypeError, OverflowError) as error:
-            raise ModelError(f'{file} does not define the preparation of images: expected a size '
-                             f'up to {_MOST_PX}, mean and standard deviation') from error
+            size = size.get('shortest_edge', [size.get('height'), size.get('width')])
+        height, width = map(int, numbers({'size': size}, file, 'size', 2, 1, _MOST_PX))
+        scale, mean, std = (found[:, None, None] for found in colours(about, file))
+        self._range, self._mean, self._std = map(np.float32, (1 / scale, mean, std))
         if any(want not in (ANY, has) for want, has in zip(fixed, (height, width), strict=True)):
             raise ModelError(f'{file} has an image size of {height} x {width}, but the network '
                              f'takes {fixed[0]} x {fixed[1]}: they are not from the same CLIP')
-        self._height, self._width, self._mean, self._std = height, width, mean, std
-        self._mode = about.get('resize_mode') or 'shortest'
-        self._filter = (Image.Resampling.BILINEAR if about.get('interpolation') == 'bilinear'
-                        else Image.Resampling.BICUBIC)
-        self._fill = about.get('fill_color') or 0
+        self._height, self._width, self._filter = height, width, Image.Resampling(number)
+        self._fill = int(numbers({'fill_color': 0} | about, file, 'fill_color', 1, 0, 255)[0])
 
     def __call__(self, crop_rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Convert a crop (h, w, 3) to the input (3, H, W) of the tower.
@@ -200,7 +202,7 @@ class CropPreparation:
                                 max(self._height - image.height, 0) // 2))
             image, left, top = frame, 0, 0
         image = image.crop((left, top, left + self._width, top + self._height))
-        pixels = np.asarray(image, dtype=np.float32).transpose(2, 0, 1) / np.float32(255)
+        pixels = np.asarray(image, dtype=np.float32).transpose(2, 0, 1) / self._range
         return np.asarray((pixels - self._mean) / self._std)
 
     def _scaled(self, width: int, height: int) -> tuple[int, int]:
@@ -214,17 +216,6 @@ class CropPreparation:
                     else (int(side * width / short), side))
         ratio = max(ratios) if self._mode == 'longest' else min(ratios)
         return round(width / ratio), round(height / ratio)
-
-
-def _in_the_form_of_open_clip(about: dict[str, Any]) -> dict[str, Any]:
-    size = about.get('size')
-    squashes = not about.get('do_center_crop', isinstance(size, dict) and 'shortest_edge' in size)
-    is_scaled = about.get('do_normalize', True)
-    return {'size': about.get('crop_size') if not squashes else size,
-            'resize_mode': 'squash' if squashes else 'shortest',
-            'interpolation': _FILTERS.get(about.get('resample', 3), 'bicubic'),
-            'mean': about.get('image_mean') if is_scaled else [0.0] * 3,
-            'std': about.get('image_std') if is_scaled else [1.0] * 3}
 
 
 class OnnxTextTower:

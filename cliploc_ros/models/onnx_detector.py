@@ -19,14 +19,15 @@ from PIL import Image
 
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.models.exports import DETECTOR, export_key, exported
 from cliploc_ros.models.files import (
+    digest_file,
     find_network,
-    fingerprint_file,
     first_line,
     is_hub_name,
     resolve_folder,
 )
-from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
+from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, colours, numbers, one_of, read_config
 from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
 
 _CONFIG, _PREPROCESSOR = 'config.json', 'preprocessor_config.json'
@@ -34,11 +35,15 @@ _CONFIG, _PREPROCESSOR = 'config.json', 'preprocessor_config.json'
 NETWORKS = ('model.onnx', 'onnx/model.onnx')
 BESIDE = (_CONFIG, _PREPROCESSOR)
 _LOGITS, _BOXES = 'logits', 'pred_boxes'
-# Default stride of YOLO, for files without one.
-_STRIDE = 32
+# Default stride of YOLO, for files without one, and greatest stride.
+_STRIDE, _MOST_STRIDE = 32, 1024
+# Fields of a size, and greatest side of an image that a network takes.
+_SIDES, _MOST_PX = ('height', 'width', 'shortest_edge', 'longest_edge'), 8192
 # Grey of the borders, and greatest number of boxes that are compared, as in ultralytics.
 _GREY = (114, 114, 114)
 _MOST_BOXES = 30_000
+# Greatest length of the name of a class, as in a map.
+_MOST_NAME = 1000
 # Columns of the output of a network that removes duplicates itself: box, score, class.
 _END2END = 6
 
@@ -55,9 +60,10 @@ class OnnxDetector:
             raise OptionsError(f'{options.model} has fixed classes: a vocabulary needs the .pt '
                                'file of a YOLO-World or YOLOE')
         file = Path(options.model).expanduser().absolute()
-        if file.suffix != '.onnx' and not file.is_file():
+        if is_hub_name(options.model) or file.is_dir():
             file = find_network(resolve_folder(options.model, [NETWORKS], BESIDE,
                                                options.cache_dir), options.model, NETWORKS)
+        export_key(file.parent)  # warns about a changed export
         network = OnnxNetwork(file, options.cache_dir)
         self._head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs) else YoloHead)(network)
         #: All classes of the network
@@ -104,16 +110,15 @@ def load_detector(options: DetectorOptions) -> ObjectDetector:
         The options name prompts for a network with fixed classes.
     """
     path = Path(options.model).expanduser()
-    if path.suffix == '.onnx' or path.is_dir() or is_hub_name(options.model):
+    if is_hub_name(options.model) or path.suffix == '.onnx' or path.is_dir():
         return OnnxDetector(options)
-    from cliploc_ros.models.exports import DETECTOR, exported
     from cliploc_ros.models.yolo_weights import export_detector, resolve_published
 
     file = resolve_published(options.model, options.cache_dir, 'model')
-    identity = [fingerprint_file(file)]
+    identity = [digest_file(file)]
     if options.prompts:
         tower = Path(options.text_model).expanduser()
-        identity += [fingerprint_file(tower) if tower.is_file() else options.text_model,
+        identity += [digest_file(tower) if tower.is_file() else options.text_model,
                      json.dumps(options.prompts)]
     folder = exported(options.cache_dir, 'YOLO', str(file), identity,
                       partial(export_detector, file, options))
@@ -136,7 +141,9 @@ class YoloHead:
         self.names = _names(network)
         # several texts of a class
         self.has_doubles = len(set(self.names.values())) < len(self.names)
-        self._stride = int(about['stride']) if about.get('stride', '').isdecimal() else _STRIDE
+        stride = about.get('stride', '')[:9]
+        self._stride = int(numbers({'stride': int(stride) if stride.isdecimal() else _STRIDE},
+                                   network.file, 'stride', 1, 1, _MOST_STRIDE)[0])
         height, width = self._input.shape[2:]
         self._size = None if ANY in (height, width) else (height, width)
         self._is_end2end = self._removes_doubles(self._run(np.zeros((1, 3, *(
@@ -211,29 +218,23 @@ class DetrHead:
         self.names = _names(network)
         file = _beside(network.file, _PREPROCESSOR)
         about = read_config(file, 'it defines the preparation of images')
-        size = about.get('size')
-        fixed = self._input.shape[2:]
+        size, fixed = about.get('size'), self._input.shape[2:]
+        if isinstance(size, dict):
+            size = {side: int(numbers(size, file, side, 1, 1, _MOST_PX)[0])
+                    for side in _SIDES if size.get(side) is not None}
         if not isinstance(size, dict) or not ({'height', 'width'} <= size.keys()
                                               or 'shortest_edge' in size):
             raise ModelError(f"{file}: the field 'size' has neither height and width nor "
-                             f'shortest_edge: {size}')
+                             f'shortest_edge: {str(size)[:80]}')
         if ANY not in fixed:
             if 'height' in size and (size['height'], size['width']) != fixed:
                 raise ModelError(f'{file} has the size {size}, but {network.file} takes '
                                  f'{fixed[0]} x {fixed[1]}: they are not from the same network')
             size = {'height': fixed[0], 'width': fixed[1]}
         self._size: dict[str, int] = size
-        self._scale = np.float32(about.get('rescale_factor', 1 / 255)
-                                 if about.get('do_rescale', True) else 1.0)
-        self._mean, self._deviation = np.zeros(3, np.float32), np.ones(3, np.float32)
-        if about.get('do_normalize', True):
-            try:
-                self._mean = np.array(about['image_mean'], np.float32).reshape(3)
-                self._deviation = np.array(about['image_std'], np.float32).reshape(3)
-            except (LookupError, ValueError, TypeError) as error:
-                raise ModelError(f"{file}: the fields 'image_mean' and 'image_std' must have "
-                                 'three numbers each') from error
-        self._resample = Image.Resampling(about.get('resample', Image.Resampling.BILINEAR))
+        self._scale, self._mean, self._deviation = (
+            found.astype(np.float32) for found in colours(about, file))
+        self._resample = Image.Resampling(one_of(about, file, 'resample', (2, 0, 1, 3, 4, 5)))
         probe = self._run(np.zeros((64, 64, 3), dtype=np.uint8))[_LOGITS]
         #: Whether the last logit of a query means 'no object'
         self._has_nothing = probe.shape[-1] == len(self.names) + 1
@@ -316,6 +317,11 @@ def _names(network: OnnxNetwork) -> dict[int, str]:
     if not isinstance(found, dict) or sorted(map(str, found)) != sorted(
             map(str, range(len(found)))) or not found:
         raise ModelError(f'{where} must have class names with the keys 0, 1 ...')
+    for number, name in found.items():
+        # a boolean is an int, too
+        if type(name) not in (str, int) or not 0 < len(str(name).strip()) <= _MOST_NAME:
+            raise ModelError(f'{where}: class {number} has the name {str(name)[:80]!r}, expected '
+                             f'a text of 1 to {_MOST_NAME} characters: add it')
     return {int(number): str(name) for number, name in found.items()}
 
 

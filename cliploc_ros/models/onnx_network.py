@@ -10,13 +10,16 @@ memory (studies/README.md).
 import contextlib
 import ctypes
 import gc
-import glob
 import hashlib
 import json
 import logging
 import os
+import shutil
 import sys
+import tempfile
 import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +30,7 @@ from numpy.typing import NDArray
 from cliploc_ros.errors import ModelError
 from cliploc_ros.files.storage import (
     MAKE_ROOM,
+    check_owners,
     parse_json,
     read_file,
     replace_file,
@@ -35,9 +39,10 @@ from cliploc_ros.files.storage import (
 )
 from cliploc_ros.models.files import (
     check_weights_file,
-    fingerprint_file,
+    digest_network,
     first_line,
     remove_unused,
+    weights_beside,
 )
 
 # A compiled network is as large as its file: ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
@@ -48,6 +53,8 @@ _TYPES: dict[str, type[np.number[Any]]] = {
     'f32': np.float32, 'f16': np.float16, 'i64': np.int64, 'i32': np.int32}
 #: Marks a variable size of an input.
 ANY = -1
+# Greatest mean and deviation of colours, which are at most 255.
+_MOST = 1000.0
 
 logger = logging.getLogger(__name__)
 
@@ -102,13 +109,14 @@ class OnnxNetwork:
 
     def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
         check_weights_file(file)
-        openvino = import_openvino()
         self.file = file
-        # A compiled network is named by a hash of all that it depends on, including the file of
-        # weights next to a large network.
-        files = sorted(file.parent.glob(f'{glob.escape(file.name)}*'))
-        depends = [_FORMAT, *map(fingerprint_file, files), precision, openvino.get_version(),
-                   openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME')]
+        # A compiled network is named by a hash of all that it depends on. The import takes as long
+        # as the digest of 500 MB.
+        with ThreadPoolExecutor(1) as pool:
+            content = pool.submit(digest_network, file)
+            openvino = import_openvino()
+            depends = [_FORMAT, openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME'),
+                       openvino.get_version(), precision, content.result()]
         digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
         stored = resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}.blob'
         try:
@@ -149,7 +157,8 @@ class OnnxNetwork:
 def read_config(file: Path, purpose: str) -> dict[str, Any]:
     """Read the JSON object of a file next to a network; ModelError: it is missing or damaged.
 
-    The error states the purpose of the file.
+    The error states the purpose of the file. Fields that are null count as missing, as in
+    transformers.
     """
     try:
         found = parse_json(read_file(file))
@@ -160,7 +169,47 @@ def read_config(file: Path, purpose: str) -> dict[str, Any]:
         raise ModelError(f'{file} cannot be read: {first_line(error)}') from error
     if not isinstance(found, dict):
         raise ModelError(f'{file} is not a JSON object: download it again')
-    return found
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def one_of(about: dict[str, Any], file: Path, name: str, choices: Sequence[Any]) -> Any:
+    """Return a field of a file, by default the first choice; ModelError: it is no choice."""
+    value = about.get(name, choices[0])
+    if not any(type(value) is type(choice) and value == choice for choice in choices):
+        raise ModelError(f"{file}: the field '{name}' is {str(value)[:80]!r}, expected one of "
+                         f'{", ".join(map(str, choices))}: download the file again')
+    return value
+
+
+def numbers(about: dict[str, Any], file: Path, name: str, count: int, least: float, most: float
+            ) -> NDArray[np.float64]:
+    """Return the numbers (count,) of a field of a file; a single number counts for all.
+
+    ModelError: it is missing, has another type or length, or a number is out of range.
+    """
+    value = about.get(name)
+    found = value if isinstance(value, list) else [value] * count
+    if len(found) != count or not all(
+            isinstance(number, int | float) and not isinstance(number, bool)
+            and least <= number <= most for number in found):
+        raise ModelError(f"{file}: the field '{name}' is {str(value)[:80]!r}, expected {count} "
+                         f'number(s) from {least:.4g} to {most:.4g}: download the file again')
+    return np.array(found, dtype=np.float64)
+
+
+def colours(about: dict[str, Any], file: Path) -> list[NDArray[np.float64]]:
+    """Return scale (1,), mean (3,) and deviation (3,) of the colours, as transformers states them.
+
+    ModelError: a field is missing or wrong.
+    """
+    if not one_of(about, file, 'do_rescale', (True, False)):
+        about = about | {'rescale_factor': 1.0}
+    if not one_of(about, file, 'do_normalize', (True, False)):
+        about = about | {'image_mean': 0.0, 'image_std': 1.0}
+    return [numbers({'rescale_factor': 1 / 255} | about, file, name, count, least, most)
+            for name, count, least, most in (
+                ('rescale_factor', 1, 1 / 2**16, 1.0), ('image_mean', 3, -_MOST, _MOST),
+                ('image_std', 3, 1 / _MOST, _MOST))]
 
 
 # ---- the process --------------------------------------------------------------------------------
@@ -200,6 +249,7 @@ def _settings(precision: str | None) -> dict[str, Any]:
 
 def _load(stored: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
     """Load a compiled network and its metadata, see _compile; any exception: it is unusable."""
+    check_owners(stored.parent)
     content = np.memmap(stored, dtype=np.uint8, mode='r')
     if hashlib.sha256(content[32:]).digest() != content[:32].tobytes():
         raise ValueError('it is damaged')
@@ -213,6 +263,28 @@ def _load(stored: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
     return compiled, json.loads(content[40:end].tobytes())
 
 
+@contextlib.contextmanager
+def _without_links(file: Path) -> Iterator[Path]:
+    """Yield the path of a network whose files of weights are in its folder.
+
+    The hub's cache has links to files in another folder, which OpenVINO refuses to follow.
+    """
+    beside = [path for path in weights_beside(file) if path.is_file() and '..' not in path.parts
+              and path.is_relative_to(file.parent)]
+    if not any(path.is_symlink() for path in beside):
+        yield file
+        return
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_network_') as desk:
+        for path in (file, *beside):
+            whole = Path(desk) / path.relative_to(file.parent)
+            whole.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                whole.hardlink_to(path.resolve())
+            except OSError:  # on another disk
+                shutil.copyfile(path, whole)
+        yield Path(desk) / file.name
+
+
 def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
     """Compile and store a network; return it with the metadata of its file.
 
@@ -221,7 +293,8 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
     """
     core = import_openvino().Core()
     try:
-        network = core.read_model(file)
+        with _without_links(file) as whole:
+            network = core.read_model(whole)
     except Exception as error:  # OpenVINO has no exception classes
         # its last lines name the cause, such as a missing file of weights
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
@@ -247,6 +320,7 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
         for part in parts:
             digest.update(part)
         stored.parent.mkdir(parents=True, exist_ok=True)
+        check_owners(stored.parent)
         remove_unused(stored.parent, _MOST_NETWORKS - 1)
         with replace_file(stored) as partial, partial.open('wb') as opened:
             opened.writelines((digest.digest(), *parts))

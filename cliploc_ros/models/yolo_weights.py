@@ -33,7 +33,7 @@ from cliploc_ros.models.exports import (
     describe_export,
     needs_pytorch,
 )
-from cliploc_ros.models.files import check_weights_file, download, fingerprint_file, first_line
+from cliploc_ros.models.files import check_weights_file, digest_file, download, first_line
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 
@@ -208,12 +208,12 @@ def _tower(name: str, options: DetectorOptions
         except ModelError as error:
             remedy = str(error).replace(f'{CHECKPOINT}{WITHOUT_CLIP}', 'text_model to the file')
             raise ModelError(f'text tower of {options.model}: {remedy}') from error
-        return weights.key, lambda texts: encode_labels(weights, texts, clip)
+        return weights.text_key, lambda texts: encode_labels(weights, texts, clip)
     if name not in ('clip', *_TOWERS):
         raise ModelError(f"{options.model} needs the text tower '{name}', which is unknown: "
                          f'expected {", ".join(_TOWERS)}')
     file = resolve_published(options.text_model or _TOWERS[name], options.cache_dir, 'text_model')
-    return f'torchscript:{fingerprint_file(file)}', lambda texts: _run_torchscript(file, texts)
+    return f'torchscript:{digest_file(file)}', lambda texts: _run_torchscript(file, texts)
 
 
 def _run_torchscript(file: Path, texts: Sequence[str]) -> NDArray[np.float32]:

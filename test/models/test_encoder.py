@@ -17,7 +17,7 @@ from cliploc_ros.core.map.map_file import write_map
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models import clip_encoder
-from cliploc_ros.models.files import fingerprint_file
+from cliploc_ros.models.files import digest_file, fingerprint_file
 from cliploc_ros.models.observer import Observer, crop_bounds
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions
@@ -181,6 +181,12 @@ def test_fingerprint(tmp_path):
         found.add(fingerprint_file(file))
         assert fingerprint_file(file) in found
     assert len(found) == 6
+    # Only a digest covers the gap, which ends after the first 64 KiB and 1/65 of the file.
+    digests = set()
+    for byte in (b'0', b'1'):
+        file.write_bytes(content[:70_000] + byte + content[70_001:])
+        digests.add((fingerprint_file(file), digest_file(file)))
+    assert len({found for found, _ in digests}) == 1 and len(digests) == 2
 
 
 # ---- crops

@@ -15,8 +15,13 @@ import sys
 import threading
 from pathlib import Path
 
+import onnx
 import pytest
 from disks import small_disk
+
+from cliploc_ros.models.onnx_detector import load_detector
+from cliploc_ros.models.protocols import DetectorOptions
+from demo import ASSETS
 
 pytestmark = pytest.mark.full
 
@@ -53,6 +58,8 @@ class Hub(http.server.BaseHTTPRequestHandler):
     #: Content that is sent in place of a file
     sent: dict[str, bytes]
     requests: list[str]
+    #: Sent in place of the SHA-256 of each file
+    etag: str
     #: A file that is sent in part, and the size of this part
     broken: tuple[str, int] | None
 
@@ -76,8 +83,8 @@ class Hub(http.server.BaseHTTPRequestHandler):
                 self.end_headers()
                 return
             body = self.sent.get(name, self.files[name])
-            extra = {'ETag': f'"{hashlib.sha256(self.files[name]).hexdigest()}"',
-                     'X-Repo-Commit': COMMIT, 'Accept-Ranges': 'bytes'}
+            etag = self.etag or hashlib.sha256(self.files[name]).hexdigest()
+            extra = {'ETag': f'"{etag}"', 'X-Repo-Commit': COMMIT, 'Accept-Ranges': 'bytes'}
         start = int(self.headers.get('Range', 'bytes=0-')[6:].partition('-')[0])
         self.send_response(206 if start else 200)
         for key, value in extra.items():
@@ -101,7 +108,7 @@ def hub(monkeypatch, tmp_path):
                  'onnx/model.onnx_data': os.urandom(3_000_000),
                  'onnx/model_fp16.onnx': b'\x08half',
                  'model.safetensors': b'large', 'README.md': b'text'}
-    Hub.sent, Hub.requests, Hub.broken = {}, [], None
+    Hub.sent, Hub.requests, Hub.broken, Hub.etag = {}, [], None, ''
     monkeypatch.setenv('HF_HOME', str(tmp_path / 'hub'))
     monkeypatch.setenv('HF_HUB_DISABLE_XET', '1')
     with http.server.ThreadingHTTPServer(('127.0.0.1', 0), Hub) as server:
@@ -135,10 +142,44 @@ def test_a_download_is_made_once_and_of_what_is_needed(hub, tmp_path):
     assert 'carried' in resolve(tmp_path / 'carried', HF_HUB_OFFLINE='1')['network']
 
 
-def test_a_revision_and_a_file(hub, tmp_path):
-    found = Path(resolve(tmp_path, f'someone/net@{COMMIT}:onnx/model_fp16.onnx')['network'])
+@pytest.mark.parametrize(('revision', 'asked'), [(COMMIT, COMMIT), ('refs/pr/1', 'refs%2Fpr%2F1')])
+def test_a_revision_and_a_file(hub, tmp_path, revision, asked):
+    found = Path(resolve(tmp_path, f'someone/net@{revision}:onnx/model_fp16.onnx')['network'])
     assert found.read_bytes() == b'\x08half'
-    assert any(COMMIT in request for request in hub.requests if '/api/' in request)
+    assert any(asked in request for request in hub.requests if '/api/' in request)
+
+
+def test_weights_of_any_name_in_a_cache_behind_a_link(hub, tmp_path):
+    """The cache has links to its files, which OpenVINO does not follow out of their folder."""
+    onnx.save(onnx.load(ASSETS / 'yolo.onnx'), tmp_path / 'model.onnx', size_threshold=0,
+              save_as_external_data=True, location='weights.bin')
+    hub.files = {name: (tmp_path / name).read_bytes() for name in ('model.onnx', 'weights.bin')}
+    (tmp_path / 'real').mkdir()
+    (tmp_path / 'link').symlink_to('real')
+    for _ in range(2):  # the second time from the cache
+        network = resolve(tmp_path / 'link')['network']
+        assert len(load_detector(DetectorOptions(network, cache_dir=str(tmp_path))).class_names)
+        hub.files = {}
+
+
+@pytest.mark.parametrize('etag', ['5' * 39, '../../../../evil', '1' * 63 + 'g', 'W'])
+def test_a_hub_without_digests(hub, tmp_path, etag):
+    hub.etag = etag
+    assert 'the hub states no digest of config.json' in resolve(tmp_path / 'cache')['error']
+    assert not any(path.is_file() for path in tmp_path.rglob('*'))
+
+
+def test_damaged_files_of_the_cache_are_downloaded_again(hub, tmp_path):
+    found = Path(resolve(tmp_path)['network'])
+    for name in ('model.onnx', 'model.onnx_data', '../config.json'):
+        file = found.parent / name
+        file.write_bytes(file.read_bytes()[:-1] + b'x')
+        assert 'network' in resolve(tmp_path)
+        assert file.read_bytes() == hub.files[os.path.normpath(f'onnx/{name}')]
+    marker, = (tmp_path / 'weights').glob('*.json')
+    for place in (str(tmp_path), '../..', 'gone'):
+        marker.write_text(json.dumps(place))
+        assert Path(resolve(tmp_path)['network']) == found
 
 
 def test_another_file_under_the_same_name(hub, tmp_path):

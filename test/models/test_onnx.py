@@ -16,7 +16,7 @@ from scipy.special import expit
 from tokenizers import Tokenizer, models, pre_tokenizers, processors
 
 from cliploc_ros.errors import ModelError, OptionsError
-from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
+from cliploc_ros.models.clip_encoder import ClipEncoder, LabelCache, encode_labels
 from cliploc_ros.models.exports import describe_export
 from cliploc_ros.models.files import is_hub_name
 from cliploc_ros.models.onnx_clip import names_onnx, resolve_clip_weights
@@ -186,6 +186,9 @@ def refusal(load, model) -> str:
     (YOLO, {**TWO, 'task': 'classify'}, {}, "for the task 'classify'"),
     (YOLO, {}, {}, 'config.json is missing; .* has no class names'),
     (YOLO, {'names': "{0: 'mug', 2: 'box'}"}, {}, 'with the keys 0, 1'),
+    (YOLO, {'names': "{0: 'mug', 1: None}"}, {}, "class 1 has the name 'None'"),
+    (YOLO, TWO | {'stride': '0'}, {}, "'stride' is '0'"),
+    (YOLO, TWO | {'stride': '9' * 5000}, {}, "'stride' is '9"),
     ({'output0': np.zeros((1, 9, 84), np.float32)}, TWO, {}, r'of 2 classes: .*\(9, 84\)'),
     (YOLO, TWO, {'kind': TensorProto.UINT8}, 'images of integers'),
     (YOLO, TWO, {'shape': (1, 1, 64, 64)}, 'takes no single colour image'),
@@ -206,6 +209,32 @@ def test_configurations_that_do_not_fit(load, tmp_path):
     assert "'size' has neither" in refusal(load, tmp_path)
     (tmp_path / 'preprocessor_config.json').write_text('[1')
     assert 'cannot be read' in refusal(load, tmp_path)
+    for name in (None, '', ' ', True, ['mug'], 'm' * 2000):
+        write_configs(tmp_path, ('mug', name))
+        assert 'config.json' in (text := refusal(load, tmp_path)) and 'class 1 has' in text
+
+
+WRONG = (True, 'two', [1, 1], {}, -1, 10**19, 1e300, float('nan'))
+
+
+@pytest.mark.parametrize('name', ['size', 'height', 'do_rescale', 'rescale_factor', 'resample',
+                                  'do_normalize', 'image_mean', 'image_std'])
+def test_each_field_of_a_preparation(load, tmp_path, name):
+    """A null field counts as missing; other types and huge numbers are refused."""
+    values = {'logits': np.zeros((1, 3, 2), np.float32), 'pred_boxes': DETR['pred_boxes'] + .5}
+    write_network(tmp_path / 'model.onnx', values)
+    for value in (None, *WRONG):
+        whole = {'do_normalize': True, 'image_mean': MEAN, 'image_std': STD}
+        write_configs(tmp_path, ('mug', 'box'), **whole | (
+            {'size': {'height': value, 'width': 64}} if name == 'height' else {name: value}))
+        is_right = ((value is None and name.startswith(('do', 're')))
+                    or (value is True and name.startswith('do'))
+                    or (value == -1 and name == 'image_mean'))
+        if is_right:
+            assert len(load(tmp_path).detect(an_image()).scores)
+        else:
+            text = refusal(load, tmp_path)
+            assert f"'{name}'" in text or "'size'" in text, text
 
 
 YOLO_FILE = ASSETS / 'yolo.onnx'
@@ -218,15 +247,46 @@ def test_damaged_files(load, tmp_path):
         assert 'OpenVINO cannot read' in refusal(load, file)
     assert 'No such file' in refusal(load, tmp_path / 'gone.onnx')
     network = onnx.load(YOLO_FILE)
-    onnx.save(network, tmp_path / 'apart.onnx', save_as_external_data=True,
-              location='apart.onnx_data')
-    load(tmp_path / 'apart.onnx')
-    (tmp_path / 'apart.onnx_data').unlink()
-    assert 'apart.onnx_data' in refusal(load, tmp_path / 'apart.onnx')
-    network = onnx.load(YOLO_FILE)
     network.graph.node[0].op_type = 'Strange'
     onnx.save(network, tmp_path / 'strange.onnx')
     assert 'update OpenVINO' in refusal(load, tmp_path / 'strange.onnx')
+
+
+@pytest.mark.parametrize('place', ['elsewhere', 'links'])
+def test_each_byte_of_a_network_counts(load, tmp_path, place):
+    """A damaged network that was compiled is not used in place of the sound one."""
+    file = tmp_path / 'snapshot/apart.onnx'
+    file.parent.mkdir()
+    onnx.save(onnx.load(YOLO_FILE), file, save_as_external_data=True, location=place)
+    changed = file.with_name(place)
+    if place == 'links':  # as in the hub's cache
+        for path in (changed, file):
+            path.symlink_to(path.rename(tmp_path / f'blob of {path.name}'))
+    sound = changed.read_bytes()
+    half = len(sound) // 2
+    image = cv2.imread(str(min((ASSETS / 'sequence/rgb').iterdir())))[..., ::-1]
+    found = []
+    for content in (sound[:half] + bytes(400) + sound[half + 400:], sound):
+        changed.write_bytes(content)
+        found.append(load(file).detect(image).bboxes_xyxy)
+    expected = load(YOLO_FILE).detect(image).bboxes_xyxy
+    assert not np.array_equal(found[0], expected) and np.array_equal(found[1], expected)
+    changed.unlink()
+    assert place in refusal(load, file)
+
+
+def test_a_folder_of_others_is_not_used(tmp_path, load, caplog):
+    """Compiled networks and label embeddings: anyone could have written them."""
+    cache = LabelCache(tmp_path / 'openvino')
+    load(YOLO_FILE, cache_dir=str(tmp_path))
+    cache.store('key', ['mug'], np.ones((1, 4), np.float32))
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / 'openvino').iterdir()}
+    (tmp_path / 'openvino').chmod(0o777)
+    load(YOLO_FILE, cache_dir=str(tmp_path))
+    assert cache.load('key', ['mug'], 4) is None
+    cache.store('key', ['mug'], np.zeros((1, 4), np.float32))
+    assert caplog.text.count('other users own its folder or can write to it') == 4
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / 'openvino').iterdir()}
 
 
 def test_a_damaged_compiled_network_is_compiled_again(tmp_path, caplog):
@@ -257,9 +317,14 @@ def test_a_vocabulary_is_refused(load):
 
 @pytest.mark.parametrize(('model', 'expected'), [
     ('someone/d-fine@main:onnx/model_fp16.onnx', True), ('someone/d-fine.s-coco', True),
+    ('some/d-fine:onnx/model_fp16.onnx', True), ('some/d-fine@refs/pr/1:model.onnx', True),
+    ('some/d-fine@refs/pr/1', True), ('some/mine.onnx', False), ('some/d-fine@/main', False),
     ('yolov8n.pt', False), ('weights/mine.pt', False), ('some/where/mine', False), ('', False)])
-def test_names_of_the_hub(model, expected):
+def test_names_of_the_hub(model, expected, load, monkeypatch):
+    monkeypatch.setenv('HTTPS_PROXY', 'http://127.0.0.1:1')
     assert is_hub_name(model) == expected
+    if expected:  # and no local file
+        assert 'cannot download' in refusal(load, model)
 
 
 # ---- CLIP in files of transformers and open_clip. The towers are small: an embedding is a linear
@@ -346,7 +411,7 @@ def test_both_layouts_give_the_embeddings_of_their_towers(layout, cache, request
     np.testing.assert_allclose(labels, unit_rows(OF_TOKEN[rows].mean(axis=1)), atol=1e-4)
 
 
-def test_a_changed_export_has_another_key(exported, cache, tmp_path):
+def test_a_changed_export_has_another_key(exported, cache, tmp_path, caplog):
     changed = Path(shutil.copytree(exported, tmp_path / 'changed'))
     network = onnx.load(changed / 'visual/model.onnx')
     network.producer_name = 'someone'
@@ -354,7 +419,8 @@ def test_a_changed_export_has_another_key(exported, cache, tmp_path):
     def key(folder):
         return resolve_clip_weights(ClipOptions(pretrained=str(folder), cache_dir=str(cache))).key
 
-    assert key(exported) == 'clip:small' and key(changed).startswith('onnx:')
+    assert key(exported) == 'clip:small' and not caplog.records
+    assert key(changed).startswith('onnx:') and 'differs from its digest' in caplog.text
     for content in ('{"files": 3, "key": "x"}', '[]', '{"files": {"gone": 0}, "key": "x"}'):
         (changed / 'export.json').write_text(content)
         assert key(changed).startswith('onnx:')
@@ -378,7 +444,9 @@ def other_words(file: Path) -> None:
     (lambda folder: (folder / 'config.json').unlink(), 'config.json is missing'),
     (lambda folder: text_of(folder / 'config.json', projection_dim=99), 'expected one output'),
     (lambda folder: text_of(folder / 'preprocessor_config.json', crop_size=256), '256 x 256'),
-    (lambda folder: text_of(folder / 'preprocessor_config.json', image_std=[0, 1, 1]), 'deviat'),
+    *((lambda folder, change=change: text_of(folder / 'preprocessor_config.json', **change),
+       f"'{next(iter(change))}'") for change in (
+           {'image_std': [0, 1, 1]}, {'resample': [3]}, {'rescale_factor': 300})),
     (lambda folder: (folder / 'tokenizer.json').unlink(), 'tokenizer.json is missing'),
     (lambda folder: (folder / 'tokenizer.json').write_text('{}'), 'not a tokenizer of a CLIP'),
     (lambda folder: other_words(folder / 'tokenizer.json'), 'it has 30 tokens, but the text'),

@@ -33,7 +33,7 @@ from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 
-from cliploc_ros.files.storage import is_foreign, resolve_cache_dir, warn_not_kept
+from cliploc_ros.files.storage import check_owners, resolve_cache_dir, warn_not_kept
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _ROOT = _PACKAGE.name
@@ -63,13 +63,14 @@ def kernel_folder(preferred: Path | None = None) -> Path | None:
     else:
         is_ours = os.access(own if own.exists() else _PACKAGE, os.W_OK)
         folder = own if is_ours else resolve_cache_dir('') / 'kernels'
-    trusted = {os.getuid(), 0, Path(__file__).stat().st_uid}
     with suppress(OSError):  # reported by the first write
         if not folder.exists() and own.exists():
             shutil.copytree(own, folder)
-        if any(is_foreign(path.stat(), trusted) for path in (folder, *folder.iterdir())):
-            logger.warning('%s is not used: other users own it or can write to it', folder)
-            return None
+    try:
+        check_owners(folder)
+    except PermissionError as error:
+        logger.warning('%s is not used: %s', folder, error.strerror)
+        return None
     return folder
 
 

@@ -128,7 +128,7 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
     ModelError, OptionsError: see cliploc_ros.models.clip_encoder.embed_map.
     """
     cache = LabelCache(resolve_cache_dir(options.cache_dir) / 'phrases', _MOST_FILES)
-    found = {texts: cache.load(weights.key, texts, weights.embed_dim) for texts in phrases}
+    found = {texts: cache.load(weights.text_key, texts, weights.embed_dim) for texts in phrases}
     missing = [texts for texts, rows in found.items() if rows is None]
     if missing:
         all_texts = [text for texts in missing for text in texts]
@@ -137,6 +137,6 @@ def embed_phrases(weights: ClipWeights, options: ClipOptions,
         ends = np.cumsum([len(texts) for texts in missing])
         for texts, rows in zip(missing, np.split(encode_labels(weights, all_texts, options),
                                                  ends[:-1]), strict=True):
-            cache.store(weights.key, texts, rows)
+            cache.store(weights.text_key, texts, rows)
             found[texts] = rows
     return {texts: Phrases(texts, rows) for texts, rows in found.items() if rows is not None}
