@@ -170,14 +170,13 @@ def walk(tmp_path_factory):
     return folder
 
 
-METHODS = ('--methods', 'hybrid_b-prosac', 'auto', '--trials', 2, '--sweep', '--no-figures',
-           '--workers', 1)
+METHODS = ('--methods', 'hybrid_b-prosac', 'auto', '--trials', 2, '--sweep', '--no-figures')
 
 
 @pytest.fixture(scope='module')
 def evaluated_bag(walk):
     done = evaluate('--bag', walk / 'bag', *NETWORKS, *METHODS, '--out', walk / 'from_bag',
-                    '--save-queries', walk / 'saved.npz')
+                    '--save-queries', walk / 'saved.npz', '--workers', 1)
     assert done.returncode == 0, done.stderr
     print('\n' + done.stdout)
     return done
