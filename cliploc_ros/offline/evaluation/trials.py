@@ -21,6 +21,7 @@ from cliploc_ros.core.map.joined_map import place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.offline.datasets.agreement import w_first
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
@@ -32,6 +33,9 @@ from cliploc_ros.units import NS_PER_S
 GIVEN = 'given'
 #: Greatest difference in time between a query and its given pose [ms]: evo's default.
 GIVEN_TOLERANCE_MS = 10
+# Given poses with higher median errors [m] [deg] do not fit the truth, and a transform that fits
+# must divide these errors. At least and at most this many poses are compared. Chosen.
+_FITS, _BETTER, _LEAST_GIVEN, _COMPARED = (0.25, 5.0), 3.0, 4, 100
 
 
 @dataclass(frozen=True)
@@ -181,6 +185,52 @@ def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -
             name, 0, query.number, stamp_ns / NS_PER_S, len(query.observation.detections),
             solved=pose is not None, accepted=False, source=GIVEN, **_error(pose, query)))
     return results
+
+
+def fit_after_transform(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str:
+    """Return the transform after which wrong poses of another program fit; '' if there is none.
+
+    Quaternions may be w first, poses inverse, their unit not metres, or the poses those of
+    another body or in another coordinate frame.
+    """
+    pairs = [(result.map_from_camera, query.map_from_camera)
+             for result, query in zip(results, queries, strict=True) if result.solved]
+    pairs = pairs[::-(-len(pairs) // _COMPARED) or 1]
+    if len(pairs) < _LEAST_GIVEN:
+        return ''
+    given, truth = np.array(pairs).transpose(1, 0, 2, 3)
+
+    def errors_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the median errors (k, 2) of poses (k, n, 4, 4), in units of _FITS."""
+        cosines = (poses[..., :3, :3] * truth[:, :3, :3]).sum(axis=(-1, -2)) / 2 - 0.5
+        return np.median([np.linalg.norm((poses - truth)[..., :3, 3], axis=-1),
+                          np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))], axis=-1).T / _FITS
+
+    before = errors_of(given[None]).max()
+    steps = np.linalg.norm(np.diff([given, truth], axis=1)[..., :3, 3], axis=-1)
+    steps = steps[:, (steps > 0.0).all(axis=0)]
+    scale = float(np.median(steps[1] / steps[0])) if steps.size else 1.0
+    readings = {
+        '': given,
+        'quaternions are w first (first line of the file: # timestamp tx ty tz '
+        'qw qx qy qz)': np.array([*map(w_first, given)]),
+        'poses are inverse (map in camera)': np.linalg.inv(given),
+        f'their unit is {scale:.4g} m': transforms.move_poses(given, scale, np.eye(3))}
+    tried = [(what, '', np.eye(4)[None], poses[None], before) for what, poses in readings.items()]
+    # any transform fits poses of one place
+    moving = min(before, errors_of(truth[:, None]).max(axis=1).min())
+    for what, poses in readings.items():
+        of_map, of_body = truth @ np.linalg.inv(poses), np.linalg.inv(poses) @ truth
+        tried += [(what, 'map from their frame', of_map, of_map[:, None] @ poses, moving),
+                  (what, 'their body from camera', of_body, poses @ of_body[:, None], moving)]
+    for what, of, moves, poses, least in tried:
+        errors = errors_of(poses)
+        best = errors.max(axis=1).argmin()
+        if before > 1.0 and errors[best].max() < min(1.0, least / _BETTER):
+            numbers = [*moves[best, :3, 3], *transforms.quaternion_from_transform(moves[best])]
+            return ', '.join(filter(None, (what, of and f'{of}: x y z qx qy qz qw ' + ' '.join(
+                f'{number:.4f}' for number in numbers))))
+    return ''
 
 
 def _error(pose: NDArray[np.float64] | None, query: PosedQuery) -> dict[str, Any]:
