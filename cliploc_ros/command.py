@@ -135,14 +135,14 @@ _PATHS = ('DIR', 'NPZ', 'YAML', 'FILE', 'JSON', 'MAP', 'BAG|DIR', 'IN')
 class _Once(argparse.Action):
     """Refuses an option that is given twice; the last one would silently win."""
 
+    given_in: argparse.Namespace | None = None  # the values do not tell: they begin with a default
+
     def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
                  values: Any, option_string: str | None = None) -> None:
         """Take the values of the option, or raise ArgumentError."""
-        # options start with their default: only the options themselves know that they were given
-        if vars(self).get('_given_to') is namespace:
-            more = ', with all its values' if self.nargs in ('+', '*') else ''
-            raise argparse.ArgumentError(self, f'given twice: give it once{more}')
-        vars(self)['_given_to'] = namespace
+        if self.given_in is namespace:
+            raise argparse.ArgumentError(self, 'given twice: give it once, with all its values')
+        self.given_in = namespace
         super().__call__(parser, namespace, values, option_string)
 
 

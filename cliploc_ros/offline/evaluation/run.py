@@ -30,12 +30,7 @@ from cliploc_ros.offline import page as html
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.methods import Method
-from cliploc_ros.offline.evaluation.trials import (
-    Result,
-    fit_after_transform,
-    given_results,
-    run_trial,
-)
+from cliploc_ros.offline.evaluation.trials import Result, find_misfit, given_results, run_trial
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
 
@@ -175,10 +170,8 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     shown = [*own, *chain.from_iterable(of_others.values())]
     summaries = summary.summarize(shown)
     rows = summary.table_rows(summaries)
-    remarks = [*remarks, *(
-        f'note: {name}: poses fit after one transform: {fit}; correct the file: --poses are x y z '
-        'qx qy qz qw of the camera (z forward) in the map' for name, its in of_others.items()
-        if (fit := fit_after_transform(its, queries))), *summary.notes(summaries)]
+    misfits = [find_misfit(its, queries) for its in of_others.values()]
+    remarks = [*remarks, *filter(None, misfits), *summary.notes(summaries)]
     if names := ', '.join(method.name for method in methods if method.accumulates):
         remarks.append(f'{names}: one localizer gets the queries in the order of their stamps, as '
                        'on a robot; its evidence about cameras and depth accumulates.')

@@ -5,7 +5,7 @@
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -187,11 +187,11 @@ def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -
     return results
 
 
-def fit_after_transform(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str:
-    """Return the transform after which wrong poses of another program fit; '' if there is none.
+def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str:
+    """Return a note if poses of another program are wrong, but fit after one transform; else ''.
 
-    Quaternions may be w first, poses inverse, their unit not metres, or the poses those of
-    another body or in another coordinate frame.
+    Quaternions may be w first, poses inverse, or those of another body or in another coordinate
+    frame.
     """
     pairs = [(result.map_from_camera, query.map_from_camera)
              for result, query in zip(results, queries, strict=True) if result.solved]
@@ -207,29 +207,24 @@ def fit_after_transform(results: Sequence[Result], queries: Sequence[PosedQuery]
                           np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))], axis=-1).T / _FITS
 
     before = errors_of(given[None]).max()
-    steps = np.linalg.norm(np.diff([given, truth], axis=1)[..., :3, 3], axis=-1)
-    steps = steps[:, (steps > 0.0).all(axis=0)]
-    scale = float(np.median(steps[1] / steps[0])) if steps.size else 1.0
-    readings = {
-        '': given,
-        'quaternions are w first (first line of the file: # timestamp tx ty tz '
-        'qw qx qy qz)': np.array([*map(w_first, given)]),
-        'poses are inverse (map in camera)': np.linalg.inv(given),
-        f'their unit is {scale:.4g} m': transforms.move_poses(given, scale, np.eye(3))}
-    tried = [(what, '', np.eye(4)[None], poses[None], before) for what, poses in readings.items()]
     # any transform fits poses of one place
     moving = min(before, errors_of(truth[:, None]).max(axis=1).min())
-    for what, poses in readings.items():
-        of_map, of_body = truth @ np.linalg.inv(poses), np.linalg.inv(poses) @ truth
-        tried += [(what, 'map from their frame', of_map, of_map[:, None] @ poses, moving),
-                  (what, 'their body from camera', of_body, poses @ of_body[:, None], moving)]
-    for what, of, moves, poses, least in tried:
-        errors = errors_of(poses)
-        best = errors.max(axis=1).argmin()
-        if before > 1.0 and errors[best].max() < min(1.0, least / _BETTER):
-            numbers = [*moves[best, :3, 3], *transforms.quaternion_from_transform(moves[best])]
-            return ', '.join(filter(None, (what, of and f'{of}: x y z qx qy qz qw ' + ' '.join(
-                f'{number:.4f}' for number in numbers))))
+    readings = {'': given, 'quaternions are w first (first line of the file: # timestamp tx ty tz '
+                'qw qx qy qz)': np.array([*map(w_first, given)]),
+                'poses are inverse (map in camera)': np.linalg.inv(given)}
+    for of, (what, poses) in product(('', 'map from their frame', 'their body from camera'),
+                                     readings.items()):
+        moves = {'': np.eye(4)[None], 'map from their frame': truth @ np.linalg.inv(poses)}.get(
+            of, np.linalg.inv(poses) @ truth)
+        errors = errors_of(moves[:, None] @ poses if of.startswith('map') else
+                           poses @ moves[:, None]).max(axis=1)
+        if before > 1.0 and errors.min() < min(1.0, (moving if of else before) / _BETTER):
+            move = moves[errors.argmin()]
+            numbers = [*move[:3, 3], *transforms.quaternion_from_transform(move)]
+            of += of and ' x y z qx qy qz qw ' + ' '.join(f'{each:.4f}' for each in numbers)
+            return (f'note: {results[0].method}: poses fit after one transform: '
+                    f'{", ".join(filter(None, (what, of)))}; give poses of the camera (z forward) '
+                    'in the map, x y z qx qy qz qw')
     return ''
 
 
