@@ -88,7 +88,7 @@ class OnnxDetector:
         """Return the sums of scores in images, by the inputs that networks are trained with.
 
         The first is the input that the files of the network define. With a wrong range of values,
-        a network may see objects everywhere, also in noise: its sum is 0 then.
+        a network may see objects everywhere, also in noise: another input has a sum of 0 then.
         """
         noise = np.random.default_rng(0).integers(0, 256, images_rgb[0].shape, np.uint8)
         own, found = self._head.convert, dict[str, float]()
@@ -97,8 +97,8 @@ class OnnxDetector:
             for scaled, values in ranges.items():
                 self._head.convert = lambda pixels, scaled=scaled, step=step: scaled(
                     np.ascontiguousarray(pixels[:, ::step]))
-                found[order + values] = 0.0 if len(self.detect(noise)) > _IN_NOISE else sum(
-                    float(self.detect(image).scores.sum()) for image in images_rgb)
+                found[order + values] = 0.0 if found and len(self.detect(noise)) > _IN_NOISE else \
+                    sum(float(self.detect(image).scores.sum()) for image in images_rgb)
         self._head.convert = own
         return found
 

@@ -51,7 +51,7 @@ _FRAMES_FOR_UNIT = 10
 # With fewer boxes per image, a detector finds almost nothing. With fewer than the second number,
 # it is tried with other inputs on the first images. Another input is right if it multiplies the
 # scores by the last number. Chosen.
-_NOTHING, _FEW_BOXES, _FIRST, _MORE = 0.3, 4.0, 4, 2.5
+_NOTHING, _FEW_BOXES, _FIRST, _MORE = 0.3, 6.0, 3, 2.5
 _UNKNOWN = np.full((4, 4), np.nan)
 
 
