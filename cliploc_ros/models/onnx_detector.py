@@ -95,7 +95,7 @@ class OnnxDetector:
         ranges = {own: '', _from_0_to_1: ' from 0 to 1', np.copy: ' from 0 to 255'}
         for order, step in (('RGB', 1), ('BGR', -1)):
             for scaled, values in ranges.items():
-                self._head.convert = lambda pixels, scaled=scaled, step=step: scaled(
+                self._head.convert = lambda pixels, scaled=scaled, step=step: scaled(  # type: ignore[misc]
                     np.ascontiguousarray(pixels[:, ::step]))
                 found[order + values] = 0.0 if found and len(self.detect(noise)) > _IN_NOISE else \
                     sum(float(self.detect(image).scores.sum()) for image in images_rgb)
