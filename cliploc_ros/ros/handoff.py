@@ -10,6 +10,7 @@ pose that the localizer publishes proves that it took the given pose.
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
@@ -58,6 +59,8 @@ _UPDATE_PATIENCE_S = 2.0
 # Period of broadcasts. Each is stamped with the time of the next one, so that a lookup at the
 # present time does not wait.
 _PERIOD_S = 0.1
+# A transform of another node counts for this time: SLAM and AMCL broadcast at 1 Hz or more.
+_RIVAL_S = 3.0
 
 
 class HandOffError(CliplocError):
@@ -122,10 +125,16 @@ class HandOff:
         if not self._publisher.get_subscription_count():
             return (f'nobody subscribes to {self._publisher.topic_name}: start the localizer '
                     '(AMCL), then retry; without one, set require_localizer: false')
-        if self._subscription is not None and not self._node.count_publishers(self._pose_topic):
+        if self._subscription is None:
+            return ''
+        publishers = self._node.get_publishers_info_by_topic(self._pose_topic)
+        names = {f'{one.node_namespace.rstrip("/")}/{one.node_name}' for one in publishers}
+        if not names:
             return (f'nobody publishes {self._pose_topic}: start the localizer (AMCL); if it has '
                     'just started, retry; or set localizer_pose to the topic of its pose')
-        return ''
+        # a localizer that was killed and restarted may be listed twice
+        return '' if len(names) == 1 else (f'{len(names)} nodes publish {self._pose_topic} '
+                                           f'({", ".join(sorted(names))}): stop all but one')
 
     def hand_over(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
                   deadline: float, received_at: float, jumps: TimeJumps) -> None:
@@ -241,7 +250,7 @@ class HandOff:
             return 'too little time is left for the localizer to take the pose: retry'
         if shown is None:
             return (f'{why}no message on {self._pose_topic} since initialpose was published '
-                    f'{times} times: check that the localizer is active and receives scans')
+                    f'{times} times: {silence_of_localizer(self._node)}')
         given = self._carried(given, shown.header.stamp)
         return f'{why}{self._pose_topic} {difference(given, shown)}'
 
@@ -314,6 +323,14 @@ class HandOff:
         return ''
 
 
+def silence_of_localizer(node: Node) -> str:
+    """Return what to do about a localizer that publishes no pose."""
+    topic = node.resolve_topic_name('map')
+    no_map = '' if node.count_publishers(topic) else (
+        f'nobody publishes {topic}, without which AMCL has no pose: start its map server; ')
+    return f'{no_map}check that the localizer is active and receives scans'
+
+
 def _left_s(deadline: float) -> float:
     """Return the time left until a deadline (monotonic clock), at least 0 [s]."""
     return max(0.0, deadline - time.monotonic())
@@ -379,6 +396,25 @@ class MapToOdom:
         self._transform: TransformStamped | None = None
         self._jumped_at = -math.inf
         self._began_ns = 0
+        # Stamps of the newest own broadcasts [ns], and of each coordinate frame the parent in the
+        # newest transform of another node, and until when it counts (monotonic clock) [s].
+        self._sent: deque[int] = deque(maxlen=100)
+        self._others: dict[str, tuple[str, float]] = {}
+        transforms.on_transform = self.hear
+
+    def hear(self, transform: TransformStamped, is_static: bool) -> None:
+        """Process a transform that any node broadcasts."""
+        child, stamp = transform.child_frame_id.lstrip('/'), stamp_ns(transform.header.stamp)
+        if is_static or stamp not in self._sent:
+            until = math.inf if is_static else time.monotonic() + _RIVAL_S
+            self._others[child] = transform.header.frame_id, until
+
+    def rival(self, odom_frame: str) -> str:
+        """Return that another node broadcasts the pose of a frame, and what to do; else ''."""
+        parent, until = self._others.get(odom_frame.lstrip('/'), ('', -math.inf))
+        return '' if time.monotonic() > until else (
+            f"another node broadcasts the transform '{parent}' -> '{odom_frame}', so publish_tf "
+            'pauses: stop that node (SLAM or a localizer), or set publish_tf: false')
 
     def open(self) -> None:
         """Start broadcasting as soon as there is a pose.
@@ -421,12 +457,15 @@ class MapToOdom:
         Raises
         ------
         NoTransformError
-            The robot's pose by odometry is unknown; the former transform is kept.
+            The robot's pose by odometry is unknown, and the former transform is kept; or another
+            node broadcasts the transform.
         TimeJumpError
             Time has jumped or odometry has restarted since the image.
         """
         if self._timer is None:
             return
+        if rival := self.rival(parameters.odom_frame):
+            raise NoTransformError(rival)
         base_from_odom = self._transforms.lookup(parameters.base_frame, parameters.odom_frame,
                                                  header.stamp, parameters.tf_timeout_s,
                                                  'correct odom_frame')
@@ -439,12 +478,13 @@ class MapToOdom:
     def _broadcast(self) -> None:
         with self._lock:
             transform = self._transform
-            if transform is None:
+            if transform is None or self.rival(transform.child_frame_id):
                 return
             until = (self._node.get_clock().now() + Duration(seconds=_PERIOD_S)).to_msg()
             if transform.header.stamp == until:
                 return  # simulated time is paused; tf2 warns of repeated stamps
             transform.header.stamp = until
+            self._sent.append(stamp_ns(until))
             self._broadcaster.sendTransform(transform)
 
 

@@ -31,7 +31,7 @@ from cliploc_ros.errors import CliplocError, StoppedError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer
 from cliploc_ros.ros.conversions import pose_from_msg, stamp_ns
-from cliploc_ros.ros.handoff import HandOff, HandOffError
+from cliploc_ros.ros.handoff import HandOff, HandOffError, silence_of_localizer
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
@@ -230,7 +230,8 @@ class Watcher:
         # The watch needs odometry even if fuse_frames is 1.
         parameters = replace(self._node.settings.snapshot().of_camera(frame.camera),
                              fuse_frames=MAX_FRAMES)
-        state = self._robot.at(image, parameters, depth_frame=frame.depth_frame)
+        state = self._robot.at(image, parameters, depth_frame=frame.depth_frame,
+                               info=frame.camera_info)
         pose = self._pose.at(image, state, parameters, [
             part.landmark_map.frame_id for part in parts_of(localizer.landmark_map)])
         self._had_pose = True
@@ -465,6 +466,6 @@ class LocalizerPose:
                     then.place.odom_from_frame @ then.camera_from_base))
         if place.way_m - anchor.way_m > _SILENT_WAY_M:
             raise NoLocalizerPoseError(
-                f'no message on {topic} for {place.way_m - anchor.way_m:.1f} m of driving: check '
-                'that the localizer is active and receives scans')
+                f'no message on {topic} for {place.way_m - anchor.way_m:.1f} m of driving: '
+                f'{silence_of_localizer(self._node)}')
         return frame_id, anchor.map_from_odom @ place.odom_from_frame
