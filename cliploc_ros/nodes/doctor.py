@@ -102,19 +102,16 @@ class Doctor(RelocalizerNode):
         Parameters of the relocalizer. Those that make it act without a request are replaced.
     rules : sequence of str
         Remappings of the relocalizer, NAME:=TOPIC.
-    rival : str or None
-        What a running relocalizer says about MapToOdom.rival; the doctor hears its transforms.
     """
 
-    def __init__(self, given: Sequence[Parameter], rules: Sequence[str], rival: str | None
-                 ) -> None:
+    def __init__(self, given: Sequence[Parameter], rules: Sequence[str]) -> None:
         passive = {'autostart': True, 'mode': 'on_request', 'watch': 'none', 'record_folder': ''}
         rules = ['/diagnostics:=~/diagnostics', *rules]
         super().__init__('doctor', delivers=False, parameter_overrides=[
             *(one for one in given if one.name not in passive),
             *(Parameter(name, value=value) for name, value in passive.items())],
             cli_args=['--ros-args', *(word for rule in rules for word in ('-r', rule))])
-        self._map_error, self._rival = '', rival
+        self._map_error = ''
 
     def load(self) -> str:
         """Load map and network. After an error, the inputs are checked nevertheless."""
@@ -191,9 +188,6 @@ class Doctor(RelocalizerNode):
                 if parameters.publish_tf:
                     self._robot.transforms.lookup(image.frame_id, parameters.odom_frame,
                                                   image.stamp, patience_s, 'correct odom_frame')
-                    if rival := self._map_to_odom.rival(parameters.odom_frame) \
-                            if self._rival is None else self._rival:
-                        raise OptionsError(rival)
                 up_deg = math.degrees(math.asin(np.clip(base_from_camera[2, 2], -1.0, 1.0)))
                 report.add('tf', State.PASS, f'the camera is {base_from_camera[2, 3]:.2f} m above '
                            f"'{parameters.base_frame}' and looks {up_deg:+.0f} degrees up")
@@ -250,15 +244,14 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
                     Verdict.ACCEPTED, Verdict.WITHHELD)):  # it no longer uses its last pose
                 given = [parameter for parameter in given if parameter.name != 'last_pose_file']
             # missing inputs of an active relocalizer are reported by the checks below
-            report.judge('relocalizer', values.get('wrong cameras', '')
-                         if values['state'] == 'active' else status.problem(),
-                         f'{name} is active')
+            report.judge('relocalizer', '; '.join(filter(None, (
+                values.get('wrong cameras'), values.get('rival of publish_tf'))))
+                         if values['state'] == 'active' else status.problem(), f'{name} is active')
     except NotRunningError as error:
         return report.add('relocalizer', State.FAIL, str(error))
     finally:
         asking.destroy_node()
-    node = Doctor(given, [*values.get('topics', '').split(), f'~/prior:={name}/prior'],
-                  None if files else values.get('rival of publish_tf', ''))
+    node = Doctor(given, [*values.get('topics', '').split(), f'~/prior:={name}/prior'])
     node.get_logger().set_level(LoggingSeverity.ERROR)
     executor, ended = NodeExecutor(), threading.Event()
     executor.add_node(node)

@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -25,6 +25,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.time import Time
 from rclpy.timer import Timer
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
@@ -125,16 +126,8 @@ class HandOff:
         if not self._publisher.get_subscription_count():
             return (f'nobody subscribes to {self._publisher.topic_name}: start the localizer '
                     '(AMCL), then retry; without one, set require_localizer: false')
-        if self._subscription is None:
-            return ''
-        publishers = self._node.get_publishers_info_by_topic(self._pose_topic)
-        names = {f'{one.node_namespace.rstrip("/")}/{one.node_name}' for one in publishers}
-        if not names:
-            return (f'nobody publishes {self._pose_topic}: start the localizer (AMCL); if it has '
-                    'just started, retry; or set localizer_pose to the topic of its pose')
-        # a localizer that was killed and restarted may be listed twice
-        return '' if len(names) == 1 else (f'{len(names)} nodes publish {self._pose_topic} '
-                                           f'({", ".join(sorted(names))}): stop all but one')
+        return '' if self._subscription is None else not_one_publisher(
+            self._pose_topic, self._node.get_publishers_info_by_topic(self._pose_topic))
 
     def hand_over(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
                   deadline: float, received_at: float, jumps: TimeJumps) -> None:
@@ -259,8 +252,7 @@ class HandOff:
 
         Without a publisher of odometry, the robot is assumed to be at rest.
         """
-        odometry = self._odometry.recent(_MAX_ODOM_AGE_S,
-                                         min(_ODOM_PATIENCE_S, _left_s(deadline)))
+        odometry = self._odometry.recent(_MAX_ODOM_AGE_S, min(_ODOM_PATIENCE_S, _left_s(deadline)))
         if odometry is None:
             if not self._odometry.is_published:
                 self._node.get_logger().warning(
@@ -321,6 +313,17 @@ class HandOff:
             if self._stopped.wait(_UPDATE_PERIOD_S):
                 return ''
         return ''
+
+
+def not_one_publisher(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
+    """Return why the topic of the localizer's pose has no single source; empty if it has one."""
+    # by name: a localizer that was killed and started again may be listed twice
+    names = {f'{one.node_namespace.rstrip("/")}/{one.node_name}' for one in publishers}
+    if len(names) > 1:
+        return f'{len(names)} nodes publish {topic}: {", ".join(sorted(names))}; stop all but one'
+    return '' if names else (
+        f'nobody publishes {topic}: start the localizer (AMCL); if it has just started, retry; or '
+        'set localizer_pose to the topic of its pose')
 
 
 def silence_of_localizer(node: Node) -> str:

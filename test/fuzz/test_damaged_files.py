@@ -179,6 +179,16 @@ def test_a_flood_of_empty_collections_in_yaml_takes_no_time(tmp_path, text):
     assert time.monotonic() - begun_s < 1.0
 
 
+@pytest.mark.parametrize('text', [''.join(f'{key}: 1\n' for key in range(1_000_000)),
+                                  f'a: [{"1, " * 1_000_000}1]'])
+def test_a_flood_of_values_in_yaml_takes_no_time(tmp_path, text):
+    (tmp_path / 'a.yaml').write_text(text)
+    begun_s = time.monotonic()
+    with pytest.raises(CliplocError, match='more than 10000 values side by side'):
+        LandmarkMap.from_file(tmp_path / 'a.yaml')
+    assert time.monotonic() - begun_s < 1.0
+
+
 @pytest.mark.parametrize('make', [
     os.mkfifo, lambda path: path.symlink_to('/dev/zero'), Path.mkdir,
     lambda path: path.symlink_to('/proc/kmsg'),

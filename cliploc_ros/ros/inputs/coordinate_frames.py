@@ -85,8 +85,7 @@ class CoordinateFrames:
         if not base_frame:
             return np.eye(4)
         if any(mount):
-            return invert_transform(transform_from_pose(np.array(mount[:3]),
-                                                        np.array(mount[3:])))
+            return invert_transform(transform_from_pose(np.array(mount[:3]), np.array(mount[3:])))
         return self.lookup(camera_frame, base_frame, stamp, timeout_s)
 
     def lookup(self, target_frame: str, source_frame: str, stamp: Time, timeout_s: float,
