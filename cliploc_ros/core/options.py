@@ -105,10 +105,9 @@ class RelocalizerOptions:
             raise OptionsError(f"algorithm '{self.algorithm}' needs similarities, but matching "
                                "'class' has none: set algorithm to auto, bf or ransac")
         for name, (low, high) in _RANGES.items():
-            or_zero = ', or be 0' if name == 'tilt_deviation_deg' else ''
-            if not low <= (value := getattr(self, name)) <= high and not (or_zero and value == 0):
-                raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}'
-                                   f'{or_zero}')
+            or_0 = ', or be 0' if name == 'tilt_deviation_deg' else ''
+            if not low <= (value := getattr(self, name)) <= high and not (or_0 and value == 0.0):
+                raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}{or_0}')
         heights = self.height_range_m
         if len(heights) != 2 or not heights[0] < heights[1]:
             raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a higher '

@@ -303,8 +303,8 @@ class Instants:
         except CliplocError as error:
             self.note(f'localizing without depth: {error}')
         return image, Observation(
-            camera, detections, stamp_ns=frame.stamp_ns,
-            camera_name=frame.camera, up_in_camera=state.up_in_camera, depths=depths,
+            camera, detections, stamp_ns=frame.stamp_ns, camera_name=frame.camera,
+            up_in_camera=state.up_in_camera, depths=depths,
             odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m,
             base_up_in_camera=state.camera_from_base[:3, 2]
             if parameters.base_frame not in ('', image_frame) else None)

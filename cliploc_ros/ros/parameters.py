@@ -221,8 +221,8 @@ class RelocalizerParameters(CommonParameters):
         "Topic of the localizer's pose, which must agree with initialpose; empty: any subscriber "
         'of initialpose suffices.', read_only=True)
     publish_tf: bool = parameter(False,
-        'Broadcast map -> odom_frame (REP 105) after an accepted pose. Only if no other localizer '
-        'broadcasts it.', read_only=True)
+        'Broadcast map -> odom_frame (REP 105) after an accepted pose. It pauses while another '
+        'node broadcasts it.', read_only=True)
     odom_frame: str = parameter('odom', 'Coordinate frame of odometry, for publish_tf.')
     watch: str = parameter('none',
         "Check the localizer's pose continuously: map -> base_frame in tf2, or the topic "

@@ -15,9 +15,6 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
-from cliploc_ros.core.localizer import Localizer, repeat
-from cliploc_ros.core.query import CASE, Case, case_arrays, read_case
-from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import CameraError
 from cliploc_ros.ros.frame_localizer import load_localizer
 from cliploc_ros.ros.inputs.odometry import OdometryPlace
@@ -75,18 +72,15 @@ def test_a_mount_of_body_axes_is_refused_where_the_pose_contradicts_it(make_node
     assert "'camera' has the axes of a body" in found.reason
 
 
-def test_a_robot_on_its_head_is_refused_and_named(make_node, values, tmp_path):
+def test_a_robot_on_its_head_is_refused_and_named(make_node, values):
     """A driver turns the image upright, tf says that the camera is upside down."""
     turned = np.diag([1.0, -1.0, -1.0, 1.0])
     for gravity, up in (('none', None), ('base_frame', turned[:3, 2])):
         asked = replace(values, base_frame='base_link', gravity=gravity, algorithm='auto')
         localizer = load_localizer(make_node(), asked)
         known = KnownBefore(RobotState(turned, up))
-        found = localizer.localize(make_frame(), asked, known, timer())
-        assert found.found.refusal_kind is RefusalKind.WRONG_MOUNT
-        CASE.write(tmp_path / 'case.npz', case_arrays(Case((found.query,), {})))
-        assert repeat(read_case(tmp_path / 'case.npz'), Localizer(Relocalizer(
-            make_room(), asked.options()))).refusal_kind is RefusalKind.WRONG_MOUNT
+        found = localizer.localize(make_frame(), asked, known, timer()).found
+        assert found.refusal_kind is RefusalKind.WRONG_MOUNT
         report = localizer.look(make_frame(), asked, known.state, 'map', MAP_FROM_CAMERA)
         assert 'tilted by 174 degrees' in report.fault
 

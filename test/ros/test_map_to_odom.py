@@ -126,10 +126,8 @@ def test_a_jump_or_a_restart_ends_the_broadcast_until_the_next_pose(robot, resta
 def test_map_to_odom_pauses_while_another_node_broadcasts_it(make_node):
     frames, sent = CoordinateFrames(node := make_node()), []
     map_to_odom = MapToOdom(node, frames)
-    map_to_odom._broadcaster = SimpleNamespace(
-        sendTransform=lambda transform: sent.append(deepcopy(transform)))
-    map_to_odom._transform = moving(100.0, 0.0, 'map', 'odom')
-    map_to_odom._timer = 'open'
+    map_to_odom._broadcaster = SimpleNamespace(sendTransform=lambda t: sent.append(deepcopy(t)))
+    map_to_odom._transform, map_to_odom._timer = moving(100.0, 0.0, 'map', 'odom'), 'open'
     map_to_odom._broadcast()
     frames.on_transform(sent[0], False)
     frames.on_transform(moving(100.0, 0.0), False)

@@ -205,8 +205,7 @@ def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
     mean = np.mean(ups, axis=0)
     length = float(np.linalg.norm(mean))
     if not length > _MIN_MEAN_LENGTH:
-        raise NoVerticalError(
-            'the IMU turns too fast: its orientations around the image differ')
+        raise NoVerticalError('the IMU turns too fast: its orientations around the image differ')
     return np.asarray(mean / length)
 
 
