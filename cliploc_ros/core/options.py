@@ -21,6 +21,7 @@ _RANGES = {'k': (1, math.inf), 'iterations': (1, 1_000_000), 'iou_threshold': (0
            'tilt_deviation_deg': (0.1, 60.0), 'vertical_deviation_deg': (0.01, 45.0),
            'min_inliers': (3, math.inf), 'min_confidence': (0.0, 1.0)}
 
+
 class Deadline(NamedTuple):
     """The end of a search.
 
