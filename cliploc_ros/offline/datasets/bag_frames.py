@@ -21,7 +21,12 @@ from cliploc_ros.core.geometry.depth import DepthCamera, DepthImage, depth_from_
 from cliploc_ros.errors import CameraError, CliplocError, DatasetError
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_agreement
-from cliploc_ros.offline.datasets.bag_poses import PoseSource, plain_name, poses_of_images
+from cliploc_ros.offline.datasets.bag_poses import (
+    PoseSource,
+    TransformChain,
+    plain_name,
+    poses_of_images,
+)
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.offline.datasets.parsing import find_camera
@@ -122,8 +127,9 @@ def bag_frames(bag: Path, topics: BagTopics, source: PoseSource,
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
         with BagReader(bag) as reader:
             yield from _paired(reader, topics, poses, cameras, decode_depth, is_wanted)
-    return Frames(bag, count, read_raw, varies=len(cameras.infos) > 1, notes=tuple(
-        f'note: {note}' for note in notes if note))
+    return Frames(bag, count, read_raw, of_tf=isinstance(poses, TransformChain),
+                  varies=len(cameras.infos) > 1, notes=tuple(
+                      f'note: {note}' for note in notes if note))
 
 
 class _Cameras(NamedTuple):

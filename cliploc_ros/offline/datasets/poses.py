@@ -3,7 +3,7 @@
 """Poses of a camera over time, with interpolation between them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -18,6 +18,8 @@ from cliploc_ros.units import NS_PER_S
 STAMP_TOLERANCE_NS = 20_000_000
 #: Greatest deviation of a quaternion's norm from 1.
 MAX_NORM_ERROR = 0.01
+#: Remedy for poses that jump.
+AT_A_JUMP = 'use the recording before or after it alone, or give corrected poses as `trajectory`'
 # A smaller offset is taken for a late start of the recording, a larger one for another clock.
 _OTHER_CLOCK_S = 60.0
 # Delayed messages are out of order by less than this; a clock that restarts jumps back by more
@@ -72,6 +74,11 @@ class TimedPoses:
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.stamps_ns)
+
+    def part(self, first: int, end: int) -> 'TimedPoses':
+        """Return the samples from the first one to the one before the end."""
+        return replace(self, **{name: getattr(self, name)[first:end] for name in (
+            'stamps_ns', 'positions_xyz', 'quats_xyzw')})
 
     @property
     def span_ns(self) -> tuple[int, int] | None:

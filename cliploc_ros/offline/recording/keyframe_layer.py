@@ -19,6 +19,9 @@ from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
+from cliploc_ros.offline.datasets.poses import AT_A_JUMP
+from cliploc_ros.offline.mapping.triangulation import check_scale
+from cliploc_ros.units import NS_PER_S
 
 # Features extracted from an image, before those without a point are left out.
 _MOST_FOUND = 2000
@@ -37,6 +40,11 @@ _NEIGHBOURS = 8
 _LEAST_M, _MOST_M, _MOST_COS = 0.05, 2.0, np.cos(np.radians(40.0))
 #: Range of depths of points in a room or hall [m].
 _DEPTHS_M = (0.2, 40.0)
+# Number of keyframes in whose images depth is compared with triangulated points.
+_COMPARED = 6
+# Poses jump by more than this against the images [m], and pairs of images across the jump agree up
+# to this share. Chosen: correct poses of the kitchen differ by up to 0.04 m.
+_JUMP_M, _JUMP_SPREAD = 0.12, 0.3
 # Number of words. 1,024 words find the keyframes of the kitchen as well as comparing all
 # descriptors.
 _WORDS = 1024
@@ -78,6 +86,7 @@ class _Keyframe(NamedTuple):
     depths: NDArray[np.float64]
     jpeg: bytes
     camera: Camera  #: Camera of the undistorted image
+    stamp_ns: int
 
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
@@ -95,9 +104,17 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     ------
     MappingError
         No image has enough points.
+    DatasetError
+        The images show that depth has another unit, or that the poses jump.
     """
-    seen = [_look(frame, options) for part in frames.each for frame in _chosen(part, options)]
+    seen, starts = list[_Keyframe](), [0]
+    for part in frames.each:
+        own = [_look(frame, options) for frame in _chosen(part, options)]
+        _check_depth(own, options.kind, f' of {part.camera}' if part.camera else '')
+        seen += own
+        starts.append(len(seen))
     images, has_depth = [keyframe.posed for keyframe in seen], False
+    of_images = list[NDArray[np.float64]]()
     chosen = []  # keyframes, the points of their features, and the rows of these features
     for number, keyframe in enumerate(seen):
         # points (n, 3) in the camera's coordinate frame; NaN where unknown
@@ -107,10 +124,14 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
                                      ) * keyframe.depths[:, None]
         else:
             points = triangulate(images, number, options.kind)
+        of_images.append(points)
         # the strongest features that have a point
         rows = np.nonzero(np.isfinite(points).all(axis=1))[0][:options.most_points]
         if len(rows) >= _LEAST_POINTS:
             chosen.append((keyframe, points[rows], rows))
+    for part, start, end in zip(frames.each, starts, starts[1:], strict=False):
+        _check_steps(images[start:end], of_images[start:end], [
+            keyframe.stamp_ns for keyframe in seen[start:end]], options.kind, part.source)
     if not chosen:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
                            f'{_LEAST_POINTS} points; record depth, or overlapping '
@@ -140,6 +161,63 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     jpegs = [keyframe.jpeg for keyframe, _, _ in chosen]
     return replace(built, images=np.frombuffer(b''.join(jpegs), dtype=np.uint8),
                    image_offsets=np.cumsum([0, *map(len, jpegs)]))
+
+
+def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
+    """Refuse keyframes with depth in another unit than their poses.
+
+    DatasetError: points that are triangulated in a sample of the images have other depths.
+    """
+    images, ratios = [keyframe.posed for keyframe in seen], list[float]()
+    for number in np.unique(np.linspace(0, len(seen) - 1, _COMPARED).astype(np.int64)).tolist():
+        if np.isfinite(seen[number].depths).any():
+            found = triangulate(images, number, kind)[:, 2] / seen[number].depths
+            ratios += found[np.isfinite(found)].tolist()
+    if len(ratios) >= _LEAST_POINTS:
+        check_scale(float(np.median(ratios)), of, 'triangulated points')
+
+
+def _check_steps(seen: Sequence[PosedFeatures], points: Sequence[NDArray[np.float64]],
+                 stamps_ns: Sequence[int], kind: FeatureKind, where: object) -> None:
+    """Refuse poses that jump against the images, which are in order, with the points of each.
+
+    DatasetError: images after a step are located elsewhere than their poses say, by the points of
+    images before it, and all pairs across the step agree by how far.
+    """
+    for after in range(1, len(seen)):
+        jumps = _shift(seen[after - 1], points[after - 1], seen[after], kind)
+        if not len(jumps) or np.linalg.norm(jumps) < _JUMP_M:
+            continue
+        # a false match locates one image, a jump displaces all of them
+        jumps = np.concatenate([jumps, *(
+            _shift(seen[first], points[first], seen[second], kind)
+            for first, second in ((after - 1, after + 1), (after - 2, after), (after - 2, after + 1))
+            if first >= 0 and second < len(seen))])
+        size_m = float(np.linalg.norm(jumps.mean(axis=0)))
+        if len(jumps) > 1 and np.linalg.norm(jumps - jumps.mean(axis=0), axis=1).max() < (
+                _JUMP_SPREAD * size_m):
+            raise DatasetError(
+                f'{where}: the poses jump by {size_m:.2f} m against the images at '
+                f'{stamps_ns[after] / NS_PER_S:.2f} s: {AT_A_JUMP}')
+
+
+def _shift(ours: PosedFeatures, points: NDArray[np.float64], theirs: PosedFeatures,
+           kind: FeatureKind) -> NDArray[np.float64]:
+    """Return how far (1, 3) the pose of an image is from where our points (n, 3) locate it [m].
+
+    The axes are those of the map. Empty: too few points locate it.
+    """
+    pairs, _ = kind.match(kind.units(ours.descriptors), kind.units(theirs.descriptors))
+    pairs = pairs[np.isfinite(points[pairs[:, 0]]).all(axis=1)]
+    if len(pairs) >= _LEAST_POINTS:
+        _, turn, shift, kept = cv2.solvePnPRansac(
+            points[pairs[:, 0]], theirs.bearings[pairs[:, 1]], np.eye(3), None,
+            reprojectionError=_MOST_ERROR, iterationsCount=200)
+        if kept is not None and len(kept) >= max(_LEAST_POINTS, 0.5 * len(pairs)):
+            place = -Rotation.from_rotvec(turn[:, 0]).inv().apply(shift[:, 0])
+            return np.asarray(theirs.map_from_camera[:3, 3] - ours.map_from_camera[:3, 3]
+                              - ours.map_from_camera[:3, :3] @ place)[None]
+    return np.empty((0, 3))
 
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
@@ -179,7 +257,8 @@ def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
         known &= np.cumsum(known) <= options.most_points
     return _Keyframe(PosedFeatures(frame.map_from_camera, bearings[known],
                                    features.descriptors[known]), depths[known],
-                     _small_jpeg(frame) if options.images else b'', frame.camera.pinhole)
+                     _small_jpeg(frame) if options.images else b'', frame.camera.pinhole,
+                     frame.stamp_ns)
 
 
 def _small_jpeg(frame: PosedImage) -> bytes:
