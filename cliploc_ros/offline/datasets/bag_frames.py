@@ -21,16 +21,11 @@ from cliploc_ros.core.geometry.depth import DepthCamera, DepthImage, depth_from_
 from cliploc_ros.errors import CameraError, CliplocError, DatasetError
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.agreement import AXES, Reading, View, check_agreement
-from cliploc_ros.offline.datasets.bag_poses import (
-    PoseSource,
-    TransformChain,
-    plain_name,
-    poses_of_images,
-)
+from cliploc_ros.offline.datasets.bag_poses import PoseSource, plain_name, poses_of_images
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.offline.datasets.parsing import find_camera
-from cliploc_ros.offline.datasets.poses import STAMP_TOLERANCE_NS, Poses, check_forward
+from cliploc_ros.offline.datasets.poses import STAMP_TOLERANCE_NS, Poses, TimedPoses, check_forward
 from cliploc_ros.units import NS_PER_S
 
 _IMAGES = (bag_messages.IMAGE, bag_messages.COMPRESSED_IMAGE)
@@ -127,7 +122,7 @@ def bag_frames(bag: Path, topics: BagTopics, source: PoseSource,
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
         with BagReader(bag) as reader:
             yield from _paired(reader, topics, poses, cameras, decode_depth, is_wanted)
-    return Frames(bag, count, read_raw, of_tf=isinstance(poses, TransformChain),
+    return Frames(bag, count, read_raw, of_tf=not isinstance(poses, TimedPoses),
                   varies=len(cameras.infos) > 1, notes=tuple(
                       f'note: {note}' for note in notes if note))
 

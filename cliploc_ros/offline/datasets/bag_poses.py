@@ -20,7 +20,6 @@ from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import bag_messages
 from cliploc_ros.offline.datasets.bags import BagReader
 from cliploc_ros.offline.datasets.poses import (
-    AT_A_JUMP,
     MAX_NORM_ERROR,
     STAMP_TOLERANCE_NS,
     Poses,
@@ -43,14 +42,10 @@ _TF_TYPE = 'tf2_msgs/msg/TFMessage'
 # Tolerance of a static transform, whose pose is constant in time.
 _ALWAYS_NS = 2**63
 # A correction jumps if it moves the camera by more than this [m] [deg], and this many times as far
-# as its median. The poses after a jump are used if they are this share of the recording. Chosen.
-_JUMP, _UNUSUAL, _LEAST_LEFT = (0.2, 8.0), 3.0, 1 / 3
+# as its median. Chosen.
+_JUMP, _UNUSUAL = (0.2, 8.0), 3.0
 # Two sources of poses are compared at this many stamps, and agree within this [m] [deg].
 _COMPARED, _SAME_M, _SAME_DEG = 50, 0.05, 2.0
-
-
-class JumpError(DatasetError):
-    """Poses that jump, so that they cannot be used as a whole."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +85,12 @@ class PoseSource:
         if self.topic is not None:
             return self._of_topic(reader, self.topic, camera_frame)
         if self.map_frame is not None:
-            _tell_drift(reader, self.map_frame)
+            reader.notes += _drift_notes(self.map_frame)
             return self._of_tf(reader, self.map_frame, camera_frame, self.max_gap_ns)
         problem, of_tf = 'no tf', None
         try:
             if _tf_topics(reader, self.tf):
                 of_tf = self._of_tf(reader, MAP_FRAME, camera_frame, self.max_gap_ns)
-        except JumpError:
-            raise
         except DatasetError as error:
             problem = str(error).removeprefix(f'{reader.path}: ')
         if self.ground_truth in reader.topics:
@@ -129,7 +122,7 @@ class PoseSource:
                 frame_id = plain_name(message.header.frame_id) or name
                 children.add(plain_name(getattr(message, 'child_frame_id', '')))
         check_forward(stamps, where)
-        _tell_drift(reader, frame_id)
+        reader.notes += _drift_notes(frame_id)
         poses = replace(TimedPoses.from_samples(stamps, rows, where),
                         max_gap_ns=self.topic_gap_ns, body_from_camera=self.body_from_camera,
                         tolerance_ns=self.tolerance_ns)
@@ -156,11 +149,7 @@ class PoseSource:
                                'or give a topic or file of poses')
         parents, up, down = _find_way(reader, topics, plain_name(map_frame), camera_frame)
         links = _read_links(reader, topics, {*up, *down}, parents, max_gap_ns)
-        moving = [child for child in (*up, *reversed(down))
-                  if links[child].tolerance_ns < _ALWAYS_NS]
-        if len(moving) > 1:  # from the map on: corrections, such as map -> odom, and odometry
-            links = _after_jumps(reader, links, moving[0], up, down)
-        return _chain(links, up, down)
+        return _after_jumps(reader, links, up, down)
 
 
 def _difference(poses: Poses, others: Poses) -> str:
@@ -323,45 +312,45 @@ def _read_links(reader: BagReader, topics: Collection[str], children: Collection
     return links
 
 
-def _tell_drift(reader: BagReader, frame_id: str) -> None:
-    """Note that poses in an odometry frame drift."""
-    if 'odom' in frame_id.lower():
-        reader.notes.append(
-            f"the poses are in '{frame_id}', where odometry drifts, so the map is as wrong as "
-            'odometry and holds for no other run: run a localizer or SLAM, and give its frame as '
-            f"`map_frame`; otherwise name the map with `frame_id` {frame_id.lstrip('/')}")
+def _drift_notes(frame_id: str) -> list[str]:
+    """Return a note if poses are in the coordinate frame of odometry."""
+    return [f"the poses are in '{frame_id}': odometry drifts, and so does the map; run a "
+            f'localizer or SLAM, and give its `map_frame`, or give `frame_id` {frame_id}'
+            ] * ('odom' in frame_id.lower())
 
 
-def _chain(links: Mapping[str, TimedPoses], up: Sequence[str], down: Sequence[str]
-           ) -> TransformChain:
-    return TransformChain(tuple(links[child] for child in up),
-                          tuple(links[child] for child in down))
+def _after_jumps(reader: BagReader, links: dict[str, TimedPoses], up: Sequence[str],
+                 down: Sequence[str]) -> TransformChain:
+    """Return the chain of links, without the poses before the last jump of a correction.
 
-
-def _after_jumps(reader: BagReader, links: Mapping[str, TimedPoses], child: str,
-                 up: Sequence[str], down: Sequence[str]) -> dict[str, TimedPoses]:
-    """Return the links; that of a child with its samples after the last jump of the camera.
-
-    A localizer or SLAM corrects this link. JumpError: little of the recording is left.
+    If several links move, the first one from the map is a correction, such as map -> odom.
     """
+    def chain(**changed: TimedPoses) -> TransformChain:
+        found = {**links, **changed}
+        return TransformChain(tuple(map(found.__getitem__, up)),
+                              tuple(map(found.__getitem__, down)))
+    child, *others = (*(child for child in (*up, *reversed(down))
+                        if links[child].tolerance_ns < _ALWAYS_NS), '')
+    if len(others) < 2:
+        return chain()
     link, sizes = links[child], np.zeros((len(links[child]), 2))
-    for row in np.nonzero(np.diff(link.positions_xyz, axis=0).any(axis=1)
-                          | np.diff(link.quats_xyzw, axis=0).any(axis=1))[0].tolist():
-        poses = [_chain({**links, child: replace(link.part(at, at + 1), tolerance_ns=_ALWAYS_NS)},
-                        up, down).pose_at(int(link.stamps_ns[row + 1])) for at in (row, row + 1)]
-        if poses[0] is not None and poses[1] is not None:
-            sizes[row + 1] = pose_error(*poses)
+    samples = np.hstack([link.positions_xyz, link.quats_xyzw])
+    for row in (1 + np.nonzero(np.diff(samples, axis=0).any(axis=1))[0]).tolist():
+        before, after = (chain(**{child: replace(
+            link.part(at, at + 1), tolerance_ns=_ALWAYS_NS)}).pose_at(int(link.stamps_ns[row]))
+            for at in (row - 1, row))
+        if before is not None and after is not None:
+            sizes[row] = pose_error(before, after)
     jumps = np.nonzero((sizes > np.maximum(_JUMP, _UNUSUAL * np.median(sizes, axis=0))
                         ).any(axis=1))[0].tolist()
-    if jumps:
-        stamps, (far_m, far_deg) = link.stamps_ns, sizes[jumps[-1]]
-        text = (f"tf of '{child}' jumps {len(jumps)} times, the last time by {far_m:.2f} m and "
-                f'{far_deg:.1f} degrees at {stamps[jumps[-1]] / NS_PER_S:.2f} s')
-        if stamps[-1] - stamps[jumps[-1]] < _LEAST_LEFT * (stamps[-1] - stamps[0]):
-            raise JumpError(f'{reader.path}: {text}: {AT_A_JUMP}')
-        reader.notes.append(f'{text}: only the poses after it are used')
-        link = link.part(jumps[-1], len(link))
-    return {**links, child: link}
+    if not jumps:
+        return chain()
+    far_m, far_deg = sizes[jumps[-1]]
+    reader.notes.append(
+        f"tf of '{child}' jumps {len(jumps)} times, the last time by {far_m:.2f} m and "
+        f'{far_deg:.1f} degrees at {link.stamps_ns[jumps[-1]] / NS_PER_S:.2f} s: only the poses '
+        'after it are used; record again with a localizer that has found its pose')
+    return chain(**{child: link.part(jumps[-1], len(link))})
 
 
 def plain_name(frame_id: str) -> str:

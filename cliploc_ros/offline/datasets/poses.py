@@ -18,8 +18,6 @@ from cliploc_ros.units import NS_PER_S
 STAMP_TOLERANCE_NS = 20_000_000
 #: Greatest deviation of a quaternion's norm from 1.
 MAX_NORM_ERROR = 0.01
-#: Remedy for poses that jump.
-AT_A_JUMP = 'use the recording before or after it alone, or give corrected poses as `trajectory`'
 # A smaller offset is taken for a late start of the recording, a larger one for another clock.
 _OTHER_CLOCK_S = 60.0
 # Delayed messages are out of order by less than this; a clock that restarts jumps back by more

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import DatasetError, MappingError
+from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping import evidence, joint, triangulation
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.doubles import close_pairs, merge_doubles, resolve_doubles
@@ -152,12 +152,12 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
               progress: Progress | None = None) -> BuiltMap:
     """Build a map from posed detections.
 
-    MappingError: this input shows no landmark. DatasetError: it is wrong as a whole. The messages
-    say what to correct.
+    MappingError: no map can be made from this input. DatasetError: its depth has another unit. The
+    messages say what to correct.
     """
     options = options or MappingOptions()
     if options.refine_mount and len(detections.cameras) > 1:
-        raise DatasetError(f'the mounts of {len(detections.cameras)} cameras cannot be corrected '
+        raise MappingError(f'the mounts of {len(detections.cameras)} cameras cannot be corrected '
                            'together; correct each with a map of that camera alone')
     builder = _Builder(detections, options, np.random.default_rng(options.random_seed),
                        progress or (lambda stage, share: None))

@@ -72,8 +72,8 @@ def tilt_note(poses: NDArray[np.float64], of_tf: bool = False) -> str:
         return ''
     if of_tf or found[1] > _UPSIDE_DOWN_DEG:
         return (f'by the poses, the cameras are tilted by {found[1]:.0f} degrees: right if they '
-                'are mounted so, otherwise correct their mount' + (
-                    '' if of_tf else '; if z of the poses points down, build_map --level turns it'))
+                'are mounted so, otherwise correct their mount') + (
+            '' if of_tf else '; if z of the poses points down, build_map --level turns it')
     return (f'z is {found[1]:.0f} degrees off the vertical of the cameras: heights and views from '
             'above are meaningless; build_map --level corrects it')
 

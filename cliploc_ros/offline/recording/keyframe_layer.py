@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 import cv2
@@ -19,7 +20,6 @@ from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
-from cliploc_ros.offline.datasets.poses import AT_A_JUMP
 from cliploc_ros.offline.mapping.triangulation import check_scale
 from cliploc_ros.units import NS_PER_S
 
@@ -40,11 +40,13 @@ _NEIGHBOURS = 8
 _LEAST_M, _MOST_M, _MOST_COS = 0.05, 2.0, np.cos(np.radians(40.0))
 #: Range of depths of points in a room or hall [m].
 _DEPTHS_M = (0.2, 40.0)
-# Number of keyframes in whose images depth is compared with triangulated points.
+# Greatest number of keyframes in whose images depth is compared with triangulated points.
 _COMPARED = 6
 # Poses jump by more than this against the images [m], and pairs of images across the jump agree up
 # to this share. Chosen: correct poses of the kitchen differ by up to 0.04 m.
 _JUMP_M, _JUMP_SPREAD = 0.12, 0.3
+# Least number of points that locate an image.
+_LEAST_SEEN = 12
 # Number of words. 1,024 words find the keyframes of the kitchen as well as comparing all
 # descriptors.
 _WORDS = 1024
@@ -107,12 +109,10 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     DatasetError
         The images show that depth has another unit, or that the poses jump.
     """
-    seen, starts = list[_Keyframe](), [0]
-    for part in frames.each:
-        own = [_look(frame, options) for frame in _chosen(part, options)]
+    parts = [[_look(frame, options) for frame in _chosen(part, options)] for part in frames.each]
+    for part, own in zip(frames.each, parts, strict=True):
         _check_depth(own, options.kind, f' of {part.camera}' if part.camera else '')
-        seen += own
-        starts.append(len(seen))
+    seen = list(chain.from_iterable(parts))
     images, has_depth = [keyframe.posed for keyframe in seen], False
     of_images = list[NDArray[np.float64]]()
     chosen = []  # keyframes, the points of their features, and the rows of these features
@@ -129,9 +129,9 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         rows = np.nonzero(np.isfinite(points).all(axis=1))[0][:options.most_points]
         if len(rows) >= _LEAST_POINTS:
             chosen.append((keyframe, points[rows], rows))
-    for part, start, end in zip(frames.each, starts, starts[1:], strict=False):
-        _check_steps(images[start:end], of_images[start:end], [
-            keyframe.stamp_ns for keyframe in seen[start:end]], options.kind, part.source)
+    for own in parts:
+        _check_steps(own, of_images[:len(own)], options.kind, frames.source)
+        of_images = of_images[len(own):]
     if not chosen:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
                            f'{_LEAST_POINTS} points; record depth, or overlapping '
@@ -169,7 +169,7 @@ def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
     DatasetError: points that are triangulated in a sample of the images have other depths.
     """
     images, ratios = [keyframe.posed for keyframe in seen], list[float]()
-    for number in np.unique(np.linspace(0, len(seen) - 1, _COMPARED).astype(np.int64)).tolist():
+    for number in range(0, len(seen), 1 + len(seen) // _COMPARED):
         if np.isfinite(seen[number].depths).any():
             found = triangulate(images, number, kind)[:, 2] / seen[number].depths
             ratios += found[np.isfinite(found)].tolist()
@@ -177,28 +177,32 @@ def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
         check_scale(float(np.median(ratios)), of, 'triangulated points')
 
 
-def _check_steps(seen: Sequence[PosedFeatures], points: Sequence[NDArray[np.float64]],
-                 stamps_ns: Sequence[int], kind: FeatureKind, where: object) -> None:
+def _check_steps(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.float64]],
+                 kind: FeatureKind, where: object) -> None:
     """Refuse poses that jump against the images, which are in order, with the points of each.
 
     DatasetError: images after a step are located elsewhere than their poses say, by the points of
     images before it, and all pairs across the step agree by how far.
     """
+    seen = [keyframe.posed for keyframe in keyframes]
     for after in range(1, len(seen)):
-        jumps = _shift(seen[after - 1], points[after - 1], seen[after], kind)
-        if not len(jumps) or np.linalg.norm(jumps) < _JUMP_M:
+        jumps, before = _shift(seen[after - 1], points[after - 1], seen[after], kind), points
+        if len(jumps) and np.linalg.norm(jumps) < _JUMP_M:
             continue
+        firsts = range(max(0, after - 2), after)
+        if not len(jumps):  # points that images on both sides of a jump show are lost
+            before = [*points[:firsts[0]], *(triangulate(seen[:after], row, kind)
+                                             for row in firsts)]
         # a false match locates one image, a jump displaces all of them
-        jumps = np.concatenate([jumps, *(
-            _shift(seen[first], points[first], seen[second], kind)
-            for first, second in ((after - 1, after + 1), (after - 2, after), (after - 2, after + 1))
-            if first >= 0 and second < len(seen))])
-        size_m = float(np.linalg.norm(jumps.mean(axis=0)))
-        if len(jumps) > 1 and np.linalg.norm(jumps - jumps.mean(axis=0), axis=1).max() < (
-                _JUMP_SPREAD * size_m):
+        jumps = np.concatenate([_shift(seen[first], before[first], second, kind)
+                                for first in firsts for second in seen[after:after + 2]])
+        size_m = float(np.linalg.norm(jumps.sum(axis=0))) / max(1, len(jumps))
+        if len(jumps) > 1 and size_m > _JUMP_M and np.linalg.norm(
+                jumps - jumps.mean(axis=0), axis=1).max() < _JUMP_SPREAD * size_m:
             raise DatasetError(
                 f'{where}: the poses jump by {size_m:.2f} m against the images at '
-                f'{stamps_ns[after] / NS_PER_S:.2f} s: {AT_A_JUMP}')
+                f'{keyframes[after].stamp_ns / NS_PER_S:.2f} s: use the recording before or after '
+                'it alone, or give corrected poses as `trajectory`')
 
 
 def _shift(ours: PosedFeatures, points: NDArray[np.float64], theirs: PosedFeatures,
@@ -209,11 +213,11 @@ def _shift(ours: PosedFeatures, points: NDArray[np.float64], theirs: PosedFeatur
     """
     pairs, _ = kind.match(kind.units(ours.descriptors), kind.units(theirs.descriptors))
     pairs = pairs[np.isfinite(points[pairs[:, 0]]).all(axis=1)]
-    if len(pairs) >= _LEAST_POINTS:
+    if len(pairs) >= _LEAST_SEEN:
         _, turn, shift, kept = cv2.solvePnPRansac(
             points[pairs[:, 0]], theirs.bearings[pairs[:, 1]], np.eye(3), None,
             reprojectionError=_MOST_ERROR, iterationsCount=200)
-        if kept is not None and len(kept) >= max(_LEAST_POINTS, 0.5 * len(pairs)):
+        if kept is not None and len(kept) >= max(_LEAST_SEEN, 0.4 * len(pairs)):
             place = -Rotation.from_rotvec(turn[:, 0]).inv().apply(shift[:, 0])
             return np.asarray(theirs.map_from_camera[:3, 3] - ours.map_from_camera[:3, 3]
                               - ours.map_from_camera[:3, :3] @ place)[None]

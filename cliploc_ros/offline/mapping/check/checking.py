@@ -48,8 +48,8 @@ _NO_RECORDING = (
     'images of 640 x 480 px with a focal length of 525 px')
 # Greatest difference in height between a robot's camera and those of the recording [m]. Chosen.
 _HEIGHT_MARGIN_M = 0.3
-# Least number of classes that agree about the scale of a map, up to a factor that is also the least
-# one reported: ellipsoids enclose objects loosely, or only parts of them. Chosen.
+# Least number of classes that agree about the scale of a map, up to a factor, which is also the
+# least one reported: ellipsoids enclose objects loosely, or only parts of them. Chosen.
 _LEAST_CLASSES, _OFF = 3, 1.8
 _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
 # Shorter runs of refused frames, and smaller areas of the grid, get no advice.
