@@ -43,7 +43,7 @@ _DEPTHS_M = (0.2, 40.0)
 # Greatest number of keyframes in whose images depth is compared with triangulated points.
 _COMPARED = 6
 # Poses jump by more than this against the images [m] and this many times the median, and pairs of
-# images across the jump agree up to this share. Chosen: the kitchen's poses differ by up to 0.04 m.
+# images across it agree up to this share. Chosen: the kitchen's poses differ by up to 0.04 m.
 _JUMP_M, _UNUSUAL, _JUMP_SPREAD = 0.12, 8.0, 0.3
 # Least number of points that locate an image.
 _LEAST_SEEN = 12
@@ -189,15 +189,12 @@ def _check_steps(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.flo
     sizes_m = [float(np.linalg.norm(step)) for step in steps if len(step)]
     least_m = max(_JUMP_M, _UNUSUAL * float(np.median(sizes_m or [0.0])))
     for after, step in enumerate(steps, 1):
-        if len(step) and np.linalg.norm(step) < least_m:
+        if not len(step) or np.linalg.norm(step) < least_m:
             continue
-        firsts, before = range(max(0, after - 2), after), points
-        if not len(step):  # points that images on both sides of a jump show are lost
-            before = [*points[:firsts[0]], *(triangulate(seen[:after], row, kind)
-                                             for row in firsts)]
         # a false match locates one image, a jump displaces all of them
-        jumps = np.concatenate([_shift(seen[first], before[first], second, kind)
-                                for first in firsts for second in seen[after:after + 2]])
+        jumps = np.concatenate([_shift(seen[first], points[first], second, kind)
+                                for first in range(max(0, after - 2), after)
+                                for second in seen[after:after + 2]])
         size_m = float(np.linalg.norm(jumps.sum(axis=0))) / max(1, len(jumps))
         if len(jumps) > 1 and size_m > least_m and np.linalg.norm(
                 jumps - jumps.mean(axis=0), axis=1).max() < _JUMP_SPREAD * size_m:
