@@ -108,7 +108,8 @@ def build(options: argparse.Namespace) -> int:
     mapping = _mapping_options(options, f'build_map {name}')
     recorded, file, images = sources.read_source(options)
     _tell_misspelt(mapping.moving_classes, recorded.class_names)
-    detections, scale, rotation = _placed(recorded, options, mapping)
+    detections, scale, rotation = _placed(recorded, options, mapping,
+                                          images is not None and images.of_tf)
     if without := recorded.without_pose:
         print(f'no pose: {without} of {recorded.images} images', flush=True)
     if options.every > 1:
@@ -128,7 +129,7 @@ def build(options: argparse.Namespace) -> int:
             note = note or made.note
             if options.keyframe_layer and note:
                 raise MappingError(note)
-    except MappingError as error:
+    except CliplocError as error:
         left_out = getattr(error, 'left_out', ())
         _write_report(options.report, {'failure': str(error),
                                        'left_out': [asdict(landmark) for landmark in left_out]})
@@ -232,7 +233,7 @@ def _write_report(path: Path | None, report: dict[str, Any]) -> None:
 
 
 def _placed(detections: 'PosedDetections', options: argparse.Namespace,
-            mapping: 'MappingOptions'
+            mapping: 'MappingOptions', of_tf: bool
             ) -> 'tuple[PosedDetections, float, NDArray[np.float64]]':
     """Level and scale detections; return them with the scale and the rotation (3, 3)."""
     import numpy as np
@@ -243,7 +244,7 @@ def _placed(detections: 'PosedDetections', options: argparse.Namespace,
 
     scale, rotation = 1.0, np.eye(3)
     if folder_of(options) is None:  # folders are levelled when they are read
-        rotation, note = find_levelling(detections.map_from_camera, options.level)
+        rotation, note = find_levelling(detections.map_from_camera, options.level, of_tf)
         print(note + '\n' if note else '', end='', flush=True)
         detections = detections.moved(scale, rotation)
     if options.object_size is not None:

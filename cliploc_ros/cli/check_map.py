@@ -21,6 +21,7 @@ from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 if TYPE_CHECKING:
     from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.offline.datasets.images import Images
+    from cliploc_ros.offline.datasets.map_recording import MapRecording
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
 _ADVICE_SHOWN = 8
@@ -86,21 +87,24 @@ def check(options: argparse.Namespace) -> int:
     # Imported late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
+    from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.evaluation.check_page import CHECK, figures_of, write_check
     from cliploc_ros.offline.mapping.check.checking import check_map
     from cliploc_ros.offline.mapping.tilt import tilt_note
 
     begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)
+    recording = load_recording(options.map) if options.observations is None else None
     check_options = CheckOptions(
         relocalizer=RelocalizerOptions(min_confidence=options.min_confidence),
         folds=options.folds, frames=options.frames, spacing_m=options.grid,
         max_positions=options.positions, headings=options.headings,
         camera_height_m=options.camera_height, use_vertical=options.gravity,
+        is_size_given=recording is not None and recording.scale != 1.0,
         random_seed=options.seed)
     thresholds = Thresholds(**{field.name: getattr(options, field.name)
                                for field in fields(Thresholds)})
-    detections, images = _read_recording(options) or (None, None)
+    detections, images = _read_recording(options, recording) or (None, None)
     image_of = None
     if detections is not None and images is not None:
         image_of = partial(images.of, detections)
@@ -144,15 +148,14 @@ def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections
     return 1
 
 
-def _read_recording(options: argparse.Namespace) -> 'tuple[PosedDetections, Images | None] | None':
+def _read_recording(options: argparse.Namespace, recording: 'MapRecording | None'
+                    ) -> 'tuple[PosedDetections, Images | None] | None':
     """Return the recording of the command line or of the map, and its images if they are found."""
     from cliploc_ros.cli.sources import images_at
     from cliploc_ros.offline.datasets.images import images_of_recording
-    from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.recording.recorder import source_of
 
-    recording = load_recording(options.map) if options.observations is None else None
     if options.observations is not None:
         detections, source = load_observations(options.observations), source_of(
             options.observations)

@@ -130,7 +130,8 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
         images = images_of_recording(built_from, _cameras(options, detections))
     if detections is None and options.images is not None:
         detections = views_of_folder(options.images)
-    recording = None if detections is None else Recording(detections, images)
+    recording = None if detections is None else Recording(
+        detections, images, built_from is not None and built_from.scale != 1.0)
     # a new map gets the first unused name
     names = itertools.chain(['map.yaml'], (f'map-{number}.yaml' for number in itertools.count(2)))
     document = Document(options.map or next(

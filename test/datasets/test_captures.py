@@ -33,7 +33,7 @@ from cliploc_ros.offline.datasets.observations import load_observations, save_ob
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.make_map import scale_of_objects
 from cliploc_ros.offline.mapping.options import MappingOptions
-from cliploc_ros.offline.mapping.tilt import find_vertical
+from cliploc_ros.offline.mapping.tilt import find_vertical, tilt_note
 from cliploc_ros.offline.recording.networks import RunNetworks
 from cliploc_ros.offline.recording.recorder import record_every_frame
 
@@ -218,6 +218,17 @@ def test_the_option_mends_it(shots, tmp_path):
         read_folder(folder, FolderOptions(scale=1.0))
     found = next(read_folder(folder, FolderOptions(scale=1.0, axes='opencv')).read())
     np.testing.assert_allclose(found.map_from_camera, shots[0].pose, atol=1e-9)
+
+
+def test_an_upside_down_camera_is_no_reason_to_turn_the_map_over():
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    turns = Rotation.from_euler('xz', [[-90.0, 30.0 * place] for place in range(12)], degrees=True)
+    poses[:, :3, :3] = turns.as_matrix()
+    assert tilt_note(poses) == ''
+    poses[:, :3, :3] = turns.as_matrix() @ np.diag([-1.0, -1.0, 1.0])
+    assert 'mounted so' in tilt_note(poses) and 'corrects' not in tilt_note(poses)
+    assert 'mounted so' in tilt_note(poses, of_tf=True)
+    assert '--level' not in tilt_note(poses, of_tf=True)
 
 
 @pytest.mark.parametrize('angles_deg', [(120.0, 0.0, 30.0), (1.0, -1.0, 100.0)])

@@ -6,6 +6,7 @@ Recordings are real images and poses or the demo's walk, with one field altered.
 """
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -288,6 +289,34 @@ def test_exif_orientation(shared_data, tmp_path):
         else:
             with pytest.raises(DatasetError, match=expected):
                 read_folder(tmp_path)
+
+
+def test_mirrored_images_are_named(room, tmp_path):
+    for axis, name in enumerate(('upside down', 'left and right')):
+        refuses('the images are mirrored', write_bag(tmp_path / name, [
+            (at, np.ascontiguousarray(np.flip(image, axis)), pose, camera)
+            for at, image, pose, camera in room]))
+
+
+@pytest.mark.parametrize(('jump_m', 'turn_deg'), [(0.25, 0.0), (0.0, 10.0), (0.1, 0.0)])
+def test_only_poses_after_a_jump_of_the_localizer_are_used(room, tmp_path, jump_m, turn_deg):
+    """map -> odom is corrected at the 20th image; odometry has the poses of the camera."""
+    poses, turn = poses_of(room), Rotation.from_euler('z', turn_deg, degrees=True).as_matrix()
+    corrected = make_transform(turn, np.array([jump_m, 0.0, 0.0]))
+    tf = [*rig_bag.tf_messages([(at, corrected if place >= 20 else np.eye(4))
+                                for place, (at, _) in enumerate(poses)], 'map', 'odom'),
+          *rig_bag.tf_messages(poses, 'odom')]
+    bag = write_bag(tmp_path / 'bag', room, more=tf, poses=False)
+    frames, is_jump = reads(bag), jump_m != 0.1
+    named = f' {jump_m or ""}.* m and {turn_deg} degrees at {poses[20][0] / 1e9:.2f}'
+    assert any(re.search(named, note) for note in frames.notes) == is_jump
+    known = [frame.map_from_camera for frame in frames.read()]
+    assert [pose is None for pose in known] == [place < 20 * is_jump for place in range(48)]
+    np.testing.assert_allclose(known[20], corrected @ poses[20][1], atol=1e-6)
+    assert frames.of_tf
+    # the frame of odometry drifts, but has no jump
+    frames = reads(bag, poses=PoseSource(map_frame='odom'))
+    assert re.search('odometry drifts(?!.* jumps)', '; '.join(frames.notes))
 
 
 def test_messages_of_two_cameras_or_bodies_on_one_topic(room, tmp_path):

@@ -13,7 +13,7 @@ import yaml
 
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import write_map
-from cliploc_ros.errors import MappingError, ModelError
+from cliploc_ros.errors import DatasetError, MappingError, ModelError
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.association import find_overlaps, ious_with
@@ -196,7 +196,7 @@ def test_with_parallax_boxes_decide_and_an_error_of_scale_is_corrected():
 
 def test_depth_in_another_unit_is_refused():
     boxes = walk.see(TABLE, walk.walk_around(frames=30))
-    with pytest.raises(MappingError, match=r'depth is 0\.2.* `depth_unit`'):
+    with pytest.raises(DatasetError, match=r'depth is 0\.2.* `depth_unit`'):
         build_map(walk.measure_depth(boxes, TABLE, scale=0.2))
 
 

@@ -368,6 +368,17 @@ def test_right_sizes_few_classes_and_views_of_one_side_tell_no_scale(office, off
     assert office_report.scale is None
     for none in (office.select(cups), one_sided):
         assert check_map(scaled(none, 3.0), options=FEW).scale is None
+    given = replace(FEW, is_size_given=True)
+    assert check_map(scaled(office, 3.0), options=given).scale is None, 'the user knows it'
+    for ratios, expected in (((0.32, 0.39, 1.11), None), ((0.5, 0.54, 0.9), None),
+                             ((0.32, 0.39, 0.45, 1.11), 0.42)):
+        names = ('chair', 'bottle', 'book', 'keyboard')[:len(ratios)]
+        several = office.select(range(len(ratios)))
+        several = replace(several, class_ids=names, semi_axes=np.array([
+            [0.5 * ratio * size_of_class(name).extent_m] * 3
+            for name, ratio in zip(names, ratios, strict=True)]))
+        assert check_map(several, options=FEW).scale == (
+            expected and pytest.approx(expected, abs=0.03))
 
 
 def test_a_landmark_that_is_too_large_has_a_serious_fault(office):

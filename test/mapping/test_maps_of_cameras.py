@@ -133,7 +133,7 @@ def test_depth_of_each_camera_has_its_own_scale():
     long = build_map(replace(detections, depths=np.where(is_left, 1.2 * depths, depths)))
     note, = long.report.notes
     assert float(re.search(r' of left is ([\d.]+)', note)[1]) == pytest.approx(1.2, abs=0.02)
-    with pytest.raises(MappingError, match=r' of left is .* wrong unit'):
+    with pytest.raises(DatasetError, match=r' of left is .* wrong unit'):
         build_map(replace(detections, depths=np.where(is_left, 1000.0 * depths, depths)))
 
 

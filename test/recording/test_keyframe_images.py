@@ -13,9 +13,15 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import DepthImage
 from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, load_layer_of_map, save_layer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import MappingError
+from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.folders import read_folder
-from cliploc_ros.offline.datasets.frames import FolderOptions, Frames, PosedImage, RawFrame
+from cliploc_ros.offline.datasets.frames import (
+    DepthFormat,
+    FolderOptions,
+    Frames,
+    PosedImage,
+    RawFrame,
+)
 from cliploc_ros.offline.recording.keyframe_layer import (
     LayerOptions,
     build_layer,
@@ -55,6 +61,28 @@ def test_at_the_edge_of_a_depth_image_a_pixel_without_depth_has_none(frame):
     found = depths_of_points(DepthImage(depths, None), frame.camera, np.array(
         [[0.0, 0.0], [0.0, 240.0], [200.0, 479.0], [639.0, 0.0], [639.0, 479.0]]))
     np.testing.assert_array_equal(found, [np.nan, np.nan, np.nan, 2.0, 2.0])
+
+
+@pytest.mark.parametrize(('unit_m', 'jump_m', 'expected'), [
+    (0.001, 0.0, None), (0.0002, 0.0, r'is 0\.2.* triangulated points .*`depth_unit` by (4\.9|5)'),
+    (None, 0.25, r'jump by 0\.2[3-7] m .* at 104[01]\.')])
+def test_images_that_contradict_depth_or_poses(shared_data, unit_m, jump_m, expected):
+    """The poses of a real room jump at the 101st of the images, which have depth or not."""
+    options = FolderOptions(layout='rgbd' if unit_m else 'tum', depth=DepthFormat(unit_m))
+    frames = read_folder(shared_data / 'rooms/hololens_office', options).select(range(92, 112))
+
+    def read_raw(is_wanted):
+        shift = np.zeros((4, 4))
+        for raw in frames.read_raw(lambda *_: True):
+            shift[0, 3] = jump_m * (raw.place > 100)
+            if is_wanted(raw.place, raw.stamp_ns, raw.map_from_camera + shift):
+                yield replace(raw, map_from_camera=raw.map_from_camera + shift)
+    moved = replace(frames, read_raw=read_raw)
+    if expected is None:
+        assert len(build_layer(moved, LandmarkMap.empty('map'))) > 5
+        return
+    with pytest.raises(DatasetError, match=expected):
+        build_layer(moved, LandmarkMap.empty('map'))
 
 
 def test_many_images_are_chosen_as_by_comparing_all(frame, demo_map):

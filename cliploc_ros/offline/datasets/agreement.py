@@ -19,7 +19,7 @@ from cliploc_ros.core.keyframes.features import SIFT, extract
 from cliploc_ros.errors import DatasetError
 
 _Pose = NDArray[np.float64]
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_FLIP, _TURN = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, 1.0, -1.0, 1.0])
 # A camera that looks forward, on a body with the axes forward, left, up (REP 103).
 _BODY_FROM_CAMERA = transforms.make_transform(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -40,6 +40,8 @@ _FEATURES, _LONGEST_PX = 500, 480
 _LEAST_MATCHES, _LEAST_SHARE, _GATE_PX = 25, 0.5, 2.0
 # Median epipolar errors at an image width of _LONGEST_PX [px]: correct conventions give 0.3 to 2.
 _GOOD_PX, _WRONG_PX, _BETTER = 3.0, 4.0, 0.35
+# Share of the matches behind both cameras by which images are mirrored. Chosen.
+_BEHIND = 0.8
 
 
 class View(NamedTuple):
@@ -90,6 +92,9 @@ def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], wher
         Images and poses fit well under another reading; the message names it.
     """
     given, first = next(iter(readings.items()))
+    # mirrored images fit turned cameras: about x as 'opengl' if left and right are exchanged
+    readings = {**readings, 'turned': Reading(
+        'turn the camera about its y axis', lambda pose: first.pose(pose) @ _TURN, first.camera)}
     found: dict[str, list[float]] = {name: [] for name in readings}
     for pair in _pairs([view for view in views if view.pose is not None], first):
         for name, error_px in _epipolar_errors(pair, readings).items():
@@ -98,9 +103,13 @@ def check_agreement(views: Sequence[View], readings: Mapping[str, Reading], wher
             break
     if len(found[given]) < _PAIRS // 2:
         return ''
-    errors = {name: float(np.median(values)) for name, values in found.items()
+    errors = {name: float(np.median(np.abs(values))) for name, values in found.items()
               if len(values) == len(found[given])}
     best = min(errors, key=lambda name: errors[name])
+    if errors[best] < _GOOD_PX and np.median(np.sign(found[best])) < 0.0:
+        raise DatasetError(f'{where}: the images are mirrored: they fit the poses as {best} '
+                           f'({errors[best]:.1f} px), but with all points behind the cameras; '
+                           'record them as the camera sees them')
     reading = readings[best]
     if errors[given] > reading.least_px and errors[best] < min(_GOOD_PX,
                                                                reading.better * errors[given]):
@@ -130,6 +139,7 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
                      ) -> dict[str, float]:
     """Return the median epipolar error of two images under each reading, by its name [px].
 
+    It is negative if the points lie behind both cameras, as in mirrored images.
     The result is empty if no epipolar geometry explains enough matches, as for images without
     overlap.
     """
@@ -146,7 +156,11 @@ def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
                          else view.pose_at(view.stamp_ns + reading.shift_ns) for view in pair)
         if len(points[0]) and first is not None and second is not None:
             step = transforms.invert_transform(reading.pose(second)) @ reading.pose(first)
-            errors[name] = focal_px * float(np.median(_sampson(points[0], points[1], step)))
+            found = cv2.triangulatePoints(np.eye(3, 4), step[:3], points[0].T, points[1].T)
+            found = found / found[3]
+            is_behind = (found[2] < 0.0) & (step[2] @ found < 0.0)
+            errors[name] = (1.0 - 2.0 * (is_behind.mean() > _BEHIND)) * focal_px * float(
+                np.median(_sampson(points[0], points[1], step)))
     return errors
 
 

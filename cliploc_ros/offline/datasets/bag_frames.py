@@ -25,7 +25,7 @@ from cliploc_ros.offline.datasets.bag_poses import PoseSource, plain_name, poses
 from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, deserialize
 from cliploc_ros.offline.datasets.frames import DepthFormat, Frames, RawFrame, Wanted
 from cliploc_ros.offline.datasets.parsing import find_camera
-from cliploc_ros.offline.datasets.poses import STAMP_TOLERANCE_NS, Poses, check_forward
+from cliploc_ros.offline.datasets.poses import STAMP_TOLERANCE_NS, Poses, TimedPoses, check_forward
 from cliploc_ros.units import NS_PER_S
 
 _IMAGES = (bag_messages.IMAGE, bag_messages.COMPRESSED_IMAGE)
@@ -123,8 +123,9 @@ def bag_frames(bag: Path, topics: BagTopics, source: PoseSource,
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
         with BagReader(bag) as reader:
             yield from _paired(reader, topics, poses, cameras, decode_depth, is_wanted)
-    return Frames(bag, count, read_raw, varies=len(cameras.infos) > 1, notes=tuple(
-        f'note: {note}' for note in notes if note))
+    return Frames(bag, count, read_raw, of_tf=not isinstance(poses, TimedPoses),
+                  varies=len(cameras.infos) > 1, notes=tuple(
+                      f'note: {note}' for note in notes if note))
 
 
 class _Cameras(NamedTuple):

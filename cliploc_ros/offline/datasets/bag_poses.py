@@ -7,7 +7,7 @@ gap between two samples is limited.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,9 @@ _TF, _TF_STATIC = '/tf', '/tf_static'
 _TF_TYPE = 'tf2_msgs/msg/TFMessage'
 # Tolerance of a static transform, whose pose is constant in time.
 _ALWAYS_NS = 2**63
+# A correction jumps if it moves the camera by more than this [m] [deg], and this many times as far
+# as its median. Chosen.
+_JUMP, _UNUSUAL = (0.2, 8.0), 3.0
 # Two sources of poses are compared at this many stamps, and agree within this [m] [deg].
 _COMPARED, _SAME_M, _SAME_DEG = 50, 0.05, 2.0
 
@@ -83,6 +86,7 @@ class PoseSource:
         if self.topic is not None:
             return self._of_topic(reader, self.topic, camera_frame)
         if self.map_frame is not None:
+            reader.notes += _drift_notes(self.map_frame)
             return self._of_tf(reader, self.map_frame, camera_frame, self.max_gap_ns)
         problem, of_tf = 'no tf', None
         try:
@@ -109,15 +113,17 @@ class PoseSource:
         pose_of = _POSE_TYPES.get(kind)
         if pose_of is None:
             raise DatasetError(f'{where} is of type {kind}, not {" or ".join(_POSE_TYPES)}')
-        stamps, rows, children = [], [], set[str]()
+        stamps, rows, children, frame_id = [], [], set[str](), ''
         for _, message in reader.readable([name]):
             pose = pose_of(message)
             numbers = _sound(reader, name, message, pose.position, pose.orientation)
             if numbers is not None:
                 stamps.append(bag_messages.stamp_ns(message))
                 rows.append(numbers)
+                frame_id = plain_name(message.header.frame_id) or name
                 children.add(plain_name(getattr(message, 'child_frame_id', '')))
         check_forward(stamps, where)
+        reader.notes += _drift_notes(frame_id)
         poses = replace(TimedPoses.from_samples(stamps, rows, where),
                         max_gap_ns=self.topic_gap_ns, body_from_camera=self.body_from_camera,
                         tolerance_ns=self.tolerance_ns)
@@ -144,8 +150,7 @@ class PoseSource:
                                'or give a topic or file of poses')
         parents, up, down = _find_way(reader, topics, plain_name(map_frame), camera_frame)
         links = _read_links(reader, topics, {*up, *down}, parents, max_gap_ns)
-        return TransformChain(tuple(links[child] for child in up),
-                              tuple(links[child] for child in down))
+        return _after_jumps(reader, links, up, down)
 
 
 def _difference(poses: Poses, others: Poses) -> str:
@@ -306,6 +311,47 @@ def _read_links(reader: BagReader, topics: Collection[str], children: Collection
             links[child] = replace(TimedPoses.from_samples(stamps, rows, where),
                                    max_gap_ns=max_gap_ns)
     return links
+
+
+def _drift_notes(frame_id: str) -> list[str]:
+    """Return a note if poses are in the coordinate frame of odometry."""
+    return [f"the poses are in '{frame_id}': odometry drifts, and so does the map; run a "
+            f'localizer or SLAM, and give its `map_frame`, or give `frame_id` {frame_id}'
+            ] * ('odom' in frame_id.lower())
+
+
+def _after_jumps(reader: BagReader, links: dict[str, TimedPoses], up: Sequence[str],
+                 down: Sequence[str]) -> TransformChain:
+    """Return the chain of links, without the poses before the last jump of a correction.
+
+    If several links move, the first one from the map is a correction, such as map -> odom.
+    """
+    def chain(**changed: TimedPoses) -> TransformChain:
+        found = {**links, **changed}
+        return TransformChain(tuple(map(found.__getitem__, up)),
+                              tuple(map(found.__getitem__, down)))
+    child, *others = (*(child for child in (*up, *reversed(down))
+                        if links[child].tolerance_ns < _ALWAYS_NS), '')
+    if len(others) < 2:
+        return chain()
+    link, sizes = links[child], np.zeros((len(links[child]), 2))
+    samples = np.hstack([link.positions_xyz, link.quats_xyzw])
+    for row in (1 + np.nonzero(np.diff(samples, axis=0).any(axis=1))[0]).tolist():
+        before, after = (chain(**{child: replace(
+            link.part(at, at + 1), tolerance_ns=_ALWAYS_NS)}).pose_at(int(link.stamps_ns[row]))
+            for at in (row - 1, row))
+        if before is not None and after is not None:
+            sizes[row] = pose_error(before, after)
+    jumps = np.nonzero((sizes > np.maximum(_JUMP, _UNUSUAL * np.median(sizes, axis=0))
+                        ).any(axis=1))[0].tolist()
+    if not jumps:
+        return chain()
+    far_m, far_deg = sizes[jumps[-1]]
+    reader.notes.append(
+        f"tf of '{child}' jumps {len(jumps)} times, the last time by {far_m:.2f} m and "
+        f'{far_deg:.1f} degrees at {link.stamps_ns[jumps[-1]] / NS_PER_S:.2f} s: only the poses '
+        'after it are used; record again with a localizer that has found its pose')
+    return chain(**{child: link.part(jumps[-1], len(link))})
 
 
 def plain_name(frame_id: str) -> str:

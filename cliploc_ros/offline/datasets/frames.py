@@ -92,6 +92,7 @@ class Frames:
     camera: str = ''  #: Name of the camera; '' if there is only one
     #: The frames of each camera; empty if there is only one
     of_cameras: tuple['Frames', ...] = ()
+    of_tf: bool = False  #: Whether tf has the poses, or the mount of the camera
     varies: bool = False  #: Whether the camera differs between images
     #: Digests of images with cameras, and of poses, which may change without the images
     digest: str = ''
@@ -143,7 +144,7 @@ def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:
         first += frames.count
     return Frames(parts[0].source, first, lambda is_wanted: chain.from_iterable(
         part.read_raw(is_wanted) for part in parts), of_cameras=tuple(parts),
-        notes=tuple(note for part in parts for note in part.notes))
+        of_tf=parts[0].of_tf, notes=tuple(note for part in parts for note in part.notes))
 
 
 #: The stamp of an image of unknown time.

@@ -3,7 +3,7 @@
 """Poses of a camera over time, with interpolation between them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -72,6 +72,11 @@ class TimedPoses:
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.stamps_ns)
+
+    def part(self, first: int, end: int) -> 'TimedPoses':
+        """Return the samples from the first one to the one before the end."""
+        return replace(self, **{name: getattr(self, name)[first:end] for name in (
+            'stamps_ns', 'positions_xyz', 'quats_xyzw')})
 
     @property
     def span_ns(self) -> tuple[int, int] | None:

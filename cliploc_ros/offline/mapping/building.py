@@ -152,7 +152,8 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
               progress: Progress | None = None) -> BuiltMap:
     """Build a map from posed detections.
 
-    MappingError: no map can be made from this input; the message says what to correct.
+    MappingError: no map can be made from this input. DatasetError: its depth has another unit. The
+    messages say what to correct.
     """
     options = options or MappingOptions()
     if options.refine_mount and len(detections.cameras) > 1:

@@ -124,6 +124,7 @@ class CheckOptions:
     headings: int = 12
     camera_height_m: float | None = None  #: Of the grid [m]; None: as in the recording
     use_vertical: bool = False  #: The relocalizer knows the vertical
+    is_size_given: bool = False  #: The user gave the size of a class, so sizes tell no scale
     wrong_m: float = 1.0  #: An accepted pose farther off than this misleads a robot [m]
     random_seed: int = 0  #: Equal seed and input give equal output
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.kernels.compiled import compiled
-from cliploc_ros.errors import MappingError
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.mapping.evidence import gather_evidence
 from cliploc_ros.offline.mapping.fitting import descend, fit_ellipsoid
 from cliploc_ros.offline.mapping.landmarks import Landmarks, box_iou, group_boxes, project_box
@@ -111,7 +111,7 @@ def scaled_depths(views: Views, detections: PosedDetections, landmarks: Landmark
     """Return the views with depth, corrected by a scale for each camera, and notes.
 
     The landmarks are fitted to boxes only. Those with enough parallax determine the scale.
-    MappingError: a scale is so far off that the unit of depth must be wrong.
+    DatasetError: a scale is so far off that the unit of depth must be wrong.
     """
     baselines_deg = gather_evidence(views, landmarks, shown).baseline_deg
     measured = add_depths(views, detections)
@@ -122,14 +122,22 @@ def scaled_depths(views: Views, detections: PosedDetections, landmarks: Landmark
         if scale is None or abs(scale - 1.0) < _LEAST_CORRECTION:
             continue
         of = f' of {name}' if len(kept) > 1 else ''
-        if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
-            raise MappingError(
-                f'measured depth{of} is {1.0 / scale:.3g} times the depth by boxes and poses: '
-                f'wrong unit? multiply `depth_unit` by {scale:.3g}, or give poses in metres')
+        check_scale(scale, of, 'boxes')
         kept[number] = scale
         notes.append(f'measured depth{of} is {1.0 / scale:.3f} times the depth by boxes and '
                      'poses; it is corrected by this factor')
     return (add_depths(views, detections, kept) if notes else measured), notes
+
+
+def check_scale(scale: float, of: str, by: str) -> None:
+    """Refuse depth whose true value is `scale` times the measured one, by a measurement `by`.
+
+    DatasetError: the scale is so far off that the unit of depth must be wrong.
+    """
+    if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
+        raise DatasetError(
+            f'measured depth{of} is {1.0 / scale:.3g} times the depth by {by} and poses: wrong '
+            f'unit? multiply `depth_unit` by {scale:.3g}, or give poses in metres')
 
 
 def _depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],

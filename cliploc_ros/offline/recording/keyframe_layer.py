@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 import cv2
@@ -19,6 +20,8 @@ from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
+from cliploc_ros.offline.mapping.triangulation import check_scale
+from cliploc_ros.units import NS_PER_S
 
 # Features extracted from an image, before those without a point are left out.
 _MOST_FOUND = 2000
@@ -37,6 +40,13 @@ _NEIGHBOURS = 8
 _LEAST_M, _MOST_M, _MOST_COS = 0.05, 2.0, np.cos(np.radians(40.0))
 #: Range of depths of points in a room or hall [m].
 _DEPTHS_M = (0.2, 40.0)
+# Greatest number of keyframes in whose images depth is compared with triangulated points.
+_COMPARED = 6
+# Poses jump by more than this against the images [m] and this many times the median, and pairs of
+# images across it agree up to this share. Chosen: the kitchen's poses differ by up to 0.04 m.
+_JUMP_M, _UNUSUAL, _JUMP_SPREAD = 0.12, 8.0, 0.3
+# Least number of points that locate an image.
+_LEAST_SEEN = 12
 # Number of words. 1,024 words find the keyframes of the kitchen as well as comparing all
 # descriptors.
 _WORDS = 1024
@@ -78,6 +88,7 @@ class _Keyframe(NamedTuple):
     depths: NDArray[np.float64]
     jpeg: bytes
     camera: Camera  #: Camera of the undistorted image
+    stamp_ns: int
 
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
@@ -95,9 +106,15 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     ------
     MappingError
         No image has enough points.
+    DatasetError
+        The images show that depth has another unit, or that the poses jump.
     """
-    seen = [_look(frame, options) for part in frames.each for frame in _chosen(part, options)]
+    parts = [[_look(frame, options) for frame in _chosen(part, options)] for part in frames.each]
+    for part, own in zip(frames.each, parts, strict=True):
+        _check_depth(own, options.kind, f' of {part.camera}' if part.camera else '')
+    seen = list(chain.from_iterable(parts))
     images, has_depth = [keyframe.posed for keyframe in seen], False
+    of_images = list[NDArray[np.float64]]()
     chosen = []  # keyframes, the points of their features, and the rows of these features
     for number, keyframe in enumerate(seen):
         # points (n, 3) in the camera's coordinate frame; NaN where unknown
@@ -107,10 +124,14 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
                                      ) * keyframe.depths[:, None]
         else:
             points = triangulate(images, number, options.kind)
+        of_images.append(points)
         # the strongest features that have a point
         rows = np.nonzero(np.isfinite(points).all(axis=1))[0][:options.most_points]
         if len(rows) >= _LEAST_POINTS:
             chosen.append((keyframe, points[rows], rows))
+    for own in parts:
+        _check_steps(own, of_images[:len(own)], options.kind, frames.source)
+        of_images = of_images[len(own):]
     if not chosen:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
                            f'{_LEAST_POINTS} points; record depth, or overlapping '
@@ -140,6 +161,66 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     jpegs = [keyframe.jpeg for keyframe, _, _ in chosen]
     return replace(built, images=np.frombuffer(b''.join(jpegs), dtype=np.uint8),
                    image_offsets=np.cumsum([0, *map(len, jpegs)]))
+
+
+def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
+    """Refuse keyframes with depth in another unit than their poses.
+
+    DatasetError: points that are triangulated in a sample of the images have other depths.
+    """
+    images, ratios = [keyframe.posed for keyframe in seen], list[float]()
+    for number in range(0, len(seen), 1 + len(seen) // _COMPARED):
+        if np.isfinite(seen[number].depths).any():
+            found = triangulate(images, number, kind)[:, 2] / seen[number].depths
+            ratios += found[np.isfinite(found)].tolist()
+    if len(ratios) >= _LEAST_POINTS:
+        check_scale(float(np.median(ratios)), of, 'triangulated points')
+
+
+def _check_steps(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.float64]],
+                 kind: FeatureKind, where: object) -> None:
+    """Refuse poses that jump against the images, which are in order, with the points of each.
+
+    DatasetError: images after a step are located elsewhere than their poses say, by the points of
+    images before it, and all pairs across the step agree by how far.
+    """
+    seen = [keyframe.posed for keyframe in keyframes]
+    steps = [_shift(seen[row], points[row], seen[row + 1], kind) for row in range(len(seen) - 1)]
+    sizes_m = [float(np.linalg.norm(step)) for step in steps if len(step)]
+    least_m = max(_JUMP_M, _UNUSUAL * float(np.median(sizes_m or [0.0])))
+    for after, step in enumerate(steps, 1):
+        if not len(step) or np.linalg.norm(step) < least_m:
+            continue
+        # a false match locates one image, a jump displaces all of them
+        jumps = np.concatenate([_shift(seen[first], points[first], second, kind)
+                                for first in range(max(0, after - 2), after)
+                                for second in seen[after:after + 2]])
+        size_m = float(np.linalg.norm(jumps.sum(axis=0))) / max(1, len(jumps))
+        if len(jumps) > 1 and size_m > least_m and np.linalg.norm(
+                jumps - jumps.mean(axis=0), axis=1).max() < _JUMP_SPREAD * size_m:
+            raise DatasetError(
+                f'{where}: the poses jump by {size_m:.2f} m against the images at '
+                f'{keyframes[after].stamp_ns / NS_PER_S:.2f} s: use the recording before or after '
+                'it alone, or give corrected poses as `trajectory`')
+
+
+def _shift(ours: PosedFeatures, points: NDArray[np.float64], theirs: PosedFeatures,
+           kind: FeatureKind) -> NDArray[np.float64]:
+    """Return how far (1, 3) the pose of an image is from where our points (n, 3) locate it [m].
+
+    The axes are those of the map. Empty: too few points locate it.
+    """
+    pairs, _ = kind.match(kind.units(ours.descriptors), kind.units(theirs.descriptors))
+    pairs = pairs[np.isfinite(points[pairs[:, 0]]).all(axis=1)]
+    if len(pairs) >= _LEAST_SEEN:
+        _, turn, shift, kept = cv2.solvePnPRansac(
+            points[pairs[:, 0]], theirs.bearings[pairs[:, 1]], np.eye(3), None,
+            reprojectionError=_MOST_ERROR, iterationsCount=200)
+        if kept is not None and len(kept) >= max(_LEAST_SEEN, 0.4 * len(pairs)):
+            place = -Rotation.from_rotvec(turn[:, 0]).inv().apply(shift[:, 0])
+            return np.asarray(theirs.map_from_camera[:3, 3] - ours.map_from_camera[:3, 3]
+                              - ours.map_from_camera[:3, :3] @ place)[None]
+    return np.empty((0, 3))
 
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
@@ -179,7 +260,8 @@ def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
         known &= np.cumsum(known) <= options.most_points
     return _Keyframe(PosedFeatures(frame.map_from_camera, bearings[known],
                                    features.descriptors[known]), depths[known],
-                     _small_jpeg(frame) if options.images else b'', frame.camera.pinhole)
+                     _small_jpeg(frame) if options.images else b'', frame.camera.pinhole,
+                     frame.stamp_ns)
 
 
 def _small_jpeg(frame: PosedImage) -> bytes:

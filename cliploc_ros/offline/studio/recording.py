@@ -49,8 +49,10 @@ _MARGIN = 0.25
 class Recording:
     """Boxes and poses of a recording of the mapped place, and optionally its images."""
 
-    def __init__(self, detections: PosedDetections, images: Images | None = None):
+    def __init__(self, detections: PosedDetections, images: Images | None = None,
+                 is_size_given: bool = False):
         self.detections, self.images = detections, images
+        self.is_size_given = is_size_given  # by the user, see CheckOptions
 
     @cached_property
     def views(self) -> Views:

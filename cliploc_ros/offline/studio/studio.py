@@ -8,6 +8,7 @@ Every action returns a line with its result, or raises a CliplocError.
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -460,8 +461,9 @@ class Studio:
         detections, image_of = None, None
         if self.recording is not None and self.review.has_boxes:
             detections, image_of = self.recording.detections, self.recording.image
-        report = check_map(landmark_map, detections, options=self.CHECK, progress=tell,
-                           layer=self.layer)
+        report = check_map(landmark_map, detections, options=replace(
+            self.CHECK, is_size_given=self.recording is not None and self.recording.is_size_given),
+            progress=tell, layer=self.layer)
         self.check_page = check_page(self.document.path.name, landmark_map, report, detections,
                                      image_of)
         self._checked = landmarks

@@ -48,8 +48,8 @@ _NO_RECORDING = (
     'images of 640 x 480 px with a focal length of 525 px')
 # Greatest difference in height between a robot's camera and those of the recording [m]. Chosen.
 _HEIGHT_MARGIN_M = 0.3
-# Least number of classes to estimate the scale of a map, and the least factor that is reported:
-# ellipsoids enclose objects loosely, or only parts of them. Chosen.
+# Least number of classes that agree about the scale of a map, up to a factor, which is also the
+# least one reported: ellipsoids enclose objects loosely, or only parts of them. Chosen.
 _LEAST_CLASSES, _OFF = 3, 1.8
 _MOST_OF_A_KIND, _MOST_MISLED = 5, 3
 # Shorter runs of refused frames, and smaller areas of the grid, get no advice.
@@ -135,7 +135,7 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         grid=grid, recording=recording,
         notes=tuple(notes), map_ids=landmark_map.landmark_ids,
         keyframes=None if layer is None else check_keyframes(layer, grid, recorded),
-        scale=_scale_by_sizes(landmark_map))
+        scale=None if options.is_size_given else _scale_by_sizes(landmark_map))
     tell('done', 1.0)
     return replace(report, to_do=tuple(give_advice(report)),
                    measures=tuple(find_measures(report, thresholds or Thresholds())))
@@ -193,7 +193,7 @@ def _scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
 
     The estimate is the median over classes of the median over their landmarks. Landmarks that were
     seen from one side only are ignored: they are longer towards the camera than their objects.
-    None: too few classes have a size, or the sizes fit.
+    None: the sizes fit, or too few classes agree about the factor.
     """
     ratios: dict[str, list[float]] = {}
     sides = [detail.baseline_deg for detail in landmark_map.details] or [None] * len(landmark_map)
@@ -202,10 +202,11 @@ def _scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
         size = size_of_class(name)
         if size is not None and (seen_deg is None or seen_deg >= MappingOptions.min_baseline_deg):
             ratios.setdefault(name, []).append(2.0 * semi_axes.max() / size.extent_m)
-    if len(ratios) < _LEAST_CLASSES:
-        return None
-    scale = float(np.median([np.median(of_class) for of_class in ratios.values()]))
-    return scale if not 1.0 / _OFF <= scale <= _OFF else None
+    scales = np.log([np.median(of_class) for of_class in ratios.values()])
+    scale = float(np.median(scales)) if len(scales) else 0.0
+    agree = (np.abs(scales - scale) < np.log(_OFF)) & (scales * np.sign(scale) > np.log(_OFF))
+    return None if abs(scale) < np.log(_OFF) or agree.sum() < _LEAST_CLASSES else float(
+        np.exp(scale))
 
 
 def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:
