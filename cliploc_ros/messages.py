@@ -233,15 +233,16 @@ def faults_of_rectified(image_topic: str, rectified: bool, msg: CameraInfoMessag
     differ, the topic names of image_proc (image_rect, image_rect_color) make the fault certain.
     """
     name = image_topic.removesuffix('/compressed')
-    sounds = 'raw' if name.endswith('/image_raw') else \
-        'rectified' if re.search('[/_]rect(?!.*raw)', name) else ''
+    # a whole word: /rectangle/image is not rectified
+    rect = re.search('(/image)?[/_]rect(if(y|ied))?(?![a-z])(?!.*raw)', name)
+    sounds = 'raw' if name.endswith('/image_raw') else 'rectified' if rect else ''
     is_same = msg.distortion_model != 'equidistant' and not any(msg.d) and \
         np.array_equal(_left_of_p(msg), np.reshape(msg.k, (3, 3)))
     if is_same or sounds != ('raw' if rectified else 'rectified'):
         return []
     return [Fault(f'by its name, {image_topic} is {sounds}, but the parameter rectified is '
                   f'{str(rectified).lower()}: poses would be wrong by the distortion of the lens',
-                  '/image_rect' in name)]
+                  bool(rect and rect[1]))]
 
 
 def _left_of_p(msg: CameraInfoMessage) -> NDArray[np.float64]:

@@ -55,24 +55,26 @@ explain_failure() {
 
 free_mb() { df --output=avail -m "$root" | tail -n 1 | tr -d ' '; }
 
-# pip_install_locked VENV REQUIREMENTS [PIP OPTION...]: install the releases in the lock file for this
-# kind of machine and check their hashes. UNLOCKED=1: the newest releases that the requirements allow.
+# pip_install_locked VENV REQUIREMENTS LOCK [PIP OPTION...]: install the releases in a lock file and
+# check their hashes. UNLOCKED=1: the newest releases that the requirements allow.
 pip_install_locked() {
-  local prefix=$1 file=$2
-  shift 2
+  local prefix=$1 file=$2 lock=$3
+  shift 3
   if [[ -n ${UNLOCKED:-} ]]; then
-    pip_install "$prefix" "$file" "$@"
+    pip_install "$prefix" "$root/script/$file.txt" "$@"
   else
-    pip_install "$prefix" "$root/script/lock/$kind.txt" --require-hashes
+    pip_install "$prefix" "$root/script/lock/$lock.txt" --require-hashes
   fi
 }
+
+stamp_of() { hash_of "$1" "$root"/script/constraints*.txt; }
 
 # pip_install VENV REQUIREMENTS [PIP OPTION...]: install, unless the file has not changed since.
 pip_install() {
   local prefix=$1 file=$2 name hash constraint=()
   shift 2
   name=$(basename "$file" .txt)
-  hash=$(hash_of "$file" "$root"/script/constraints*.txt)
+  hash=$(stamp_of "$file")
   # Lock files pin every package; other files need the constraints.
   [[ $file == */lock/* ]] || constraint=(--constraint "$root/script/constraints.txt")
   is_done "$prefix/.$name.done" "$hash" && return

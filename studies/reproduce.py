@@ -21,7 +21,6 @@ import shutil
 import sys
 import tarfile
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -51,6 +50,10 @@ _SOURCES = Path(__file__).with_suffix('.yaml')
 _NAMES = 'fr2', 'fr3', 'kitchen'
 # Bandwidth of a typical connection, to estimate the time of a download.
 _MEGABYTES_A_S = 10.0
+# Largest ratio of the size of an unpacked sequence to Recording.unpacked, which is an estimate
+# (chosen), and least space of an unpacked file [bytes].
+_MOST_GROWTH = 2.0
+_BLOCK_BYTES = 4096
 # Names of a sequence's bags: for the map, and for the queries.
 _MAPPED, _ASKED = 'mapped', 'asked'
 _FIGURES = 'success_over_threshold', 'success_over_iterations', 'top_view'
@@ -309,27 +312,47 @@ def unpacked(recording: Recording, folder: Path, out: Path) -> Path:
         shutil.rmtree(staging, ignore_errors=True)  # left by a killed run
         try:
             if recording.inner:
+                _check_size(archive, recording, recording.inner)
                 with zipfile.ZipFile(archive) as opened:
                     inner = Path(opened.extract(recording.inner, staging))
+            _check_size(inner, recording)
             # zip archives accept no filter, and never write outside the folder
             shutil.unpack_archive(inner, staging,
                                   filter=None if inner.suffix == '.zip' else 'data')
-        except (shutil.ReadError, tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError,
-                KeyError) as error:
+            if not staging.exists():
+                raise shutil.ReadError('none of its members can be unpacked here')
+        except Exception as error:  # the libraries raise any exception for a damaged archive
+            shutil.rmtree(staging, ignore_errors=True)
+            if isinstance(error, OSError) and error.errno:
+                raise DatasetError(f'{staging} cannot be written: {error.strerror}; make room, '
+                                   f'then {_AGAIN}') from error
             for file in (archive, _digest_file(archive)):
                 file.unlink(missing_ok=True)
             raise DatasetError(f'{archive} cannot be unpacked ({error}): it is truncated or a '
                                'different file, and was removed; run again to download it'
                                ) from error
-        except OSError as error:
-            raise DatasetError(f'{staging} cannot be written: {error.strerror}; make room, '
-                               f'then {_AGAIN}') from error
         staging.rename(frames)
     for sequence in (frames, *sorted(path for path in frames.rglob('*') if path.is_dir())):
         if find_layout(sequence) is not None:
             return sequence
     raise DatasetError(f'{frames} has no sequence of a known layout: remove it and {archive}*, '
                        'and run again')
+
+
+def _check_size(archive: Path, recording: Recording, name: str = '') -> None:
+    """Raise shutil.ReadError if an archive, or one of its members, unpacks to far too many bytes.
+
+    A small file may unpack to any size.
+    """
+    most_mb = _MOST_GROWTH * recording.unpacked
+    left = 1e6 * most_mb
+    with (zipfile.ZipFile if archive.suffix == '.zip' else tarfile.open)(archive) as opened:
+        for member in ([opened.getinfo(name)] if name else opened.infolist()) if isinstance(
+                opened, zipfile.ZipFile) else opened:
+            left -= _BLOCK_BYTES + (member.file_size if isinstance(member, zipfile.ZipInfo)
+                                    else member.size)
+            if left < 0.0:
+                raise shutil.ReadError(f'it unpacks to more than {most_mb:g} MB')
 
 
 def write_bags(recording: Recording, frames: Path, folder: Path) -> None:
@@ -341,8 +364,6 @@ def write_bags(recording: Recording, frames: Path, folder: Path) -> None:
     count = min(recording.queries, len(others))
     chosen = np.linspace(0, len(others) - 1, count).round().astype(int)
     for name, chosen_rows in ((_MAPPED, rows[::2]), (_ASKED, [others[place] for place in chosen])):
-        for partial_bag in folder.glob(f'.{name}.*.partial'):  # left by a killed run
-            shutil.rmtree(partial_bag, ignore_errors=True)
         if not (folder / name).exists():
             convert_tum(
                 replace(sequence, stamps_ns=tuple(sequence.stamps_ns[row] for row in chosen_rows),

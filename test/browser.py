@@ -48,7 +48,7 @@ class Person:
         self.page.get_by_text('landmarks in ').first.wait_for()
 
     def note(self, request):
-        if not re.match(r'(http|ws)://127\.0\.0\.1:|data:|blob:', request.url):
+        if not re.match(r'(http|ws)://127\.0\.0\.1:|data:|blob:|file:', request.url):
             self.foreign.append(request.url)
 
     def click(self, name):

@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -55,7 +56,10 @@ def test_extras_are_what_the_tests_run_with(extras):
 
 @pytest.mark.parametrize(('lock', 'files'), [
     ('pypi', ('requirements', 'requirements-ros', 'constraints')),
-    ('jazzy', ('requirements', 'constraints', 'constraints-jazzy'))])
+    ('jazzy', ('requirements', 'constraints', 'constraints-jazzy')),
+    *((f'{kind}-{part}', (f'requirements-{part}', 'constraints'))
+      for kind in ('pypi', 'jazzy') for part in ('test', 'models', 'all')),
+    ('numpy1', ('requirements-numpy1',)), ('release', ('requirements-release',))])
 def test_locks_meet_their_requirements_and_hold_hashes(lock, files):
     """script/freeze writes them again."""
     text = re.sub(r' \\\n +', ' ', read(f'script/lock/{lock}.txt'))
@@ -75,4 +79,11 @@ def test_locks_meet_their_requirements_and_hold_hashes(lock, files):
 
 def test_container_and_setup_install_the_locks():
     assert 'pip install --no-cache-dir --require-hashes' in read('docker/Dockerfile')
-    assert '"$root/script/lock/$kind.txt" --require-hashes' in read('script/common.bash')
+    assert '"$root/script/lock/$lock.txt" --require-hashes' in read('script/common.bash')
+    # PyTorch's own index, whose hashes are in no lock
+    assert re.findall(r'pip_install "\$venv"[^\n]*\n?[^\n]*', read('script/setup')) == [
+        'pip_install "$venv" "$root/script/requirements-models.txt" "${pip_options[@]}" \\\n'
+        '      --extra-index-url https://download.pytorch.org/whl/cpu']
+    writers = [job for job in yaml.safe_load(read('.github/workflows/release.yml'))[
+        'jobs'].values() if job['permissions'] == {'contents': 'write'}]
+    assert not [step for job in writers for step in job['steps'] if 'pip' in step.get('run', '')]

@@ -13,7 +13,7 @@ from pathlib import Path
 from cliploc_ros.cli.options import add_weights_options
 from cliploc_ros.command import option, run_main
 from cliploc_ros.errors import OptionsError
-from cliploc_ros.files.storage import MAKE_ROOM, make_folder
+from cliploc_ros.files.storage import MAKE_ROOM, make_folder, unfinished
 
 EPILOG = """\
 Exporting needs PyTorch (script/setup models). A robot runs the files without it: name them in
@@ -85,9 +85,8 @@ def export_network(options: argparse.Namespace) -> int:
             found /= DETECTOR
         copy = shutil.copytree if is_clip else shutil.copy
         try:
-            with tempfile.TemporaryDirectory(dir=out.parent, prefix='.',
-                                             ignore_cleanup_errors=True) as beside:
-                Path(copy(found, Path(beside) / out.name)).rename(out)
+            with unfinished(out, Path.mkdir) as beside:
+                Path(copy(found, beside / out.name)).rename(out)
         except OSError as error:
             raise OptionsError(f'{out}: cannot be written: {error.strerror}; {MAKE_ROOM}'
                                ) from error

@@ -70,7 +70,7 @@ def serve(options: argparse.Namespace) -> int:
     # Imported late, so that --help is fast.
     from cliploc_ros.offline.mapping.tilt import tilt_note
     from cliploc_ros.offline.studio.page import serve_studio
-    from cliploc_ros.offline.studio.web import once
+    from cliploc_ros.offline.studio.web import private_page
 
     studio = open_studio(options)
     try:
@@ -83,9 +83,11 @@ def serve(options: argparse.Namespace) -> int:
             for note in filter(None, (*studio.document.notes, tilt)):
                 print(f'note: {note}')
             print(f'studio: {url}', flush=True)
-            if not options.no_browser:
-                webbrowser.open(once(url))
-            threading.Event().wait()
+            with nullcontext() if options.no_browser else private_page(
+                    url, studio.document.path.absolute()) as page:
+                if page is not None:
+                    webbrowser.open(page.as_uri())
+                threading.Event().wait()
     finally:
         studio.document.close()
     return 0

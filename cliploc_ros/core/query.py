@@ -133,6 +133,7 @@ def read_case(path: Path) -> Case:
         about = parse_json(arrays['about'].tobytes())
         images, crops = _parts(arrays, 'image'), _parts(arrays, 'crop')
         first, *others = (_query_of(fields, images, crops) for fields in about['queries'])
+        _expect(not [*images, *crops], 'the numbers of images and crops')
         report = dict(about['report'])
         _expect(isinstance(report.get('parameters', {}), dict), 'parameters')
         return Case((first, *others), report)

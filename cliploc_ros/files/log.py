@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.files.storage import open_file, parse_json
+from cliploc_ros.files.storage import open_file, parse_json, replace_file
 
 # While the user drags a landmark, a hundred entries a second must not each wait for the disk.
 _SYNC_INTERVAL_S = 0.5
@@ -95,22 +95,31 @@ class Log:
         self._end += len(line)
 
     def restart(self, entries: Sequence[Any]) -> None:
-        """Replace all entries; CliplocError: the disk is full or gone."""
-        self._end = 0
-        for entry in entries:
-            self.append(entry)
+        """Replace all entries at once; CliplocError: the disk is full or gone, they are kept."""
+        try:
+            with replace_file(self.path) as partial:
+                partial.write_text(''.join(f'{json.dumps(entry)}\n' for entry in entries))
+                file = partial.open('a+b', buffering=0)
+                # shared, as replace_file holds it too; it still excludes the lock of __init__
+                with suppress(OSError):
+                    fcntl.flock(file, fcntl.LOCK_SH)
+        except OSError as problem:
+            raise self._unwritable(problem) from problem
+        self._file.close()
+        self._file, self._end = file, file.seek(0, os.SEEK_END)
 
     def set_aside(self) -> Path:
         """Copy the file to a new file, without overwriting any file; return its path."""
         for number in itertools.count(1):
             path = self.path.with_name(f'{self.path.name}.{number}')
             try:
-                with self.path.open('rb') as content, path.open('xb') as copy:
+                with path.open('xb') as copy, self.path.open('rb') as content:
                     shutil.copyfileobj(content, copy)
                 break
             except FileExistsError:
                 pass
             except OSError as problem:
+                path.unlink(missing_ok=True)
                 raise self._error(f'{path}: cannot be written: {problem.strerror}') from problem
         return path
 

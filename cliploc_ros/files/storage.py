@@ -9,6 +9,7 @@ import glob
 import json
 import logging
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -34,6 +35,7 @@ _MOST_DIGITS = 20
 _TURN_S, _TURN_POLL_S = 30.0, 0.02
 # Not 0: an empty file can be created even on a full disk.
 _PROBE_BYTES = 4096
+_UNFINISHED = re.compile(r'\.[0-9a-f]{12}\.part\.')
 #: Advice for a file that cannot be written.
 MAKE_ROOM = 'make room, or choose another folder'
 #: Messages about files that this process could not cache, see warn_not_kept.
@@ -107,16 +109,67 @@ def replace_file(path: Path) -> Iterator[Path]:
     Raises OSError if the folder is missing, read-only or full.
     """
     path = Path(os.path.realpath(path))
-    # random, because containers that share the folder may have processes of equal number
-    partial = path.with_name(f'.{secrets.token_hex(6)}.{path.name}')
-    try:
+    with unfinished(path) as partial:
         yield partial
         with partial.open('rb+') as file:
             os.fsync(file.fileno())
         _take_place(partial, path)
+
+
+@contextmanager
+def unfinished(path: Path, make: Callable[[Path], object] = Path.touch) -> Iterator[Path]:
+    """Yield the path of a new hidden file beside ``path``, which is removed when the block ends.
+
+    ``make`` creates it: Path.mkdir gives a folder. If this process is killed, the next writer of
+    any file in the folder removes it. It is locked, so no other process removes it before.
+
+    Raises OSError if the folder is missing, read-only or full.
+    """
+    with suppress(OSError):  # the folder is missing, or cannot be listed
+        for entry in path.parent.iterdir():
+            if _UNFINISHED.match(entry.name):
+                with suppress(OSError):  # its writer lives, or this file system has no locks
+                    descriptor = _lock(entry, fcntl.LOCK_EX)
+                    _remove(entry)
+                    os.close(descriptor)
+    descriptor = -1
+    while descriptor < 0:
+        # random, because containers that share the folder may have processes of equal number
+        place = path.with_name(f'.{secrets.token_hex(6)}.part.{path.name}')
+        make(place)
+        with suppress(FileNotFoundError, BlockingIOError):  # removed before it was locked
+            descriptor = _lock(place, fcntl.LOCK_SH)
+    try:
+        yield place
     finally:
+        _remove(place)
+        os.close(descriptor)
+
+
+def _lock(place: Path, kind: int) -> int:
+    """Open a file or folder and lock it without waiting; return the descriptor.
+
+    Raises OSError if it is missing, or locked by another process, or if it cannot be locked.
+    """
+    descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        place.stat()
+    except OSError as error:
+        # some file systems have no locks: there, nobody removes the files of others
+        if kind == fcntl.LOCK_SH and not isinstance(error, FileNotFoundError | BlockingIOError):
+            return descriptor
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _remove(place: Path) -> None:
+    if place.is_dir():
+        shutil.rmtree(place, ignore_errors=True)
+    else:
         with suppress(OSError):
-            partial.unlink(missing_ok=True)
+            place.unlink()
 
 
 def _take_place(partial: Path, path: Path) -> None:
@@ -152,7 +205,7 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
         The set was written, but a file of an older set cannot be removed.
     """
     staged = {other: _staged(Path(os.path.realpath(other)), digest) for other in besides}
-    with _alone_in(path.parent):
+    with _alone_in(path.parent) as is_alone:
         try:
             for other, make in besides.items():
                 if make is None:
@@ -175,11 +228,19 @@ def replace_set(path: Path, digest: str, write: WriteOfSet,
             except OSError as error:
                 raise OptionsError(f'{other}: belongs to an older {path.name} and cannot be '
                                    f'removed ({error.strerror}); remove it') from error
+        # Remove what killed writers left. NAME.OTHER.X.Y stays: NAME.OTHER may have a set, too.
+        names = '|'.join([rf'{re.escape(path.stem)}\.[^.]+\.[^.]+', *(
+            re.escape(place.name.removeprefix(f'.{digest}.')) for place in staged.values())])
+        for folder in {place.parent for place in staged.values()} if is_alone else ():
+            with suppress(OSError):  # it cannot be listed
+                for entry in folder.iterdir():
+                    if re.fullmatch(rf'\.[0-9a-f]{{12}}\.({names})', entry.name):
+                        _remove(entry)
 
 
 @contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold a lock on a folder against other writers of sets, if its file system supports locks.
+def _alone_in(folder: Path) -> Iterator[bool]:
+    """Hold a lock on a folder against other writers of sets; yield whether that is possible.
 
     Raises OSError if another program holds the lock for long, for example a suspended process.
     """
@@ -194,10 +255,12 @@ def _alone_in(folder: Path) -> Iterator[None]:
                                                f'{_TURN_S:g} s') from None
                 time.sleep(_TURN_POLL_S)
             except OSError:  # some network file systems cannot lock folders
+                is_alone = False
                 break
             else:
+                is_alone = True
                 break
-        yield
+        yield is_alone
     finally:
         os.close(descriptor)
 
@@ -221,11 +284,8 @@ def make_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f'.{secrets.token_hex(6)}.probe'
-        try:
+        with unfinished(folder / 'probe') as probe:
             probe.write_bytes(bytes(_PROBE_BYTES))
-        finally:
-            probe.unlink(missing_ok=True)
     except OSError as error:
         raise OptionsError(f'{folder}: cannot be written to: {error.strerror}; {MAKE_ROOM}'
                            ) from error

@@ -15,7 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from cliploc_ros.errors import CliplocError, ModelError
-from cliploc_ros.files.storage import MAKE_ROOM, parse_json, read_file, resolve_cache_dir
+from cliploc_ros.files.storage import (
+    MAKE_ROOM,
+    parse_json,
+    read_file,
+    resolve_cache_dir,
+    unfinished,
+)
 from cliploc_ros.models.files import fingerprint_file, first_line, remove_unused
 from cliploc_ros.models.onnx_network import free_memory
 
@@ -105,11 +111,10 @@ def exported(cache_dir: str, kind: str, name: str, identity: Sequence[str],
         try:
             cache.mkdir(parents=True, exist_ok=True)
             remove_unused(cache, _MOST_EXPORTS - 1)
-            with tempfile.TemporaryDirectory(dir=cache, prefix=f'.{folder.name}.', suffix='.tmp',
-                                             ignore_cleanup_errors=True) as beside:
-                whole = Path(shutil.copytree(written, Path(beside) / folder.name))
+            with unfinished(folder, Path.mkdir) as beside:
+                whole = Path(shutil.copytree(written, beside / folder.name))
                 if folder.exists():  # damaged, or from another process
-                    folder.rename(Path(beside) / 'old')
+                    folder.rename(beside / 'old')
                 whole.rename(folder)
         except OSError as error:
             reason = error.strerror or 'is the disk full?'  # copytree joins many errors

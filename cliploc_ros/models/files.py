@@ -9,7 +9,6 @@ import logging
 import os
 import re
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -22,8 +21,6 @@ _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
 # A zip archive, a bare pickle (PyTorch before 1.6), a NumPy array.
 _HEADS = (b'PK', b'\x80', b'\x93NUMPY')
-# Partial files older than this are from killed writers [s].
-_STALE_S = 24 * 3600.0
 # OWNER/NAME[@REVISION][:FILE]; the revision is a branch, tag or commit.
 _NAME = re.compile(r'([\w-][\w.-]*/[\w-][\w.-]*)(?:@([\w][\w.-]*))?(?::([\w][\w./-]*\.onnx))?')
 # Time-out of the first request, in case a firewall drops its packets [s].
@@ -97,7 +94,7 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
 
 
 def remove_unused(folder: Path, most: int) -> None:
-    """Remove the least recently used entries of a cache, and hidden files of killed writers.
+    """Remove the least recently used entries of a cache.
 
     Entries have a digest in their names. Other files stay: cache_dir may be a folder of the user
     with networks of his own.
@@ -108,11 +105,9 @@ def remove_unused(folder: Path, most: int) -> None:
         except OSError:  # another process has removed it
             return -1.0
 
-    ours = [entry for entry in folder.iterdir() if re.search('-[0-9a-f]{32}', entry.name)]
-    entries = sorted(ours, key=modified, reverse=True)
-    unused = [entry for entry in entries if not entry.name.startswith('.')][most:]
-    for entry in unused + [entry for entry in entries if entry.name.startswith('.')
-                           and 0.0 <= modified(entry) < time.time() - _STALE_S]:
+    ours = [entry for entry in folder.iterdir()
+            if re.search('-[0-9a-f]{32}', entry.name) and not entry.name.startswith('.')]
+    for entry in sorted(ours, key=modified, reverse=True)[most:]:
         if entry.is_dir():
             shutil.rmtree(entry, ignore_errors=True)
         else:

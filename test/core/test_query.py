@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, SEEN
 
+from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.localizer import (
     BATCH,
@@ -139,15 +140,24 @@ def test_all_that_is_known_comes_back(tmp_path):
     assert empty.run is None and empty.images == () and len(empty.newest.detections) == 0
 
 
+VIEWS = [[np.eye(4).tolist()], [1], [np.eye(7).tolist()], [[0.0] * 7], [1.0]]
+
+
 @pytest.mark.parametrize(('name', 'value'), [
     ('about', lambda about: about[:-3]), ('about', lambda about: about[:0]), ('crops', 'x'),
     ('images', lambda images: images[:-9]), ('images', lambda images: 0 * images),
     ('image_offsets', lambda offsets: offsets[:1]), ('crop_offsets', lambda offsets: offsets[1:]),
     ('odom_from_camera', [[0.0] * 4] * 4), ('class_ids', [[]]), ('scores', 'x'), ('limit', 0),
     ('bboxes_xyxy', [[1e308] * 4]), ('depths', [1.0]), ('compared', [99]), ('compared', [1, 1]),
+    ('views', [*VIEWS[:4], [1.0, 1.0]]), ('views', [VIEWS[0], [[1, 2]], *VIEWS[2:]]),
+    ('views', [*VIEWS, [1.0]]), ('image_offsets', lambda offsets: offsets[[0, 1, 1]]),
     ('stamp_ns', 2**70), ('width', 10), ('rooms', [1]), ('frames', []), ('cameras', [1])])
 def test_a_case_with_a_wrong_value_is_named(name, value, tmp_path):
-    arrays = dict(case_arrays(Case((replace(query(), run=1),), {'parameters': {}})))
+    cameras = CameraCheck.of_fields({'': {
+        'camera': asdict(CAMERA), 'boxes': [], 'since': [[], [], [], [], []],
+        'views': VIEWS}})
+    arrays = dict(case_arrays(Case((replace(query(), run=1, cameras=cameras),),
+                                   {'parameters': {}})))
 
     def put(node):
         for key, inner in [*node.items()] if isinstance(node, dict) else enumerate(node):

@@ -82,18 +82,21 @@ def test_a_full_disk(path, tmp_path):
     code = ('import sys; from pathlib import Path; from cliploc_ros.files.log import Log\n'
             'from cliploc_ros.errors import DatasetError\n'
             f'log = Log(Path({str(path)!r}), DatasetError, "make room")\n'
-            'try:\n'
-            '    for _ in range(100):\n'
-            '        log.append("x" * 5000)\n'
-            'except DatasetError as error:\n'
-            '    print(error)\n'
-            'entries, is_damaged = log.read()\n'
-            'print(len(entries), is_damaged)\n')
+            'for write in (lambda: [log.append("x" * 5000) for _ in range(100)],\n'
+            '              lambda: log.restart(["y" * 5000] * 100), log.set_aside):\n'
+            '    try:\n'
+            '        write()\n'
+            '    except DatasetError as error:\n'
+            '        print(error)\n'
+            '    entries, is_damaged = log.read()\n'
+            '    print(len(entries), is_damaged)\n'
+            'print([one.name for one in log.path.parent.iterdir()])\n')
     done = subprocess.run([*small_disk(tmp_path), sys.executable, '-c', code], cwd=PROJECT,
                           capture_output=True, text=True, timeout=60, check=True)
-    message, kept = done.stdout.splitlines()
-    assert 'No space left' in message
-    assert 8 <= int(kept.split()[0]) <= 13 and kept.endswith('False')
+    *lines, there = done.stdout.splitlines()
+    assert len(lines) == 6 and all('No space left' in line for line in lines[::2])
+    assert len({*lines[1::2]}) == 1 and lines[1].endswith('False')
+    assert 8 <= int(lines[1].split()[0]) <= 13 and there == "['log']"
 
 
 FILES = """

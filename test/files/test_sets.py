@@ -20,6 +20,7 @@ from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_embed
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import set_digest, write_map
 from cliploc_ros.errors import DatasetError, MapError
+from cliploc_ros.files.storage import replace_file
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording, recording_path
 from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
 from cliploc_ros.offline.studio.document import Document
@@ -33,6 +34,10 @@ def read(path):
     return number, {number % 8 == int(np.argmax(embeddings.means[0])),
                     number == load_layer_of_map(layer_path(path), landmark_map).points[0, 0],
                     number == load_recording(path).scale - 1.0}
+
+
+def hidden(path):
+    return {entry.name for entry in path.parent.iterdir() if entry.name.startswith('.')}
 
 
 @pytest.fixture
@@ -51,7 +56,7 @@ def write_again_and_again(path, first, begun, after):
 
 def test_a_kill_leaves_one_whole_set(path):
     """The writes of build_map are killed at 30 random times."""
-    draw, seen, fork = random.Random(0), set(), multiprocessing.get_context('fork')
+    draw, seen, left, fork = random.Random(0), set(), set(), multiprocessing.get_context('fork')
     for kill in range(30):
         begun = fork.Event()
         writer = fork.Process(target=write_again_and_again,
@@ -64,8 +69,15 @@ def test_a_kill_leaves_one_whole_set(path):
         number, agree = read(path)
         assert agree == {True}
         seen.add(number)
-    print(f'30 kills, {len(seen)} sets')
+        left |= hidden(path)
+    print(f'30 kills, {len(seen)} sets, {len(left)} files left')
     assert len(seen) > 10, 'the kills happen during writes'
+    assert left
+    with replace_file(path.with_name('b')) as of_this_writer:
+        write_set(path, 0)
+        assert hidden(path) == {of_this_writer.name}
+        of_this_writer.touch()
+    assert not hidden(path)
 
 
 def test_files_of_another_set_are_refused(path):
@@ -121,7 +133,7 @@ def test_a_set_that_cannot_be_written_changes_nothing(path):
         write_map(path, made_map(3).landmark_map, besides={blocker: lambda place, digest:
                                                           place.write_text(digest)})
     assert read(path) == (0, {True})
-    assert not [entry for entry in path.parent.iterdir() if entry.name.startswith('.')]
+    assert not hidden(path)
 
 
 def test_two_writers_at_once_leave_one_whole_set(path):
@@ -137,7 +149,7 @@ def test_two_writers_at_once_leave_one_whole_set(path):
             writer.join()
         assert [writer.exitcode for writer in writers] == [0, 0]
         assert read(path)[1] == {True}
-    assert not [entry for entry in path.parent.iterdir() if entry.name.startswith('.')]
+    assert not hidden(path)
 
 
 def test_what_a_killed_writer_left_comes_not_into_a_later_set_without_it(path):
@@ -148,7 +160,7 @@ def test_what_a_killed_writer_left_comes_not_into_a_later_set_without_it(path):
                    MapRecording(path.with_name('seen.npz')))
     LandmarkMap.from_file(path)
     assert not layer_path(path).exists()
-    assert not [entry for entry in path.parent.iterdir() if entry.name.startswith('.')]
+    assert not hidden(path)
 
 
 def test_files_of_a_set_stay_private_and_links_stay_links(path, tmp_path):

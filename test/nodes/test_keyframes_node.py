@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The relocalizer as a process with a keyframe layer next to its map, in the demo's room."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from scene import make_room, write_bare_map, write_map
 from tester import make_frame, transform_of
 
 from cliploc_ros.cli.evaluate import main as evaluate
-from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import pose_error, transform_from_pose
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, save_layer
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.folders import read_folder
@@ -99,7 +100,11 @@ def test_a_map_of_keyframes_alone(start, tester, layer, room_map, tmp_path, caps
     assert tester.trigger('record').success
     case, = (tmp_path / 'cases').iterdir()
     assert evaluate(['--bag', str(case), '--map', str(bare)]) == 0
-    assert 'again:    accepted' in capsys.readouterr().out
+    shown = re.search('again:    accepted\npose:     the camera at x (.*) y (.*) z (.*) m, '
+                      r'quaternion \(x y z w\) (.*), in map;', capsys.readouterr().out)
+    again = transform_from_pose(np.array([float(number) for number in shown.groups()[:3]]),
+                                np.array([float(number) for number in shown[4].split()]))
+    assert pose_error(transform_of(tester.poses[0].pose.pose), again)[0] < 0.001
     refusal = tester.relocalize(make_frame()).message
     assert 'the map has only keyframes, and none matches' in refusal
     assert 'detector' not in process.output()

@@ -36,7 +36,7 @@ def test_a_recorded_failure_replays_to_the_same_verdict(own_relocalizer, tester,
     assert output.endswith('the same verdict\n')
     assert f"confidence {answer.message.partition('[confidence ')[2].partition(',')[0]}" in output
     reason = answer.message.removeprefix('refused: ').rpartition(' [')[0]
-    assert f'again:    refused: {reason}\n' in output
+    assert f'again:    refused: {reason}\npose:     the camera at x ' in output
     digest = hashlib.sha256(room_map.read_bytes()).hexdigest()[:12]
     assert f'map {digest}' in answer.message and f'map {digest}\n' in output
     found = read_case(case)

@@ -145,7 +145,8 @@ def test_a_body_frame_in_place_of_an_optical_one(tilt_deg):
     ('/rect/image', False, BARREL, [False]), ('/camera/image_rect', True, BARREL, []),
     ('/camera/image_raw', False, BARREL, []), ('/infra1/image_rect_raw', False, {}, []),
     ('/camera/image_raw/compressed', True, BARREL, [False]), ('/camera/image_raw', True, {}, []),
-    ('/camera/image', True, BARREL, [])])
+    ('/camera/image', True, BARREL, []), ('/rectangle/image', False, BARREL, []),
+    ('/camera/image_rectangles', False, BARREL, []), ('/image_rectified', False, BARREL, [True])])
 def test_images_that_sound_rectified_or_raw(topic, rectified, changes, certain):
     fields = {'distortion_model': 'plumb_bob', 'd': [0.0] * 5, 'k': K, 'p': P} | changes
     found = messages.faults_of_rectified(topic, rectified, CameraInfo(**fields))

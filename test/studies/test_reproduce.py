@@ -18,6 +18,7 @@ import pytest
 import yaml
 
 from cliploc_ros.cli import build_map, evaluate
+from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 from cliploc_ros.offline.datasets.bag_poses import PoseSource
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
@@ -212,6 +213,42 @@ def test_seven_scenes_is_an_archive_in_an_archive(shared_data, tmp_path):
         for name in ('mapped', 'asked')]
     assert [len(some) for some in stamps] == [5, 3]
     assert not set(stamps[0]) & set(stamps[1])
+
+
+def packed(name, content):
+    """Return a tgz with one file."""
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode='w:gz') as archive:
+        member = tarfile.TarInfo(name)
+        member.size = len(content)
+        archive.addfile(member, io.BytesIO(content))
+    return packed.getvalue()
+
+
+def zipped(**members):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return packed.getvalue()
+
+
+@pytest.mark.parametrize(('file', 'content', 'inner', 'said'), [
+    ('a.zip', zipped(**{'../a': 'x', '/b': 'x'}), '', 'none of its members'),
+    ('a.zip', zipped(), '', 'none of its members'), ('a.tgz', packed('../a', b''), '', 'outside'),
+    ('a.tgz', packed('a', bytes(3_000_000)), '', 'more than 2 MB'),
+    ('a.zip', zipped(a=bytes(3_000_000)), '', 'more than 2 MB'),
+    ('a.zip', zipped(b=bytes(3_000_000)), 'b', 'more than 2 MB'),
+    ('a.zip', zipped(**{'b.zip': zipped(a=bytes(3_000_000))}), 'b.zip', 'more than 2 MB')])
+def test_an_archive_without_sound_members_or_of_any_size_is_named(file, content, inner, said,
+                                                                  tmp_path):
+    (tmp_path / 'downloads').mkdir()
+    (tmp_path / 'downloads' / file).write_bytes(content)
+    one = reproduce.Recording(name='', url=f'http://127.0.0.1:9/{file}', megabytes=1, licence='',
+                              unpacked=1, queries=3, inner=inner)
+    with pytest.raises(DatasetError, match=f'cannot be unpacked .*{said}'):
+        reproduce.unpacked(one, tmp_path, tmp_path)
+    assert [*(path for path in tmp_path.rglob('*') if path.is_file())] == []
 
 
 def test_the_form_of_the_shipped_sources():

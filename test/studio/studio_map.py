@@ -87,8 +87,10 @@ def open_page(studio, host='127.0.0.1'):
 @contextmanager
 def person_at(chromium, studio, has_scene=False):
     """Serve the page of a studio, and open it; yield the person at the page and the server."""
-    with open_page(studio) as (url, server):
-        person = Person(chromium, url, has_scene)
+    from cliploc_ros.offline.studio.web import private_page
+
+    with open_page(studio) as (url, server), private_page(url, studio.document.path) as page:
+        person = Person(chromium, page.as_uri(), has_scene)
         yield person, server
         person.page.close()
         assert person.foreign == [], 'no request leaves the machine'

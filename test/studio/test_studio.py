@@ -2,13 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The studio's actions and access control, without a browser."""
 
+import os
+import re
 import shutil
+import subprocess
+import sys
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from browser import wait_for
 from rig_bag import camera_messages, write_messages
 from scene import make_layer, make_room, write_bare_map, write_map
 from studio_map import ASSETS, open_page, write_two_rooms
@@ -32,8 +38,10 @@ from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.page import picture_of
 from cliploc_ros.offline.studio.recording import Recording
 from cliploc_ros.offline.studio.studio import Studio
-from cliploc_ros.offline.studio.web import Gate, once
+from cliploc_ros.offline.studio.web import Gate
 from demo.truth import read_frames
+
+PROJECT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -292,12 +300,24 @@ def test_only_who_has_the_token_opens_the_page(tmp_path, host):
 
 
 @pytest.mark.needs('viser')
-def test_the_address_on_the_command_line_of_a_browser_opens_the_page_once(tmp_path):
-    with open_page(Studio(Document(tmp_path / 'map.yaml'))) as (url, _):
-        shown = once(url)
-        assert url.rstrip('/').rsplit('/', 1)[1] not in shown
-        assert answer(shown) == 200, 'it leads to the page'
-        assert answer(shown) == 403
+def test_the_command_line_of_the_browser_opens_the_page_for_no_other_user(tmp_path):
+    """All users can read it in /proc."""
+    browser = tmp_path / 'browser'
+    browser.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/opened.part\n'
+                       f'mv {tmp_path}/opened.part {tmp_path}/opened\n')
+    browser.chmod(0o755)
+    with subprocess.Popen([sys.executable, '-m', 'cliploc_ros.cli.studio', tmp_path / 'map.yaml'],
+                          cwd=PROJECT, env=os.environ | {'BROWSER': str(browser)}, text=True,
+                          stdout=subprocess.PIPE) as studio:
+        url = next(line for line in studio.stdout if line.startswith('studio: ')).split()[1]
+        wait_for((tmp_path / 'opened').exists, 'the browser')
+        address = (tmp_path / 'opened').read_text().strip()
+        page = Path(address.removeprefix('file://'))
+        assert page.stat().st_mode & 0o777 == 0o600
+        assert answer(re.search('url=(.*)"', page.read_text())[1]) == 200
+        assert re.search('[^/]{32,}', url)[0] not in address
+        studio.terminate()
+    assert not page.exists()
 
 
 def test_an_address_beyond_ascii_is_refused():

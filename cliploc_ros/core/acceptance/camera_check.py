@@ -356,12 +356,14 @@ class _Record:
         """Restore a state; KeyError, TypeError or ValueError if `fields` are damaged."""
         camera = dict(fields['camera'])
         record = cls(name, Camera(**camera | {'distortion': tuple(camera['distortion'])}))
-        record.extent.boxes = np.array(fields['boxes'], dtype=np.float64).reshape(-1, 4)
+        boxes = fields['boxes']
+        record.extent.boxes = np.array(boxes, dtype=np.float64).reshape(len(boxes), 4)
         record.views, record.since = (Views._make(
-            np.array(part, dtype=empty.dtype).reshape(-1, *empty.shape[1:]) for part, empty in zip(
+            np.array(part, dtype=empty.dtype).reshape(len(part), *empty.shape[1:])
+            for part, empty in zip(
                 # earlier releases did not weigh looks
-                [*parts, [1.0] * len(parts[1])][:len(Views())], Views(), strict=True))
-            for parts in (fields['views'], fields['since']))
+                parts if len(parts) > 4 else [*parts, [1.0] * len(parts[1])],
+                Views(), strict=True)) for parts in (fields['views'], fields['since']))
         for views in (record.views, record.since):
             # LinAlgError, a ValueError: it is no information matrix, up to rounding
             np.linalg.cholesky(views.informations + 0.01 * np.diag(_WRONG ** -2.0))

@@ -7,7 +7,6 @@ of replay, this module imports little.
 """
 
 import sqlite3
-import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.files.storage import MAKE_ROOM
+from cliploc_ros.files.storage import MAKE_ROOM, unfinished
 
 _VISION_MSGS = ('Point2D', 'Pose2D', 'BoundingBox2D', 'ObjectHypothesis',
                 'ObjectHypothesisWithPose', 'Detection2D', 'Detection2DArray')
@@ -294,8 +293,7 @@ class BagWriter:
         """Begin the recording next to its final path."""
         self._check_free()
         with ExitStack() as begun, self._naming_failures():
-            self._staging = Path(begun.enter_context(tempfile.TemporaryDirectory(
-                '.partial', f'.{self.path.name}.', self.path.parent, ignore_cleanup_errors=True)))
+            self._staging = begun.enter_context(unfinished(self.path, Path.mkdir))
             self._writer = Writer(self._staging / self.path.name, version=9,
                                   storage_plugin=self._storage)
             begun.callback(self._abort)

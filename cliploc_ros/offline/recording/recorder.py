@@ -12,9 +12,8 @@ import base64
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -29,7 +28,7 @@ from cliploc_ros.core.geometry.depth import PLAUSIBLE_DEPTH_M, depths_of_boxes
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
-from cliploc_ros.files.storage import parse_json
+from cliploc_ros.files.storage import parse_json, unfinished
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from cliploc_ros.offline.datasets.bags import MOST_LEFT_OUT
@@ -144,7 +143,7 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
         except DatasetError as error:
             logger.warning('recording again: %s', error)
     path = file.with_name(outputs_name(frames, described))
-    with closing(_open_outputs(path)) as outputs:
+    with _open_outputs(path) as outputs:
         recorded = _with_odometry(_record(
             frames, options, described, outputs, outputs.path == path), odometry)
     save_observations(file, recorded)
@@ -188,16 +187,21 @@ def outputs_name(frames: Frames, described: str) -> str:
     return f'.{frames.source.resolve().name}{_BESIDE}{_digest(json.dumps(content))}.outputs'
 
 
-def _open_outputs(path: Path) -> Log:
-    """Open a file of outputs; while another run adds to it, another file beside it."""
-    try:
-        return Log(path, DatasetError, 'make room or name another file with `record_to`, then run '
+@contextmanager
+def _open_outputs(path: Path) -> Iterator[Log]:
+    """Open a file of outputs; while another run adds to it, a temporary file."""
+    def log(at: Path) -> Log:
+        return Log(at, DatasetError, 'make room or name another file with `record_to`, then run '
                    'again: it continues from here', lambda line: SeenFrame.from_bytes(
                        base64.b64decode(parse_json(line))))
-    except DatasetError as error:
-        if not isinstance(error.__cause__, BlockingIOError):
-            raise
-        return _open_outputs(path.with_suffix(f'.{os.getpid()}.outputs'))
+    with ExitStack() as opened:
+        try:
+            outputs = log(path)
+        except DatasetError as error:
+            if not isinstance(error.__cause__, BlockingIOError):
+                raise
+            outputs = log(opened.enter_context(unfinished(path, Path.mkdir)) / path.name)
+        yield opened.enter_context(closing(outputs))
 
 
 def _again(seen: SeenFrame, raw: RawFrame) -> SeenFrame:

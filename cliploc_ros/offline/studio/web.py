@@ -12,13 +12,13 @@ page's WebSocket, and ``/image`` and ``/crop`` are pictures. PERSON is a random 
 """
 
 import asyncio
-import hashlib
 import hmac
 import http
 import json
 import secrets
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -28,7 +28,8 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from cliploc_ros.files.storage import parse_json
+from cliploc_ros.errors import OptionsError
+from cliploc_ros.files.storage import parse_json, unfinished
 
 LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
 _FILES = Path(__file__).parent / 'web'
@@ -108,17 +109,23 @@ class Board:
             self._on_change()
 
 
-def once(url: str) -> str:
-    """Return an address that opens the page of `url` only once.
+@contextmanager
+def private_page(url: str, beside: Path) -> Iterator[Path]:
+    """Yield a page that leads to `url`, and that no other user can read; it is removed at the end.
 
-    It is for the command line of a browser, which all users of the machine can read.
+    It is for the command line of a browser, which all users of the machine can read. It lies
+    beside another file, because packaged browsers have a temporary folder of their own.
+    OptionsError: it cannot be written.
     """
-    base, token = url.rstrip('/').rsplit('/', 1)
-    return f'{base}/{_ticket(token)}'
-
-
-def _ticket(token: str) -> str:
-    return hashlib.sha256(token.encode()).hexdigest()
+    with ExitStack() as written:
+        try:
+            page = written.enter_context(unfinished(
+                beside.with_suffix('.html'), partial(Path.touch, mode=0o600)))
+            page.write_text(f'<meta http-equiv="refresh" content="0;url={url}">')
+        except OSError as error:
+            raise OptionsError(f'{beside.parent}: cannot be written to: {error.strerror}; make '
+                               'room, or give --no-browser') from error
+        yield page
 
 
 class Gate:
@@ -127,7 +134,6 @@ class Gate:
     def __init__(self, host: str):
         self.is_local = host in LOOPBACK_NAMES
         self.token = secrets.token_urlsafe(24)
-        self._tickets = [_ticket(self.token)]
 
     @property
     def path(self) -> str:
@@ -135,7 +141,7 @@ class Gate:
         return f'/{self.token}/'
 
     def admit(self, request: Request) -> str | None:
-        """Return the path below the token, '' for a ticket, None for a refused request."""
+        """Return the path below the token, None for a refused request."""
         try:
             host, origin = request.headers.get('Host', ''), request.headers.get('Origin')
             name, their_host = urlsplit(f'//{host}').hostname, urlsplit(origin or '').netloc
@@ -146,9 +152,6 @@ class Gate:
                 or (origin is not None and their_host != host) or (is_socket and origin is None)):
             return None
         first, _, rest = request.path.partition('?')[0].lstrip('/').partition('/')
-        if first in self._tickets and not is_socket:
-            self._tickets.remove(first)
-            return ''
         # websockets decodes non-ASCII bytes as surrogates
         is_known = hmac.compare_digest(first.encode(errors='surrogateescape'), self.token.encode())
         return f'/{rest}' if is_known else None
@@ -175,9 +178,6 @@ class Gate:
                 if path is None:
                     return _response(http.HTTPStatus.FORBIDDEN, Content(
                         b'refused: use the address that the studio printed\n', '', False))
-                if not path:
-                    return Response(http.HTTPStatus.FOUND, 'Found', Headers({
-                        'Location': self.path, 'Content-Length': '0'}))
                 request.path = path
                 if request.headers.get('Upgrade', '').lower() == 'websocket':
                     return None
