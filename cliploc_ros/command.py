@@ -132,9 +132,25 @@ def within[Number: (int, float)](low: Number, high: Number) -> Callable[[str], N
 _PATHS = ('DIR', 'NPZ', 'YAML', 'FILE', 'JSON', 'MAP', 'BAG|DIR', 'IN')
 
 
+class _Once(argparse.Action):
+    """Refuses an option that is given twice; the last one would silently win."""
+
+    given_in: argparse.Namespace | None = None  # the values do not tell: they begin with a default
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
+                 values: Any, option_string: str | None = None) -> None:
+        """Take the values of the option, or raise ArgumentError."""
+        if self.given_in is namespace:
+            raise argparse.ArgumentError(self, 'given twice: give it once, with all its values')
+        self.given_in = namespace
+        super().__call__(parser, namespace, values, option_string)
+
+
 def option(group: Any, shown: str, text: str | None = None,
            kind: Callable[[str], Any] | None = None, default: Any = None, **more: Any) -> None:
     """Add an option or argument to a parser, or to an argument group.
+
+    An option is given once, unless its action is 'append' or 'extend'.
 
     Parameters
     ----------
@@ -162,7 +178,9 @@ def option(group: Any, shown: str, text: str | None = None,
         more['default'] = default
     if kind is not None:
         more['type'] = kind
-    group.add_argument(*names, help=text, **more)
+    added = group.add_argument(*names, help=text, **more)
+    if added.option_strings and more.get('action') not in ('append', 'extend'):
+        added.__class__ = type('Once', (_Once, type(added)), {})
 
 
 def check_output(path: Path) -> None:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from cliploc_ros.command import needs_ros, positive, positive_int, run_main
+from cliploc_ros.command import needs_ros, option, positive, positive_int, run_main
 from demo import ASSETS
 
 EPILOG = """\
@@ -31,33 +31,24 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='demo', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
         description='Let a robot wake up in a synthetic room, and draw the results.')
-    parser.add_argument(
-        '--out', type=Path, default=Path('demo_out'), metavar='DIR',
-        help='folder for the pictures (default: ./%(default)s)')
-    parser.add_argument(
-        '--wake-ups', type=positive_int, default=10, metavar='N',
-        help='number of wake-ups along the recording (default: %(default)s)')
-    parser.add_argument(
-        '--rate', type=positive, default=8.0, metavar='X',
-        help='speed between wake-ups; 2 is twice as fast as recorded (default: %(default)g)')
-    parser.add_argument(
-        '--method', default='hybrid_auto', metavar='MATCHING_ALGORITHM',
-        help='a method of the paper, such as class_bf or clip_prosac (default: %(default)s)')
-    parser.add_argument(
-        '--assets', type=Path, default=ASSETS, metavar='DIR',
-        help='world to use instead of the shipped one: sequence/ (a TUM folder), map.yaml, '
-        'yolo.onnx, mapping/ for --map, and clip/ for all methods but class_*')
-    parser.add_argument(
-        '--map', action='store_true',
-        help="build the map from the assets' mapping walk (mapping/), and wake up in it")
-    parser.add_argument(
-        '--cameras', type=int, choices=(1, 4), default=1,
-        help='4: a robot with cameras in four directions, which does not turn (default: 1)')
-    parser.add_argument(
-        '--kidnapped', action='store_true',
-        help='move a driving robot elsewhere: the watch detects it, and the robot relocalizes')
-    parser.add_argument(
-        '--rviz', action='store_true', help='show the topics in RViz, where it is installed')
+    option(parser, '--out DIR', 'folder for the pictures (default: ./%(default)s)',
+           default=Path('demo_out'))
+    option(parser, '--wake-ups N', 'number of wake-ups along the recording (default: %(default)s)',
+           positive_int, 10)
+    option(parser, '--rate X', 'speed between wake-ups; 2 is twice as fast as recorded (default: '
+           '%(default)g)', positive, 8.0)
+    option(parser, '--method MATCHING_ALGORITHM', 'a method of the paper, such as class_bf or '
+           'clip_prosac (default: %(default)s)', default='hybrid_auto')
+    option(parser, '--assets DIR', 'world to use instead of the shipped one: sequence/ (a TUM '
+           'folder), map.yaml, yolo.onnx, mapping/ for --map, and clip/ for all methods but '
+           'class_*', default=ASSETS)
+    option(parser, '--map', "build the map from the assets' mapping walk (mapping/), and wake up "
+           'in it')
+    option(parser, '--cameras', '4: a robot with cameras in four directions, which does not turn '
+           '(default: 1)', int, 1, choices=(1, 4))
+    option(parser, '--kidnapped', 'move a driving robot elsewhere: the watch detects it, and the '
+           'robot relocalizes')
+    option(parser, '--rviz', 'show the topics in RViz, where it is installed')
     return parser
 
 

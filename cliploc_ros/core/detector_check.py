@@ -93,8 +93,8 @@ class DetectorCheck:
             numbers = ', which are numbers' if all(name.isdigit() for name in names) else ''
             hint = next(filter(None, (did_you_mean(name, self._known)
                                       for name in names[:_MOST_NAMES])), '')
-            text = (f'none of its classes is in the map: {_in_words(names)}{numbers}{hint}; the '
-                    f'map has {_in_words(self._known)}: use the detector of the map, or class_map')
+            text = (f'none of its classes is in the map: {in_words(names)}{numbers}{hint}; the '
+                    f'map has {in_words(self._known)}: use the detector of the map, or class_map')
         return [Fault(text, True)] if text else []
 
 
@@ -103,7 +103,7 @@ def _scores(frames: Iterable[tuple[Detections, Detections]]) -> NDArray[np.float
     return np.concatenate([np.empty(0), *(given.scores for given, _ in frames)])
 
 
-def _in_words(names: Iterable[str]) -> str:
+def in_words(names: Iterable[str]) -> str:
     """List names in one line, shortened and printable, as their source is not trusted."""
     shown = [*islice(names, _MOST_NAMES + 1)]
     cut = [''.join(char if char.isprintable() else ' ' for char in name[:_MOST_CHARACTERS])

@@ -7,6 +7,7 @@ The meaning of the outputs is read from the metadata of the file and the configu
 
 import ast
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +28,7 @@ from cliploc_ros.models.files import (
     resolve_folder,
 )
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, read_config
-from cliploc_ros.models.protocols import DetectorOptions, ObjectDetector
+from cliploc_ros.models.protocols import DetectorOptions
 
 _CONFIG, _PREPROCESSOR = 'config.json', 'preprocessor_config.json'
 #: The files of a published detector; of the networks, the first that exists is used.
@@ -39,6 +40,15 @@ _STRIDE = 32
 # Grey of the borders, and greatest number of boxes that are compared, as in ultralytics.
 _GREY = (114, 114, 114)
 _MOST_BOXES = 30_000
+#: Said of grey images
+GREY = ('the images are grey, but detector and CLIP are trained on colour images: classes and '
+        'labels may be wrong; use a colour camera')
+# Greatest mean difference between the channels of a pixel in a grey image, and least range of all
+# values in an image that is not black [grey levels]. Chosen: JPEG keeps grey exactly.
+_GREY_LEVELS, _BLACK_LEVELS = 0.5, 16
+# Greatest number of boxes in noise of a network with the right input (chosen; measured: YOLOv8n 0,
+# with pixels from 0 to 255 300).
+_IN_NOISE = 3
 # Columns of the output of a network that removes duplicates itself: box, score, class.
 _END2END = 6
 
@@ -74,6 +84,24 @@ class OnnxDetector:
         """Change the options, except for the model."""
         self._options = options
 
+    def scores_by_input(self, images_rgb: Sequence[NDArray[np.uint8]]) -> dict[str, float]:
+        """Return the sums of scores in images, by the inputs that networks are trained with.
+
+        The first is the input that the files of the network define. With a wrong range of values,
+        a network may see objects everywhere, also in noise: another input has a sum of 0 then.
+        """
+        noise = np.random.default_rng(0).integers(0, 256, images_rgb[0].shape, np.uint8)
+        own, found = self._head.convert, dict[str, float]()
+        ranges = {own: '', _from_0_to_1: ' from 0 to 1', np.copy: ' from 0 to 255'}
+        for order, step in (('RGB', 1), ('BGR', -1)):
+            for scaled, values in ranges.items():
+                self._head.convert = lambda pixels, scaled=scaled, step=step: scaled(  # type: ignore[misc]
+                    np.ascontiguousarray(pixels[:, ::step]))
+                found[order + values] = 0.0 if found and len(self.detect(noise)) > _IN_NOISE else \
+                    sum(float(self.detect(image).scores.sum()) for image in images_rgb)
+        self._head.convert = own
+        return found
+
     def detect(self, image_rgb: NDArray[np.uint8]) -> Detections:
         """Return the objects in an image (h, w, 3) uint8, the most confident first.
 
@@ -92,7 +120,13 @@ class OnnxDetector:
                           scores=rows[:, 4].astype(np.float64))
 
 
-def load_detector(options: DetectorOptions) -> ObjectDetector:
+def is_grey(image_rgb: NDArray[np.uint8]) -> bool:
+    """Return whether an image (h, w, 3) has no colours and is not black."""
+    pixels = image_rgb[::4, ::4].astype(np.int16)
+    return bool(np.ptp(pixels, axis=2).mean() < _GREY_LEVELS and np.ptp(pixels) >= _BLACK_LEVELS)
+
+
+def load_detector(options: DetectorOptions) -> OnnxDetector:
     """Load a detector; weights of ultralytics are exported to ONNX at their first use.
 
     Raises
@@ -120,6 +154,10 @@ def load_detector(options: DetectorOptions) -> ObjectDetector:
     return OnnxDetector(replace(options, model=str(folder / DETECTOR), prompts=()))
 
 
+def _from_0_to_1(pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+    return pixels / np.float32(255)
+
+
 class YoloHead:
     """An export of ultralytics, with a letterbox before it and removal of duplicates after it.
 
@@ -139,6 +177,8 @@ class YoloHead:
         self._stride = int(about['stride']) if about.get('stride', '').isdecimal() else _STRIDE
         height, width = self._input.shape[2:]
         self._size = None if ANY in (height, width) else (height, width)
+        #: Converts an RGB image (1, 3, h, w), 0 to 255, to the input of the network
+        self.convert: Callable[[NDArray[np.float32]], NDArray[np.float32]] = _from_0_to_1
         self._is_end2end = self._removes_doubles(self._run(np.zeros((1, 3, *(
             self._size or (2 * self._stride,) * 2)))))
 
@@ -187,8 +227,8 @@ class YoloHead:
             cv2.resize(image_rgb, scaled, interpolation=cv2.INTER_LINEAR)
         filled = cv2.copyMakeBorder(image, top, free_y - top, left, free_x - left,
                                     cv2.BORDER_CONSTANT, value=_GREY)
-        output = self._run(np.ascontiguousarray(filled.transpose(2, 0, 1)[None], np.float32)
-                           / np.float32(255))
+        output = self._run(self.convert(np.ascontiguousarray(filled.transpose(2, 0, 1)[None],
+                                                             np.float32)))
         if not self._is_end2end:
             output = output[:4 + len(self.names)]
         rows = select_boxes(output, options.conf, options.iou, options.max_det, self._is_end2end)
@@ -234,6 +274,9 @@ class DetrHead:
                 raise ModelError(f"{file}: the fields 'image_mean' and 'image_std' must have "
                                  'three numbers each') from error
         self._resample = Image.Resampling(about.get('resample', Image.Resampling.BILINEAR))
+        #: See YoloHead.convert
+        self.convert: Callable[[NDArray[np.float32]], NDArray[np.float32]] = lambda pixels: (
+            pixels * self._scale - self._mean[:, None, None]) / self._deviation[:, None, None]
         probe = self._run(np.zeros((64, 64, 3), dtype=np.uint8))[_LOGITS]
         #: Whether the last logit of a query means 'no object'
         self._has_nothing = probe.shape[-1] == len(self.names) + 1
@@ -252,9 +295,8 @@ class DetrHead:
             size = max(1, round(width * scale)), max(1, round(height * scale))
         # OpenCV's bilinear filter skips pixels when scaling down, Pillow's does not
         scaled = np.asarray(Image.fromarray(image_rgb).resize(size, self._resample))
-        pixels = (scaled * self._scale - self._mean) / self._deviation
-        given: dict[str, NDArray[Any]] = {self._input.name: np.ascontiguousarray(
-            pixels.transpose(2, 0, 1)[None], dtype=self._input.type)}
+        given: dict[str, NDArray[Any]] = {self._input.name: self.convert(np.ascontiguousarray(
+            scaled.transpose(2, 0, 1)[None], np.float32)).astype(self._input.type)}
         for port in self._network.inputs:
             if port.name == 'pixel_mask':  # 1 for pixels of the image, 0 for padding
                 shape = [size[1] if side == ANY else side for side in port.shape[1:]]

@@ -22,7 +22,7 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import image_from_msg
-from cliploc_ros.models.onnx_detector import load_detector
+from cliploc_ros.models.onnx_detector import GREY, is_grey, load_detector
 from cliploc_ros.models.protocols import (
     DetectorOptions,
     ObjectDetector,
@@ -174,7 +174,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         self._newest = NewestInstant(self.worker, self._detect)
         self._cameras = {name: _Camera(self, name, self._newest, self._update)
                          for name in self.settings.values.camera_names or ('',)}
-        self._last_error = ''
+        self._last_error, self._is_grey = '', False
 
     def load(self) -> str:
         """Load the network."""
@@ -211,6 +211,8 @@ class DetectorNode(ManagedNode[DetectorParameters]):
             camera.examine(health, self.settings.values.stale_after_s)
         if self._last_error:
             health.warn(self._last_error)
+        if self._is_grey:
+            health.warn(GREY)
         since = self._newest.waiting_since
         health.values |= {'images dropped': self._newest.dropped, 'queue age [s]':
                           f'{0.0 if since is None else time.monotonic() - since:.2f}'}
@@ -234,6 +236,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
         try:
             self.detector.configure(detector_options(self.settings.snapshot()))
             pixels = image_from_msg(image.msg)
+            self._is_grey = is_grey(pixels)
             times.begin('detection')
             detections = self.detector.detect(pixels)
         except CliplocError as error:

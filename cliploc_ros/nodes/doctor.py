@@ -34,6 +34,7 @@ from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
 from cliploc_ros.errors import CliplocError, ImageError, OptionsError
 from cliploc_ros.files.storage import NOT_KEPT
+from cliploc_ros.models.onnx_detector import GREY, is_grey
 from cliploc_ros.models.protocols import ObjectDetector
 from cliploc_ros.nodes.detector import DetectorNode
 from cliploc_ros.nodes.relocalizer import RelocalizerNode
@@ -317,7 +318,8 @@ def make_ready(picture: Path | None, cache_dir: Path | None, has_detector: bool,
             first, _, later = (time_request(image_rgb, detector, localizer, parameters)
                                for _ in range(3))
             report.add('request', State.PASS, f'{picture or "a drawn picture"}: first {first}; '
-                                              f'later {later}')
+                                              f'later {later}'
+                                              f'{"; " + GREY if is_grey(image_rgb) else ""}')
     report.judge('cache', f'not ready: {NOT_KEPT[0]}' if NOT_KEPT else '',
                  'with these parameters, start and requests need neither network nor compiler')
     return [] if cache_dir is None else carrying(cache_dir, used)

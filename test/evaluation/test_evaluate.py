@@ -129,8 +129,10 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
 def test_the_files_say_what_was_compared(files, recording, tmp_path, evaluate_here):
     poses = tmp_path / 'theirs.txt'
     truth = recording[0].map_from_camera
-    numbers = ' '.join(map(str, [*truth[:3, 3], *quaternion_from_transform(truth)]))
-    poses.write_text(''.join(f'{second} {numbers}\n' for second in range(100, 109)))
+    x, y, z, w = quaternion_from_transform(truth)
+    for file, quaternion in ((poses, (x, y, z, w)), (tmp_path / 'w.txt', (w, x, y, z))):
+        numbers = ' '.join(map(str, [*truth[:3, 3], *quaternion]))
+        file.write_text(''.join(f'{second} {numbers}\n' for second in range(100, 109)))
     given = small(files, '--methods', 'class_bf', '--seed', 7, '--no-figures')
     done = evaluate_here(*given, '--poses', f'theirs={poses}', '--out', tmp_path / 'out')
     assert done.returncode == 0, done.stderr
@@ -152,6 +154,8 @@ def test_the_files_say_what_was_compared(files, recording, tmp_path, evaluate_he
     for word, named in (('class_bf=x.txt', "called 'class_bf'"), ('theirs', 'NAME=FILE'),
                         ('theirs=missing.txt', 'missing.txt')):
         assert_error(evaluate_here(*given, '--poses', word, '--out', tmp_path / 'none'), named)
+    done = evaluate_here(*given, '--poses', f'w={tmp_path}/w.txt', '--out', tmp_path / 'w_first')
+    assert 'note: w: poses fit after one transform: quaternions are w first' in done.stdout
 
 
 def test_options_without_effect_are_refused(files, tmp_path, evaluate_here):
@@ -170,14 +174,13 @@ def walk(tmp_path_factory):
     return folder
 
 
-METHODS = ('--methods', 'hybrid_b-prosac', 'auto', '--trials', 2, '--sweep', '--no-figures',
-           '--workers', 1)
+METHODS = ('--methods', 'hybrid_b-prosac', 'auto', '--trials', 2, '--sweep', '--no-figures')
 
 
 @pytest.fixture(scope='module')
 def evaluated_bag(walk):
     done = evaluate('--bag', walk / 'bag', *NETWORKS, *METHODS, '--out', walk / 'from_bag',
-                    '--save-queries', walk / 'saved.npz')
+                    '--save-queries', walk / 'saved.npz', '--workers', 1)
     assert done.returncode == 0, done.stderr
     print('\n' + done.stdout)
     return done

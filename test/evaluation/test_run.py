@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from scene import make_room
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.transforms import make_transform, quaternion_from_transform
 from cliploc_ros.core.options import RelocalizerOptions
@@ -23,6 +24,7 @@ from cliploc_ros.offline.evaluation.methods import PAPER_METHODS, parse_methods
 from cliploc_ros.offline.evaluation.run import run_methods
 from cliploc_ros.offline.evaluation.trials import (
     Result,
+    find_misfit,
     given_results,
     make_queries,
     with_neighbours,
@@ -30,6 +32,7 @@ from cliploc_ros.offline.evaluation.trials import (
 )
 
 PAPER = RelocalizerOptions(iterations=60)
+SHIFT = make_transform(np.diag([-1.0, -1.0, 1.0]), np.array([-2.0, 0.0, -1.0]))
 
 
 @pytest.fixture(scope='module')
@@ -268,6 +271,40 @@ def test_poses_of_another_program_have_errors_only(questions):
         summary.notes([ours, theirs]))
     with pytest.raises(DatasetError, match='do not overlap'):
         given_results('theirs', replace(poses, stamps_ns=poses.stamps_ns + 10**12), questions)
+
+
+def misread(pose):
+    """Read the quaternion w x y z of a pose as x y z w."""
+    return make_transform(Rotation.from_quat(np.roll(quaternion_from_transform(
+        pose), 1)).as_matrix(), pose[:3, 3])
+
+
+@pytest.mark.parametrize(('change', 'said'), [
+    (lambda pose: SHIFT @ pose, 'map from their frame x y z qx qy qz qw -2.0000 0.0000 1.0000 '),
+    (lambda pose: pose @ SHIFT, 'their body from camera x y z qx qy qz qw -2.0000 '),
+    (misread, 'quaternions are w first'),
+    (lambda pose: misread(SHIFT @ pose), 'quaternions are w first (first line of the file: # '
+     'timestamp tx ty tz qw qx qy qz), map from their frame x y z'),
+    (np.linalg.inv, 'poses are inverse (map in camera)'),
+    (lambda pose: pose, ''),
+    (lambda pose: pose @ make_transform(np.eye(3), np.random.default_rng(
+        int(1e6 * abs(pose[0, 3]))).normal(size=3)), '')])
+def test_poses_of_another_program_that_fit_after_one_transform(questions, change, said):
+    """A third of their poses are wrong. At one place, any poses would fit."""
+    rng = np.random.default_rng(3)
+    queries = [replace(query, map_from_camera=make_transform(
+        Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3)))
+        for query in questions]
+    given = [change(query.map_from_camera if number % 3 else np.eye(4))
+             for number, query in enumerate(queries)]
+    poses = TimedPoses.from_samples(
+        [query.observation.stamp_ns for query in queries],
+        [[*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in given], 'here')
+    found = find_misfit(given_results('theirs', poses, queries), queries)
+    assert found.startswith(said and f'note: theirs: poses fit after one transform: {said}')
+    assert bool(found) == bool(said)
+    if 'frame' in said:
+        assert not find_misfit(given_results('theirs', poses, questions), questions)
 
 
 def test_the_table_in_latex():

@@ -12,6 +12,7 @@ from io import StringIO
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 from capture_folders import ASSETS, copy_walk
 from scipy.spatial.transform import Rotation
@@ -115,6 +116,43 @@ def test_phrases_of_a_user(recorded, tmp_path, capsys):
     assert 'note:' not in capsys.readouterr().out
     assert any('bands' in text for details in LandmarkMap.from_file(tmp_path / 'm.yaml').details
                for text, _ in details.labels)
+
+
+def takes_other_input(folder, order, scale):
+    """Return a copy of the demo's detector that takes channels in another order and scale."""
+    network = onnx.load(ASSETS / 'yolo.onnx')
+    graph, name = network.graph, network.graph.input[0].name
+    for node in graph.node:
+        node.input[:] = ['rgb' if given == name else given for given in node.input]
+    for value, key in ((np.float32(1 / scale), 'scale'), (np.array(order), 'order')):
+        graph.initializer.append(onnx.numpy_helper.from_array(np.asarray(value), key))
+    graph.node.insert(0, onnx.helper.make_node('Gather', ['scaled', 'order'], ['rgb'], axis=1))
+    graph.node.insert(0, onnx.helper.make_node('Mul', [name, 'scale'], ['scaled']))
+    onnx.save(network, folder / 'other.onnx')
+    return folder / 'other.onnx'
+
+
+@pytest.mark.parametrize(('order', 'scale', 'options', 'said'), [
+    ([0, 1, 2], 1, (), ''),
+    ([0, 1, 2], 255, (), 'with an input of RGB from 0 to 255: export it for RGB from 0 to 1'),
+    ([2, 1, 0], 1, (), 'finds more with an input of BGR from 0 to 1'),
+    ([2, 1, 0], 255, (), 'finds more with an input of BGR from 0 to 255'),
+    ([0, 1, 2], 1, ('--conf', '0.999'), 'does the place have objects of its classes, '),
+    ([0, 1, 2], 1, 'grey', 'boxes per image: the images are grey')])
+def test_an_input_that_does_not_suit_the_detector_is_named(tmp_path, caplog, order, scale, options,
+                                                           said):
+    """Also if the boxes of an earlier run are used."""
+    copy_walk(ASSETS / 'mapping', tmp_path / 'walk', 10)
+    for file in (tmp_path / 'walk/rgb').iterdir() if options == 'grey' else ():
+        cv2.imwrite(str(file), cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+    model = takes_other_input(tmp_path, order, scale)
+    for is_used_again in (False, True):
+        caplog.clear()
+        main(arguments('--tum', tmp_path / 'walk', '--model', model, '--no-clip', *ALL, '--out',
+                       tmp_path / 'map.yaml', *options * (options != 'grey')))
+        assert ('observations of an earlier run' in caplog.text) is is_used_again
+        assert ('note: the detector finds' in caplog.text) == bool(said)
+        assert said in caplog.text
 
 
 @pytest.mark.parametrize('seen', [0, 2])

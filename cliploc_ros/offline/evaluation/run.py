@@ -30,7 +30,7 @@ from cliploc_ros.offline import page as html
 from cliploc_ros.offline.datasets.poses import TimedPoses
 from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.methods import Method
-from cliploc_ros.offline.evaluation.trials import Result, given_results, run_trial
+from cliploc_ros.offline.evaluation.trials import Result, find_misfit, given_results, run_trial
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.units import NS_PER_S
 
@@ -153,8 +153,7 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     running
         trials, workers, scheduler, layer, noisy: see run_methods.
     """
-    others = [result for name, poses in given.items()
-              for result in given_results(name, poses, queries)]
+    of_others = {name: given_results(name, poses, queries) for name, poses in given.items()}
     swept = [replace(method, name=f'{method.name}{_AT}{count}',
                      options=replace(method.options, iterations=count))
              for method in methods if not method.draws_nothing
@@ -168,10 +167,11 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
                               advance=lambda results: bar.update(len(results)), **running)
     own = [result for result in results if _AT not in result.method]
     write_trajectories(out / 'trajectories', queries, own)
-    shown = [*own, *others]
+    shown = [*own, *chain.from_iterable(of_others.values())]
     summaries = summary.summarize(shown)
     rows = summary.table_rows(summaries)
-    remarks = [*remarks, *summary.notes(summaries)]
+    misfits = [find_misfit(its, queries) for its in of_others.values()]
+    remarks = [*remarks, *filter(None, misfits), *summary.notes(summaries)]
     if names := ', '.join(method.name for method in methods if method.accumulates):
         remarks.append(f'{names}: one localizer gets the queries in the order of their stamps, as '
                        'on a robot; its evidence about cameras and depth accumulates.')

@@ -5,7 +5,7 @@
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from cliploc_ros.core.map.joined_map import place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.offline.datasets.agreement import w_first
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.datasets.poses import TimedPoses, check_clock
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
@@ -32,6 +33,9 @@ from cliploc_ros.units import NS_PER_S
 GIVEN = 'given'
 #: Greatest difference in time between a query and its given pose [ms]: evo's default.
 GIVEN_TOLERANCE_MS = 10
+# Given poses with higher median errors [m] [deg] do not fit the truth, and a transform that fits
+# must divide these errors. At least and at most this many poses are compared. Chosen.
+_FITS, _BETTER, _LEAST_GIVEN, _COMPARED = (0.25, 5.0), 3.0, 4, 100
 
 
 @dataclass(frozen=True)
@@ -181,6 +185,47 @@ def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -
             name, 0, query.number, stamp_ns / NS_PER_S, len(query.observation.detections),
             solved=pose is not None, accepted=False, source=GIVEN, **_error(pose, query)))
     return results
+
+
+def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str:
+    """Return a note if poses of another program are wrong, but fit after one transform; else ''.
+
+    Quaternions may be w first, poses inverse, or those of another body or in another coordinate
+    frame.
+    """
+    pairs = [(result.map_from_camera, query.map_from_camera)
+             for result, query in zip(results, queries, strict=True) if result.solved]
+    pairs = pairs[::-(-len(pairs) // _COMPARED) or 1]
+    if len(pairs) < _LEAST_GIVEN:
+        return ''
+    given, truth = np.array(pairs).transpose(1, 0, 2, 3)
+
+    def errors_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the median errors (k, 2) of poses (k, n, 4, 4), in units of _FITS."""
+        cosines = (poses[..., :3, :3] * truth[:, :3, :3]).sum(axis=(-1, -2)) / 2 - 0.5
+        return np.median([np.linalg.norm((poses - truth)[..., :3, 3], axis=-1),
+                          np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))], axis=-1).T / _FITS
+
+    before = errors_of(given[None]).max()
+    # any transform fits poses of one place
+    moving = min(before, errors_of(truth[:, None]).max(axis=1).min())
+    readings = {'': given, 'quaternions are w first (first line of the file: # timestamp tx ty tz '
+                'qw qx qy qz)': np.array([*map(w_first, given)]),
+                'poses are inverse (map in camera)': np.linalg.inv(given)}
+    for of, (what, poses) in product(('', 'map from their frame', 'their body from camera'),
+                                     readings.items()):
+        moves = {'': np.eye(4)[None], 'map from their frame': truth @ np.linalg.inv(poses)}.get(
+            of, np.linalg.inv(poses) @ truth)
+        errors = errors_of(moves[:, None] @ poses if of.startswith('map') else
+                           poses @ moves[:, None]).max(axis=1)
+        if before > 1.0 and errors.min() < min(1.0, (moving if of else before) / _BETTER):
+            move = moves[errors.argmin()]
+            numbers = [*move[:3, 3], *transforms.quaternion_from_transform(move)]
+            of += of and ' x y z qx qy qz qw ' + ' '.join(f'{each:.4f}' for each in numbers)
+            return (f'note: {results[0].method}: poses fit after one transform: '
+                    f'{", ".join(filter(None, (what, of)))}; give poses of the camera (z forward) '
+                    'in the map, x y z qx qy qz qw')
+    return ''
 
 
 def _error(pose: NDArray[np.float64] | None, query: PosedQuery) -> dict[str, Any]:

@@ -13,9 +13,9 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from cliploc_ros.core.detector_check import in_words
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import PLAUSIBLE_DEPTH_M, depths_of_boxes
 from cliploc_ros.errors import DatasetError
@@ -30,6 +31,7 @@ from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
 from cliploc_ros.files.storage import parse_json, unfinished
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
+from cliploc_ros.models.onnx_detector import GREY, is_grey, load_detector
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from cliploc_ros.offline.datasets.bags import MOST_LEFT_OUT
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
@@ -45,6 +47,10 @@ logger = logging.getLogger(__name__)
 _BESIDE = '.cliploc-'
 # The unit of depth is checked in this number of frames.
 _FRAMES_FOR_UNIT = 10
+# With fewer boxes per image, a detector finds almost nothing. With fewer than the second number,
+# it is tried with other inputs on the first images. Another input is right if it multiplies the
+# scores by the last number. Chosen.
+_NOTHING, _FEW_BOXES, _FIRST, _MORE = 0.3, 6.0, 3, 2.5
 _UNKNOWN = np.full((4, 4), np.nan)
 
 
@@ -138,6 +144,7 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
                 old, new = recorded.odom_from_camera, linked.odom_from_camera
                 if new is not None and (old is None or not np.array_equal(old, new, True)):
                     save_observations(file, linked)
+                _tell_about_networks(frames, options.detector, linked)
                 return linked
             logger.warning('recording again, because the options changed: %s', file)
         except DatasetError as error:
@@ -148,7 +155,30 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
             frames, options, described, outputs, outputs.path == path), odometry)
     save_observations(file, recorded)
     logger.warning('wrote %s', file)
+    _tell_about_networks(frames, options.detector, recorded)
     return recorded
+
+
+def _tell_about_networks(frames: Frames, options: DetectorOptions, recorded: PosedDetections
+                         ) -> None:
+    """Tell if the images are grey, or the detector finds few boxes; try it with other inputs."""
+    share, images, hint = len(recorded.classes) / max(1, len(recorded)), list[Any](), ''
+    with suppress(DatasetError):  # such an image is left out of the recording, too
+        images += (raw.color()[0] for raw in islice(frames.read_raw(lambda *_: True), _FIRST))
+    if images and all(map(is_grey, images)):
+        hint = GREY
+    elif images and share < _FEW_BOXES:
+        detector = load_detector(options)
+        scores = detector.scores_by_input(images)
+        own, best = next(iter(scores)), max(scores, key=lambda name: scores[name])
+        if scores[best] > _MORE * max(scores[own], _NOTHING * len(images)):
+            hint = (f'the detector finds more with an input of {best}: export it for {own}, or '
+                    'correct preprocessor_config.json')
+        elif share < _NOTHING:
+            hint = (f'does the place have objects of its classes, {in_words(detector.class_names)}'
+                    '? Give another --model, or a lower --conf')
+    if hint:
+        logger.warning('note: the detector finds %.1f boxes per image: %s', share, hint)
 
 
 def _with_odometry(recorded: PosedDetections, odometry: Mapping[str, Poses] | None
