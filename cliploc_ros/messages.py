@@ -42,6 +42,10 @@ _SAME_ASPECT = 0.02
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
 # JPEG markers that are followed by the image size.
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+# Baselines of a stereo pair [m]: poses are off, and the unit is certainly wrong.
+_BASELINE_M, _MOST_BASELINE_M = 0.02, 3.0
+# Names of the second camera of a stereo pair in those of coordinate frames.
+_SECOND = re.compile('(?<!up)right|second|infra_?2|bottom|(^|[_/])r([_/]|$)', re.IGNORECASE)
 #: Messages of sensor_msgs, of the classes of rclpy or of rosbags
 type ImageMessage = Any
 type CompressedImageMessage = Any
@@ -193,6 +197,20 @@ def camera_from_msg(msg: CameraInfoMessage, image_size: tuple[int, int], rectifi
         raise CameraError(f'camera_info: {name}: {error}') from error
 
 
+def camera_from_frame(msg: CameraInfoMessage) -> NDArray[np.float64]:
+    """Return the pose (4, 4) of the message's coordinate frame in the camera's optical centre.
+
+    P of the second camera of a stereo pair projects points of the first camera's frame, and the
+    messages of both cameras name this frame (REP 104, image_geometry). Some drivers name a frame
+    of the second camera instead; by such a name, the camera is in its frame.
+    """
+    pose, p = np.eye(4), np.reshape(msg.p, (3, 4))
+    if np.isfinite(p).all() and p[0, 0] > 0.0 and p[1, 1] > 0.0 \
+            and not _SECOND.search(msg.header.frame_id):
+        pose[:2, 3] = p[0, 3] / p[0, 0], p[1, 3] / p[1, 1]
+    return pose
+
+
 def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool
                           ) -> list[Fault]:
     """Return contradictory or implausible fields of a message, certain faults first.
@@ -207,8 +225,14 @@ def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: boo
         fx=columns * camera.fx, fy=rows * camera.fy, cx=columns * camera.cx + roi.x_offset,
         cy=rows * camera.cy + roi.y_offset)
     k, r, p = (np.reshape(matrix, (3, -1)) for matrix in (msg.k, msg.r, msg.p))
+    beside_m, frame = float(np.linalg.norm(p[:2, 3])) / max(p[0, 0], 1e-6), msg.header.frame_id
+    beside = [Fault(
+        f'P is that of the second camera of a stereo pair, {beside_m:.2g} m beside the first: '
+        f"'{frame}' is taken for the frame of the {'second' if _SECOND.search(frame) else 'first'}"
+        '; if it is the other, set P[3] and P[7] to 0, or correct frame_id',
+        beside_m > _MOST_BASELINE_M)] if beside_m > _BASELINE_M else []
     return [fault._replace(text=f'camera_info: {fault.text}')
-            for fault in calibration_faults(sensor, k, r, p, rectified)]
+            for fault in [*calibration_faults(sensor, k, r, p, rectified), *beside]]
 
 
 def faults_of_headers(image: str, camera_info: str, detections: str = '') -> list[Fault]:

@@ -278,7 +278,8 @@ def _odometry(options: argparse.Namespace) -> dict[str, Poses] | None:
     return {name: bag_poses.bag_odometry(
         options.bag, bag_frames.topic_of(name, options.image), _pose_source(
             options, name, mount, round(options.max_gap * NS_PER_S), topic,
-            options.odometry_frame)) for name, mount in _mounts(options).items()}
+            options.odometry_frame), '' if options.intrinsics else bag_frames.topic_of(
+                name, options.camera_info)) for name, mount in _mounts(options).items()}
 
 
 def _depth_format(options: argparse.Namespace) -> frames.DepthFormat:

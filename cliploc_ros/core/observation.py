@@ -6,6 +6,7 @@ It consists of detections and their similarity to each label, depth, vertical, o
 prior.
 """
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -116,6 +117,15 @@ class Observation:
     #: None for a camera without depth.
     depths: NDArray[np.float64] | None = None
     region: Region | None = None  #: Where the robot probably is; None if unknown
+    #: (3,): the z axis of base_frame, a unit vector in the camera's optical coordinate frame; None
+    #: without a base_frame
+    base_up_in_camera: NDArray[np.float64] | None = None
+
+    def base_tilt_deg(self, map_from_camera: NDArray[np.float64]) -> float:
+        """Return the tilt of base_frame at a pose (4, 4) [deg]; 0 without a base_frame."""
+        up = self.base_up_in_camera
+        return 0.0 if up is None else math.degrees(math.acos(
+            np.clip(map_from_camera[2, :3] @ up, -1.0, 1.0)))
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

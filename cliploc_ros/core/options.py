@@ -18,7 +18,7 @@ CROPS = ('all', 'on_demand')
 _CHOICES = {'matching': MATCHINGS, 'algorithm': ALGORITHMS, 'crops': CROPS}
 _RANGES = {'k': (1, math.inf), 'iterations': (1, 1_000_000), 'iou_threshold': (0.0, 1.0),
            'time_budget_s': (0.0, math.inf), 'max_tilt_deg': (0.0, 180.0),
-           'tilt_deviation_deg': (0.0, 60.0), 'vertical_deviation_deg': (0.01, 45.0),
+           'tilt_deviation_deg': (0.1, 60.0), 'vertical_deviation_deg': (0.01, 45.0),
            'min_inliers': (3, math.inf), 'min_confidence': (0.0, 1.0)}
 
 
@@ -106,8 +106,9 @@ class RelocalizerOptions:
             raise OptionsError(f"algorithm '{self.algorithm}' needs similarities, but matching "
                                "'class' has none: set algorithm to auto, bf or ransac")
         for name, (low, high) in _RANGES.items():
-            if not low <= (value := getattr(self, name)) <= high:
-                raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}')
+            or_0 = ', or be 0' if name == 'tilt_deviation_deg' else ''
+            if not low <= (value := getattr(self, name)) <= high and not (or_0 and value == 0.0):
+                raise OptionsError(f'{name}: {value} must lie within {low:g} and {high:g}{or_0}')
         heights = self.height_range_m
         if len(heights) != 2 or not heights[0] < heights[1]:
             raise OptionsError(f'height_range_m: {list(heights)} must be a lower and a higher '

@@ -190,13 +190,14 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
         _expect(bool(np.isfinite(rows).all()), 'crops')
         similarities = rows if kind == 'similarities' else CropSimilarities(rows, LabelEmbeddings(
             np.empty((0, rows.shape[1]), np.float32), np.empty(0, np.int64)))
-    up, odom, depths = (None if known[name] is None else _numbers(
+    up, odom, depths, base_up = (None if known.get(name) is None else _numbers(
         known[name], *shape, nan=name == 'depths') for name, shape in (
-            ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,))))
+            ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,)),
+            ('base_up_in_camera', (3,))))
     return Observation(
         Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
         similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,
-        float(_numbers(known['odom_way_m'])), compared, depths, region)
+        float(_numbers(known['odom_way_m'])), compared, depths, region, base_up)
 
 
 def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:

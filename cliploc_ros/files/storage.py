@@ -53,9 +53,9 @@ def open_file(path: str | os.PathLike[str]) -> BinaryIO:
         if stat.S_ISREG(mode):
             file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb')
             mode = os.fstat(file.fileno()).st_mode
-            if stat.S_ISREG(mode):
-                # OSError: a stream of the kernel, such as /proc/kmsg, with nothing to read now
-                os.pread(file.fileno(), 1, 0)
+            # a stream of the kernel, such as /proc/kmsg, has no size, but content or an OSError
+            if stat.S_ISREG(mode) and (
+                    not os.pread(file.fileno(), 1, 0) or os.fstat(file.fileno()).st_size):
                 return file
             file.close()
     except ValueError as error:  # a null byte, or invalid UTF-8

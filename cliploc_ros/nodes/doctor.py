@@ -184,7 +184,8 @@ class Doctor(RelocalizerNode):
         if frame is not None and image is not None and parameters.base_frame:
             with report.failing('tf'):
                 base_from_camera = invert_transform(self._robot.at(
-                    image, parameters.of_camera(frame.camera)).camera_from_base)
+                    image, parameters.of_camera(frame.camera), info=frame.camera_info
+                    ).camera_from_base)
                 if parameters.publish_tf:
                     self._robot.transforms.lookup(image.frame_id, parameters.odom_frame,
                                                   image.stamp, patience_s, 'correct odom_frame')
@@ -244,9 +245,9 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
                     Verdict.ACCEPTED, Verdict.WITHHELD)):  # it no longer uses its last pose
                 given = [parameter for parameter in given if parameter.name != 'last_pose_file']
             # missing inputs of an active relocalizer are reported by the checks below
-            report.judge('relocalizer', values.get('wrong cameras', '')
-                         if values['state'] == 'active' else status.problem(),
-                         f'{name} is active')
+            report.judge('relocalizer', '; '.join(filter(None, (
+                values.get('wrong cameras'), values.get('rival of publish_tf'))))
+                         if values['state'] == 'active' else status.problem(), f'{name} is active')
     except NotRunningError as error:
         return report.add('relocalizer', State.FAIL, str(error))
     finally:

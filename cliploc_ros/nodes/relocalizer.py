@@ -152,6 +152,9 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             missing.append(no_localizer)
         self._frames.examine(health, parameters.stale_after_s)
         self._robot.examine(health)
+        rival = self._map_to_odom.rival(parameters.odom_frame) if parameters.publish_tf else ''
+        if rival:
+            health.warn(rival)
         health.values |= {'frames skipped while busy': self._newest.dropped,
                           'last verdict': self._last_verdict, **self._verdicts,
                           **self._counters.values(),
@@ -159,7 +162,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                               parameters.map_file, *parameters.map_files])),
                           'base frame': parameters.base_frame,
                           'time limit [s]': parameters.timeout_s,
-                          'missing': '; '.join(missing)}
+                          'missing': '; '.join(missing), 'rival of publish_tf': rival}
         self._watcher.examine(health)
         localizer = self._pipeline.localizer  # read once, because a cleanup may drop it
         if localizer is not None:

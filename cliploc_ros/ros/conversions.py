@@ -47,9 +47,8 @@ def detections_to_msg(detections: Detections, header: Header) -> Detection2DArra
         bbox = BoundingBox2D(size_x=right - left, size_y=bottom - top)
         bbox.center.position.x, bbox.center.position.y = (left + right) / 2, (top + bottom) / 2
         hypothesis = ObjectHypothesis(class_id=class_id, score=float(score))
-        msg.detections.append(Detection2D(
-            header=header, bbox=bbox,
-            results=[ObjectHypothesisWithPose(hypothesis=hypothesis)]))
+        msg.detections.append(Detection2D(header=header, bbox=bbox, results=[
+            ObjectHypothesisWithPose(hypothesis=hypothesis)]))
     return msg
 
 

@@ -9,8 +9,7 @@ import hashlib
 import logging
 import math
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -145,9 +144,6 @@ class FrameLocalizer:
         found = self.answer(query, parameters.options(), times, deadline)
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest
-        if (found.accepted and found.map_from_camera is not None
-                and parameters.base_frame not in ('', frame.image.header.frame_id)):
-            self.instants.check_axes(frame, known.state, found.map_from_camera)
         # the result of a request that is late is not published, and must not advance the filter
         for_filter = self.localizer.covariance_for_filter(found) if (
             found.accepted and parameters.mode == 'continuous'
@@ -252,13 +248,6 @@ class Instants:
         return Query((*others, newest), images, run, parameters.fuse_frames,
                      parameters.fuse_window_s)
 
-    def check_axes(self, frame: Frame, state: RobotState, map_from_camera: NDArray[np.float64]
-                   ) -> None:
-        """Raise CameraError if an accepted pose (4, 4) shows that the mount has a body's axes."""
-        with self._keeping(frame.camera):
-            check_faults(faults_of_axes(frame.image.header.frame_id, state.camera_from_base,
-                                        map_from_camera))
-
     def explained(self, found: Relocalization) -> Relocalization:
         """Return a result; a refusal gets the faults of the newest frames as further reasons."""
         if found.accepted:
@@ -276,7 +265,7 @@ class Instants:
     def _observed(self, frame: Frame, parameters: RelocalizerParameters, state: RobotState,
                   by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
         """Return the image of a frame and its detections, without crops."""
-        with self._keeping(frame.camera):
+        try:
             image = image_from_msg(frame.image)
             height, width = image.shape[:2]
             camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
@@ -290,6 +279,9 @@ class Instants:
                 *(faults_of_axes(image_frame, state.camera_from_base)
                   if parameters.base_frame not in ('', image_frame) else [])]
             check_faults(faults)
+        except CliplocError as error:
+            self._faults[frame.camera] = [Fault(str(error), True)]
+            raise
         self._faults[frame.camera] = faults
         detections = given.usable(camera.width, camera.height, parameters.max_detections)
         self._detector.add(given, detections)
@@ -311,40 +303,31 @@ class Instants:
         except CliplocError as error:
             self.note(f'localizing without depth: {error}')
         return image, Observation(
-            camera, detections, stamp_ns=frame.stamp_ns,
-            camera_name=frame.camera, up_in_camera=state.up_in_camera, depths=depths,
-            odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m)
-
-    @contextmanager
-    def _keeping(self, camera: str) -> Iterator[None]:
-        """Store a CliplocError of the body as a fault of a camera."""
-        try:
-            yield
-        except CliplocError as error:
-            self._faults[camera] = [Fault(str(error), True)]
-            raise
+            camera, detections, stamp_ns=frame.stamp_ns, camera_name=frame.camera,
+            up_in_camera=state.up_in_camera, depths=depths,
+            odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m,
+            base_up_in_camera=state.camera_from_base[:3, 2]
+            if parameters.base_frame not in ('', image_frame) else None)
 
 
 def _run_of(state: RobotState) -> int | None:
     return None if state.place is None else state.place.run
 
 
-def faults_of_axes(frame_id: str, camera_from_base: NDArray[np.float64],
-                   map_from_camera: NDArray[np.float64] | None = None) -> list[Fault]:
+def faults_of_axes(frame_id: str, camera_from_base: NDArray[np.float64]) -> list[Fault]:
     """Return a fault if the mount (4, 4) shows that images are in a frame with a body's axes.
 
     The axes of a body are x ahead, y left, z up (REP 103), those of a camera x right, y down, z
-    ahead. A camera that looks at the ceiling has a similar mount, so the fault is a suspicion. It
-    is certain if the camera's pose (4, 4) in the map implies that the robot lies on its side.
+    ahead. A camera that looks at the ceiling has a similar mount, so the fault is a suspicion.
+    Poses at which the robot would lie on its side are refused with it.
     """
-    _, y, z = up_in_camera = camera_from_base[:3, 2]
+    _, y, z = camera_from_base[:3, 2]
     if z < _LEAST_Z or abs(y) > _MOST_Y:
         return []
     return [Fault(
         f"by its mount, '{frame_id}' has the axes of a body, x ahead and z up: the camera would "
         f'look up by {math.degrees(math.asin(min(1.0, z))):.0f} degrees; publish images in the '
-        'optical frame, or correct tf or base_from_camera',
-        map_from_camera is not None and float(map_from_camera[2, :3] @ up_in_camera) < _LEAST_Z)]
+        'optical frame, or correct tf or base_from_camera', False)]
 
 
 def load_localizer(node: Node, parameters: RelocalizerParameters,

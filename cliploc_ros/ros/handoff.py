@@ -10,7 +10,8 @@ pose that the localizer publishes proves that it took the given pose.
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -24,6 +25,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.time import Time
 from rclpy.timer import Timer
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
@@ -58,6 +60,8 @@ _UPDATE_PATIENCE_S = 2.0
 # Period of broadcasts. Each is stamped with the time of the next one, so that a lookup at the
 # present time does not wait.
 _PERIOD_S = 0.1
+# A transform of another node counts for this time: SLAM and AMCL broadcast at 1 Hz or more.
+_RIVAL_S = 3.0
 
 
 class HandOffError(CliplocError):
@@ -122,10 +126,8 @@ class HandOff:
         if not self._publisher.get_subscription_count():
             return (f'nobody subscribes to {self._publisher.topic_name}: start the localizer '
                     '(AMCL), then retry; without one, set require_localizer: false')
-        if self._subscription is not None and not self._node.count_publishers(self._pose_topic):
-            return (f'nobody publishes {self._pose_topic}: start the localizer (AMCL); if it has '
-                    'just started, retry; or set localizer_pose to the topic of its pose')
-        return ''
+        return '' if self._subscription is None else not_one_publisher(
+            self._pose_topic, self._node.get_publishers_info_by_topic(self._pose_topic))
 
     def hand_over(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
                   deadline: float, received_at: float, jumps: TimeJumps) -> None:
@@ -241,7 +243,7 @@ class HandOff:
             return 'too little time is left for the localizer to take the pose: retry'
         if shown is None:
             return (f'{why}no message on {self._pose_topic} since initialpose was published '
-                    f'{times} times: check that the localizer is active and receives scans')
+                    f'{times} times: {silence_of_localizer(self._node)}')
         given = self._carried(given, shown.header.stamp)
         return f'{why}{self._pose_topic} {difference(given, shown)}'
 
@@ -250,8 +252,7 @@ class HandOff:
 
         Without a publisher of odometry, the robot is assumed to be at rest.
         """
-        odometry = self._odometry.recent(_MAX_ODOM_AGE_S,
-                                         min(_ODOM_PATIENCE_S, _left_s(deadline)))
+        odometry = self._odometry.recent(_MAX_ODOM_AGE_S, min(_ODOM_PATIENCE_S, _left_s(deadline)))
         if odometry is None:
             if not self._odometry.is_published:
                 self._node.get_logger().warning(
@@ -312,6 +313,25 @@ class HandOff:
             if self._stopped.wait(_UPDATE_PERIOD_S):
                 return ''
         return ''
+
+
+def not_one_publisher(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
+    """Return why the topic of the localizer's pose has no single source; empty if it has one."""
+    # by name: a localizer that was killed and started again may be listed twice
+    names = {f'{one.node_namespace.rstrip("/")}/{one.node_name}' for one in publishers}
+    if len(names) > 1:
+        return f'{len(names)} nodes publish {topic}: {", ".join(sorted(names))}; stop all but one'
+    return '' if names else (
+        f'nobody publishes {topic}: start the localizer (AMCL); if it has just started, retry; or '
+        'set localizer_pose to the topic of its pose')
+
+
+def silence_of_localizer(node: Node) -> str:
+    """Return what to do about a localizer that publishes no pose."""
+    topic = node.resolve_topic_name('map')
+    no_map = '' if node.count_publishers(topic) else (
+        f'nobody publishes {topic}, without which AMCL has no pose: start its map server; ')
+    return f'{no_map}check that the localizer is active and receives scans'
 
 
 def _left_s(deadline: float) -> float:
@@ -379,6 +399,25 @@ class MapToOdom:
         self._transform: TransformStamped | None = None
         self._jumped_at = -math.inf
         self._began_ns = 0
+        # Stamps of the newest own broadcasts [ns], and of each coordinate frame the parent in the
+        # newest transform of another node, and until when it counts (monotonic clock) [s].
+        self._sent: deque[int] = deque(maxlen=100)
+        self._others: dict[str, tuple[str, float]] = {}
+        transforms.on_transform = self.hear
+
+    def hear(self, transform: TransformStamped, is_static: bool) -> None:
+        """Process a transform that any node broadcasts."""
+        child, stamp = transform.child_frame_id.lstrip('/'), stamp_ns(transform.header.stamp)
+        if is_static or stamp not in self._sent:
+            until = math.inf if is_static else time.monotonic() + _RIVAL_S
+            self._others[child] = transform.header.frame_id, until
+
+    def rival(self, odom_frame: str) -> str:
+        """Return that another node broadcasts the pose of a frame, and what to do; else ''."""
+        parent, until = self._others.get(odom_frame.lstrip('/'), ('', -math.inf))
+        return '' if time.monotonic() > until else (
+            f"another node broadcasts the transform '{parent}' -> '{odom_frame}', so publish_tf "
+            'pauses: stop that node (SLAM or a localizer), or set publish_tf: false')
 
     def open(self) -> None:
         """Start broadcasting as soon as there is a pose.
@@ -421,12 +460,15 @@ class MapToOdom:
         Raises
         ------
         NoTransformError
-            The robot's pose by odometry is unknown; the former transform is kept.
+            The robot's pose by odometry is unknown, and the former transform is kept; or another
+            node broadcasts the transform.
         TimeJumpError
             Time has jumped or odometry has restarted since the image.
         """
         if self._timer is None:
             return
+        if rival := self.rival(parameters.odom_frame):
+            raise NoTransformError(rival)
         base_from_odom = self._transforms.lookup(parameters.base_frame, parameters.odom_frame,
                                                  header.stamp, parameters.tf_timeout_s,
                                                  'correct odom_frame')
@@ -439,12 +481,13 @@ class MapToOdom:
     def _broadcast(self) -> None:
         with self._lock:
             transform = self._transform
-            if transform is None:
+            if transform is None or self.rival(transform.child_frame_id):
                 return
             until = (self._node.get_clock().now() + Duration(seconds=_PERIOD_S)).to_msg()
             if transform.header.stamp == until:
                 return  # simulated time is paused; tf2 warns of repeated stamps
             transform.header.stamp = until
+            self._sent.append(stamp_ns(until))
             self._broadcaster.sendTransform(transform)
 
 

@@ -63,8 +63,7 @@ class DetectorParameters(CommonParameters):
     """The parameters of the detector."""
 
     profile: str = parameter('balanced',
-        'Detector, if model is empty.', choices=PROFILE_NAMES,
-        read_only=True)
+        'Detector, if model is empty.', choices=PROFILE_NAMES, read_only=True)
     model: str = parameter('',
         'An ONNX file or a folder with one, OWNER/NAME on the Hugging Face hub, or YOLO weights '
         "(.pt); empty: the profile's model.", read_only=True)
@@ -76,8 +75,7 @@ class DetectorParameters(CommonParameters):
     text_model: str = parameter('',
         'File with the text tower of YOLO-World (CLIP ViT-B-32) or YOLOE (mobileclip_blt.ts); '
         'empty: download it once.', read_only=True)
-    conf: float = parameter(0.1,
-        'Drop detections below this confidence.', low=0.0, high=1.0)
+    conf: float = parameter(0.1, 'Drop detections below this confidence.', low=0.0, high=1.0)
     iou: float = parameter(0.7,
         'If two boxes of one class have a greater IoU, drop the less confident box.', low=0.0,
         high=1.0)
@@ -124,8 +122,7 @@ class RelocalizerParameters(CommonParameters):
     algorithm: str = parameter('auto',
         'Order of minimal samples; auto: compatible samples, most likely first; bf: brute force, '
         "all samples; the others are the paper's.", choices=ALGORITHMS)
-    k: int = parameter(3,
-        'Landmarks retrieved for each crop.', low=1, high=1000)
+    k: int = parameter(3, 'Landmarks retrieved for each crop.', low=1, high=1000)
     iterations: int = parameter(10_000,
         'Greatest number of minimal samples per frame.', low=1, high=1_000_000)
     iou_threshold: float = parameter(0.2,
@@ -139,20 +136,19 @@ class RelocalizerParameters(CommonParameters):
         'Source of the vertical: base_frame (the robot stands upright) or the topic imu. Two '
         'objects then suffice.', choices=('none', 'base_frame', 'imu'), read_only=True)
     tilt_deviation_deg: float = parameter(40.0,
-        "Standard deviation of the camera's tilt if the vertical is unknown; 0: all tilts are "
-        'equally likely.', unit='deg', low=0.0, high=60.0)
+        "Standard deviation of the camera's tilt if the vertical is unknown, at least 0.1; 0: all "
+        'tilts of camera and base_frame are equally likely.', unit='deg', low=0.0, high=60.0)
     vertical_deviation_deg: float = parameter(1.0,
         'Standard deviation of the vertical; use 2 for a moving accelerometer without gyroscope.',
         unit='deg', low=0.01, high=45.0)
     height_range_m: list[float] = parameter([0.0, 0.0],
-        'Least and greatest height of the camera in the map; equal values: any height.', unit='m')
+        'Least and greatest height of the camera in the map; equal values: any height.', unit='m',
+        low=-1e5, high=1e5)
     max_tilt_deg: float = parameter(180.0,
         'Greatest tilt of the camera from upright; 180: any tilt.', unit='deg', low=0.0,
         high=180.0)
-    refine: bool = parameter(True,
-        'Refine the best poses with all inliers; the paper does not.')
-    min_inliers: int = parameter(3,
-        'Refuse a pose with fewer inliers.', low=3, high=1000)
+    refine: bool = parameter(True, 'Refine the best poses with all inliers; the paper does not.')
+    min_inliers: int = parameter(3, 'Refuse a pose with fewer inliers.', low=3, high=1000)
     min_confidence: float = parameter(0.9,
         'Refuse a pose with a lower probability of being within 1 m of the truth.', low=0.0,
         high=1.0)
@@ -169,7 +165,7 @@ class RelocalizerParameters(CommonParameters):
         low=0.0, high=1.0, read_only=True)
     mount_deviation: list[float] = parameter([0.01, 0.5],
         'Standard deviations of the mounts of several cameras, position [m] and rotation [deg] '
-        'per axis.')
+        'per axis.', low=0.0, high=1000.0)
     depth_transport: str = parameter('none',
         "Depth of an RGB-D camera: 'raw' on the topic depth, 'compressed' on "
         'depth/compressedDepth.', choices=('none', 'raw', 'compressed'), read_only=True)
@@ -185,8 +181,7 @@ class RelocalizerParameters(CommonParameters):
     max_detections: int = parameter(50,
         'Use at most this many detections, the most confident.', low=3, high=1000)
     profile: str = parameter('balanced',
-        'Encoder, if none is named below.', choices=PROFILE_NAMES,
-        read_only=True)
+        'Encoder, if none is named below.', choices=PROFILE_NAMES, read_only=True)
     clip_model: str = parameter('',
         'Architecture of open_clip weights, or a model config (.json); not needed for ONNX files.',
         read_only=True)
@@ -206,14 +201,13 @@ class RelocalizerParameters(CommonParameters):
         'Greatest size of record_folder.', unit='MiB', low=1, high=1_000_000)
     rectified: bool = parameter(False,
         'The image is rectified: use P of camera_info and no distortion.')
-    base_frame: str = parameter('',
-        'Coordinate frame whose pose is published; empty: the camera.')
+    base_frame: str = parameter('', 'Coordinate frame whose pose is published; empty: the camera.')
     base_from_camera: list[float] = parameter([0.0] * 7,
         'Mount of the camera on base_frame: x, y, z [m] and quaternion x, y, z, w. Several '
-        'cameras: seven numbers for each. All zeros: look it up in tf2.', unit='m', repeats=True)
+        'cameras: seven numbers for each. All zeros: look it up in tf2.', unit='m', low=-1000.0,
+        high=1000.0, repeats=True)
     max_speed_m_s: float = parameter(0.1,
-        'Withhold initialpose while the robot is faster by odom.', unit='m/s', low=0.0,
-        high=100.0)
+        'Withhold initialpose while the robot is faster by odom.', unit='m/s', low=0.0, high=100.0)
     max_turn_rad_s: float = parameter(0.2,
         'Withhold initialpose while the robot turns faster by odom.', unit='rad/s', low=0.0,
         high=100.0)
@@ -227,10 +221,9 @@ class RelocalizerParameters(CommonParameters):
         "Topic of the localizer's pose, which must agree with initialpose; empty: any subscriber "
         'of initialpose suffices.', read_only=True)
     publish_tf: bool = parameter(False,
-        'Broadcast map -> odom_frame (REP 105) after an accepted pose. Only if no other localizer '
-        'broadcasts it.', read_only=True)
-    odom_frame: str = parameter('odom',
-        'Coordinate frame of odometry, for publish_tf.')
+        'Broadcast map -> odom_frame (REP 105) after an accepted pose. It pauses while another '
+        'node broadcasts it.', read_only=True)
+    odom_frame: str = parameter('odom', 'Coordinate frame of odometry, for publish_tf.')
     watch: str = parameter('none',
         "Check the localizer's pose continuously: map -> base_frame in tf2, or the topic "
         'localizer_pose.', choices=('none', 'tf', 'amcl_pose'), read_only=True)

@@ -43,8 +43,7 @@ _LOG_PERIOD_S = 5.0
 
 def overridable(*but: QoSPolicyKind) -> QoSOverridingOptions:
     """Return options that allow users to override all policies except `but`."""
-    return QoSOverridingOptions(
-        policy_kinds=[kind for kind in _OVERRIDABLE if kind not in but])
+    return QoSOverridingOptions(policy_kinds=[kind for kind in _OVERRIDABLE if kind not in but])
 
 
 class AdaptiveSubscription:
@@ -138,8 +137,7 @@ class AdaptiveSubscription:
                     return
                 self._renewed_at = now
                 self._renew(self._subscription)
-            self._node.get_logger().warning(
-                f'an empty message on {self._topic}: subscribed again')
+            self._node.get_logger().warning(f'an empty message on {self._topic}: subscribed again')
             return
         try:
             message = deserialize_message(data, self._message_type)

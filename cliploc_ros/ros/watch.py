@@ -31,7 +31,7 @@ from cliploc_ros.errors import CliplocError, StoppedError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer
 from cliploc_ros.ros.conversions import pose_from_msg, stamp_ns
-from cliploc_ros.ros.handoff import HandOff, HandOffError
+from cliploc_ros.ros.handoff import HandOff, HandOffError, not_one_publisher, silence_of_localizer
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
@@ -217,8 +217,7 @@ class Watcher:
     def _look(self, stopped: threading.Event) -> Time | None:
         """Check the localizer's pose with one frame; return its stamp, None without a check."""
         begun_at, age = time.monotonic(), self._age
-        frame = self._frames.next_frame(begun_at, begun_at + _FRAME_PATIENCE_S, 0.0,
-                                        cameras=1)
+        frame = self._frames.next_frame(begun_at, begun_at + _FRAME_PATIENCE_S, 0.0, cameras=1)
         localizer = self._pipeline.localizer
         if localizer is None:
             raise StoppedError('the node was deactivated')
@@ -230,7 +229,8 @@ class Watcher:
         # The watch needs odometry even if fuse_frames is 1.
         parameters = replace(self._node.settings.snapshot().of_camera(frame.camera),
                              fuse_frames=MAX_FRAMES)
-        state = self._robot.at(image, parameters, depth_frame=frame.depth_frame)
+        state = self._robot.at(image, parameters, depth_frame=frame.depth_frame,
+                               info=frame.camera_info)
         pose = self._pose.at(image, state, parameters, [
             part.landmark_map.frame_id for part in parts_of(localizer.landmark_map)])
         self._had_pose = True
@@ -422,13 +422,8 @@ class LocalizerPose:
                   ) -> tuple[str, NDArray[np.float64]]:
         topic = self._topic = self._node.resolve_topic_name(parameters.localizer_pose)
         publishers = self._node.get_publishers_info_by_topic(topic)
-        if not publishers:
-            raise NoLocalizerPoseError(f'nobody publishes {topic}: start the localizer (AMCL), or '
-                                       'set localizer_pose to the topic of its pose')
-        if len(publishers) > 1:
-            names = ', '.join(sorted(publisher.node_name for publisher in publishers))
-            raise NoLocalizerPoseError(f'{len(publishers)} publishers of {topic} ({names}): stop '
-                                       'all but one')
+        if problem := not_one_publisher(topic, publishers):
+            raise NoLocalizerPoseError(problem)
         publisher = bytes(publishers[0].endpoint_gid)
         self._shown_by = self._shown_by or publisher
         if self._shown_by != publisher:
@@ -465,6 +460,6 @@ class LocalizerPose:
                     then.place.odom_from_frame @ then.camera_from_base))
         if place.way_m - anchor.way_m > _SILENT_WAY_M:
             raise NoLocalizerPoseError(
-                f'no message on {topic} for {place.way_m - anchor.way_m:.1f} m of driving: check '
-                'that the localizer is active and receives scans')
+                f'no message on {topic} for {place.way_m - anchor.way_m:.1f} m of driving: '
+                f'{silence_of_localizer(self._node)}')
         return frame_id, anchor.map_from_odom @ place.odom_from_frame

@@ -116,7 +116,7 @@ def test_all_that_is_known_comes_back(tmp_path):
     region = Region('map', np.array([0.1, 0.2, 0.3]), np.diag([1.0, 2.0, 3.0]), 0.7)
     pose = make_transform(np.eye(3), np.array([0.1, 0.0, 1e-17]))
     first = query(up_in_camera=np.array([0.0, -1.0, 0.0]), odom_from_camera=pose, odom_way_m=0.1,
-                  stamp_ns=7, region=region,
+                  stamp_ns=7, region=region, base_up_in_camera=np.array([0.0, 0.0, 1.0]),
                   depths=np.where(np.arange(len(SEEN)) % 2, 1.0 / 3.0, np.nan),
                   similarities=CropSimilarities(np.eye(12, 16, dtype=np.float32)[:2], LABELS),
                   compared=np.array([3, 1]), camera_name='front')

@@ -85,6 +85,9 @@ WEAK = {
     'linked': ({'linked': 0.5}, RefusalKind.FRAMES_DISAGREE),
     'crops': ({'likely': 0.95, 'crops_left': 12}, RefusalKind.NOT_ALL_CROPS),
     'inliers': ({'inliers': 2}, RefusalKind.TOO_FEW_OBJECTS),
+    'leaning': ({'tilt_deg': 59.0}, None), 'lying': ({'tilt_deg': 61.0}, RefusalKind.WRONG_MOUNT),
+    'vertical': ({'likely': 0.1, 'rival': Rival(0.9, (9.0, 9.0, 9.0), is_tilted=True)},
+                 RefusalKind.WRONG_MOUNT),
     # keyframes that are sure replace what objects lack
     'points': (LACKING | {'by_points': 0.99, 'camera_fault': 'boxes'}, None),
     'few points': (LACKING | {'by_points': 0.89}, RefusalKind.SEARCH_CUT_SHORT)}
@@ -103,6 +106,7 @@ def test_a_refusal_names_the_evidence_that_decided(what):
     ({'likely': 0.98}, {'min_confidence': 0.99}, RefusalKind.UNEXPLAINED),
     ({'coverage': 0.5, 'tried': 5000}, {'algorithm': 'bf'}, RefusalKind.SEARCH_CUT_SHORT),
     ({'meetings': 0.1}, {'algorithm': 'ransac'}, RefusalKind.SEARCH_CUT_SHORT),
+    ({'tilt_deg': 180.0}, {'tilt_deviation_deg': 0.0}, None),
     ({}, {'iterations': 499, 'algorithm': 'b-prosac'}, RefusalKind.SEARCH_CUT_SHORT)])
 def test_options_decide_what_a_pose_needs(fields, options, kind):
     refused = refusal(replace(SURE, **fields), RelocalizerOptions(**options))

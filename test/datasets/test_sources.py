@@ -160,6 +160,18 @@ def test_tf_is_composed_at_the_stamp_of_the_image(tmp_path):
     np.testing.assert_allclose(frame.map_from_camera, pose_at(0.2), atol=1e-9)
 
 
+def test_the_second_camera_of_a_stereo_pair_is_beside_its_frame(tmp_path):
+    *image, info = camera_messages(START, np.zeros((48, 64, 3), np.uint8), CAMERA)
+    p = np.array([50.0, 0.0, 31.5, -6.0, 0.0, 50.0, 23.5, 0.0, 0.0, 0.0, 1.0, 0.0])
+    bag = write_messages(tmp_path / 'bag', [*image, (*info[:3], replace(info[3], p=p)),
+                                            *moving_tf()])
+    frames = bag_frames(bag, BagTopics(), of_tf('map', 1000))
+    odometry = bag_odometry(bag, '/image', of_tf('odom', 200), '/camera_info')
+    for pose in (next(frames.read()).map_from_camera, odometry.pose_at(START)):
+        np.testing.assert_allclose(pose, pose_at(0.32), atol=1e-9)
+    assert 'second camera of a stereo pair, 0.12 m' in ' '.join(frames.notes)
+
+
 def test_odometry_is_read_from_tf(tmp_path):
     bag = write_bag(tmp_path / 'bag', [450], moving_tf())
     odometry = bag_odometry(bag, '/image', of_tf('odom', 200))

@@ -16,9 +16,15 @@ from disks import read_only_disk, small_disk
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import WorkersError, run_tasks
-from cliploc_ros.files.storage import is_foreign
+from cliploc_ros.files.storage import is_foreign, read_file
 
 PROJECT = Path(__file__).resolve().parents[2]
+
+
+def test_a_stream_of_the_kernel_is_no_file():
+    """Its size is 0, and reading it may give nothing, or not end."""
+    with pytest.raises(OSError, match='not a regular file'):
+        read_file('/proc/self/status')
 
 
 def open_log(path):

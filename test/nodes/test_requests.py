@@ -7,11 +7,13 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from diagnostic_msgs.srv import SelfTest
+from frames import header_of, messages_of
 from processes import PROJECT
-from scene import MAP_FROM_CAMERA, make_room, see_room
-from tester import make_frame, transform_of
+from scene import CAMERA, MAP_FROM_CAMERA, make_room, rigid, see_room
+from tester import PIXELS, make_frame, transform_of
 
 from cliploc_ros.core.geometry import transforms
 from cliploc_ros.ros.qos import LATCHED
@@ -115,3 +117,15 @@ def test_frames_out_of_order_and_time_going_back(relocalizer, tester):
     tester.feed_until(future.done, [newer[0], older[0], older[1], newer[1], older[2]])
     assert future.result().success
     tester.wait(lambda: tester.poses[-1].header.stamp.sec == 70, 'the older frame')
+
+
+@pytest.mark.parametrize(('frame_id', 'moved_m'), [('camera', 0.0), ('right_camera', 0.12)])
+def test_the_second_camera_of_a_stereo_pair(relocalizer, tester, frame_id, moved_m):
+    """P[3] puts it beside the frame of the first camera, unless the frame is its own."""
+    seen = see_room(make_room(), MAP_FROM_CAMERA @ rigid((0.12, 0.0, 0.0)))
+    p = np.c_[CAMERA.matrix, [-0.12 * CAMERA.fx, 0.0, 0.0]].ravel()
+    assert tester.relocalize(messages_of(seen, header_of(10**11, frame_id), PIXELS, info={'p': p})
+                             ).success
+    tester.wait(lambda: tester.poses, 'the pose')
+    assert transforms.pose_error(transform_of(tester.poses[0].pose.pose),
+                                 MAP_FROM_CAMERA @ rigid((moved_m, 0.0, 0.0)))[0] < 0.03

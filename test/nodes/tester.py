@@ -206,4 +206,6 @@ def make_frame(detections=None, stamp_s=100.0):
 
 def class_matching(room_map, **parameters):
     """Return parameters of a relocalizer that needs no network."""
-    return {'map_file': room_map, 'matching': 'class', 'algorithm': 'bf', **parameters}
+    # the z axis of the room's map does not point up
+    return {'map_file': room_map, 'matching': 'class', 'algorithm': 'bf',
+            'tilt_deviation_deg': 0.0, **parameters}

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
+from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.errors import CameraError
 from cliploc_ros.ros.frame_localizer import load_localizer
@@ -66,9 +67,22 @@ def test_a_mount_of_body_axes_is_refused_where_the_pose_contradicts_it(make_node
         turn * Rotation.from_quat(room.quats_xyzw)).as_quat()), tmp_path / 'room.yaml')
     localizer = load_localizer(make_node(), values)
     values = replace(values, base_frame='base_link')
-    with pytest.raises(CameraError, match="'camera' has the axes of a body"):
-        localize(localizer, make_frame(), values)
-    assert [fault.is_certain for fault in localizer.instants.faults] == [True]
+    found = localize(localizer, make_frame(), values)
+    assert found.refusal_kind is RefusalKind.WRONG_MOUNT
+    assert "'camera' has the axes of a body" in found.reason
+
+
+def test_a_robot_on_its_head_is_refused_and_named(make_node, values):
+    """A driver turns the image upright, tf says that the camera is upside down."""
+    turned = np.diag([1.0, -1.0, -1.0, 1.0])
+    for gravity, up in (('none', None), ('base_frame', turned[:3, 2])):
+        asked = replace(values, base_frame='base_link', gravity=gravity, algorithm='auto')
+        localizer = load_localizer(make_node(), asked)
+        known = KnownBefore(RobotState(turned, up))
+        found = localizer.localize(make_frame(), asked, known, timer()).found
+        assert found.refusal_kind is RefusalKind.WRONG_MOUNT
+        report = localizer.look(make_frame(), asked, known.state, 'map', MAP_FROM_CAMERA)
+        assert 'tilted by 174 degrees' in report.fault
 
 
 def test_options_hold_from_the_next_frame_on(localizer, values):

@@ -217,13 +217,22 @@ def showing(served):
 
 
 @pytest.mark.parametrize(('off_m', 'timeout_s', 'named', 'times'), [
-    (0.0, 3.2, '', 1), (4.7, 3.2, r'4\.70 m', 3), (math.nan, 3.2, 'no message on', 3),
+    (0.0, 3.2, '', 1), (4.7, 3.2, r'4\.70 m', 3),
+    (math.nan, 3.2, r'nobody publishes /map, .* receives scans', 3),
     (math.nan, 0.3, 'too little time', 0)])
 def test_a_localizer_has_taken_the_pose_once_it_shows_it(showing, off_m, timeout_s, named, times):
     showing.localizer.off_m = off_m
     with pytest.raises(handoff.NoLocalizerError, match=named) if named else nullcontext():
         showing.hand_over(timeout_s)
     assert len(showing.localizer.poses) == times
+
+
+def test_two_localizers_are_named(showing, make_node):
+    make_node('slam').create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
+    showing.wait(showing.handoff.missing, 'the second localizer')
+    with pytest.raises(handoff.NoLocalizerError, match='2 nodes publish /amcl_pose: /amcl, /slam'):
+        showing.hand_over(1.0)
+    assert not showing.localizer.poses
 
 
 def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):

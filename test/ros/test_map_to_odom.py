@@ -3,6 +3,8 @@
 """map -> odom, and transforms before and after a jump; mostly with the real tf2_ros."""
 
 import time
+from copy import deepcopy
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -119,6 +121,22 @@ def test_a_jump_or_a_restart_ends_the_broadcast_until_the_next_pose(robot, resta
                              PARAMETERS, time.monotonic())
     robot.spin_until(lambda: robot.heard, 'map -> odom again')
     assert robot.heard[-1].transform.translation.x == pytest.approx(4.0 if x_m is None else 3.0)
+
+
+def test_map_to_odom_pauses_while_another_node_broadcasts_it(make_node):
+    frames, sent = CoordinateFrames(node := make_node()), []
+    map_to_odom = MapToOdom(node, frames)
+    map_to_odom._broadcaster = SimpleNamespace(sendTransform=lambda t: sent.append(deepcopy(t)))
+    map_to_odom._transform, map_to_odom._timer = moving(100.0, 0.0, 'map', 'odom'), 'open'
+    map_to_odom._broadcast()
+    frames.on_transform(sent[0], False)
+    frames.on_transform(moving(100.0, 0.0), False)
+    assert map_to_odom.rival('odom') == '', 'its own transform, and that of odometry'
+    frames.on_transform(moving(100.0, 0.0, 'map', '/odom'), False)
+    map_to_odom._broadcast()
+    assert len(sent) == 1
+    with pytest.raises(NoTransformError, match=r"'map' -> 'odom'.*publish_tf"):
+        map_to_odom.update(Header(frame_id='map'), np.eye(4), PARAMETERS, 0.0)
 
 
 @pytest.mark.needs('tf2_ros')

@@ -123,6 +123,7 @@ NAMES = ParameterRow('names', [''], 'Some texts.')
     (TEXT, 1, 'str, not int'), (CHOICE, 'compresed', "mean 'compressed'"), (COUNT, 0, '1 to 10'),
     (COUNT, 11, '1 to 10'), (COUNT, 3.0, 'int, not float'), (COUNT, True, 'int, not bool'),
     (LENGTH, math.nan, 'nan'), (MOUNT, [1.0], '2 finite'), (MOUNT, [1.0, -math.inf], '2 finite'),
+    (ParameterRow('span', [0.0], '', low=0.0, high=2.0), [3.0], '0 to 2'),
     (MOUNT, '12', '2 finite'), (NAMES, ['a', 1], 'texts'), (NAMES, 'a', 'texts')])
 def test_a_bad_value_is_refused_by_name_and_with_what_is_allowed(row, value, message):
     with pytest.raises(OptionsError, match=message) as raised:
@@ -161,6 +162,7 @@ def test_the_methods_options_are_parameters_of_equal_defaults_and_limits():
     ({'matching': 'class', 'algorithm': 'b-prosac'}, "'b-prosac' needs "),
     *(({'class_map': text}, 'class_map') for text in ('tv', 'tv=', '=tv', 'a=b, a=c')),
     ({'height_range_m': [2.0, 1.0]}, 'height_range_m'), ({'gravity': 'base_frame'}, 'base_frame'),
+    *(({'tilt_deviation_deg': value}, '0.1 and 60, or be 0') for value in (1e-308, 0.09, 61.0)),
     ({'publish_tf': True}, 'publish_tf'), ({'mount_deviation': [-1.0, 0.0]}, 'mount_deviation'),
     ({'base_from_camera': [0.0] * 6 + [2.0]}, 'base_from_camera')])
 def test_values_that_do_not_fit_together(changes, message):

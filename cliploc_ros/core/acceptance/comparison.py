@@ -238,6 +238,7 @@ class Comparison:
             unexplained=best.support.unexplained, signs=self._signs(best), motion=self._motion(),
             not_mirrored=self._not_mirrored(by_points), uncontradicted=self._uncontradicted(),
             recognized=self.place, prior=self.contenders[0].prior,
+            tilt_deg=self._last.base_tilt_deg(self.poses[0]),
             earlier=self._looks.earlier(self._last, self.poses[0]), crops_left=0
             if self._last.compared is None
             else len(self._last.detections) - len(self._last.compared))
@@ -299,7 +300,7 @@ class Comparison:
         place = place_of(self._joined.landmark_map, self.poses[row])
         same_source = self.by_objects if self.contenders[row].recognized is None else self.place
         return Rival(min(float(self.likely[row]), 1.0 - float(self.likely[0])), place.position,
-                     place.name, same_source is None)
+                     place.name, same_source is None, not self.contenders[row].is_upright)
 
     @cached_property
     def _by_points(self) -> float:

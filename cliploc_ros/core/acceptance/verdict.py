@@ -44,6 +44,8 @@ class RefusalKind(StrEnum):
     CHANGED = auto()
     #: Boxes, camera_info and map do not agree, or no look has verified that they do.
     WRONG_CAMERA = auto()
+    #: The robot would lie on its side or head: the mount or the image is turned.
+    WRONG_MOUNT = auto()
     #: The request timed out before a frame was localized.
     TIME_UP = auto()
     #: The map has none of the detector's classes, or no score or box is usable.
@@ -86,6 +88,7 @@ class Rival:
     map: str = ''  #: Name of its map if there are several
     #: Whether keyframes propose one of the two poses and objects the other
     is_other_source: bool = False
+    is_tilted: bool = False  #: Whether the pose contradicts the known vertical
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,7 @@ class Evidence:
     prior: float = 0.0  #: Log odds, at most 0, of the pose given the prior region
     #: Probability that odometry links all frames, see cliploc_ros.core.acceptance.links
     linked: float = 1.0
+    tilt_deg: float = 0.0  #: Tilt of the robot at the pose [deg]; 0 without a base_frame
     #: The earlier looks and their confidence in this pose
     earlier: tuple[EarlierLook, ...] = ()
     crops_left: int = 0  #: Number of crops that have not been compared with labels yet
@@ -197,10 +201,20 @@ def refusal(evidence: Evidence, options: RelocalizerOptions) -> Refusal | None:
                        f'{options.min_confidence:g} over the last {len(evidence.earlier) + 1} '
                        'frames of this view; move, or turn the camera')
     if refused or evidence.mean_confidence >= needed:
-        return refused
+        return refused or too_tilted(evidence.tilt_deg, options)
     return Refusal(RefusalKind.FRAMES_DISAGREE,
                    f'mean confidence {_rounded_down(evidence.mean_confidence)} < {needed:g} in '
                    f'this pose over the last {len(evidence.earlier) + 1} frames; {_LOOK_ABOUT}')
+
+
+def too_tilted(tilt_deg: float, options: RelocalizerOptions) -> Refusal | None:
+    """Return the refusal of a pose at which the robot is tilted by an angle [deg]; else None."""
+    most_deg = CALIBRATION.attitude.most_tilt_deg
+    if tilt_deg <= most_deg or options.tilt_deviation_deg == 0.0:
+        return None
+    return Refusal(RefusalKind.WRONG_MOUNT,
+                   f'the robot would be tilted by {tilt_deg:.0f} degrees > {most_deg:g}; correct '
+                   'tf or the turned image; if true: tilt_deviation_deg 0')
 
 
 def needed_confidence(evidence: Evidence, options: RelocalizerOptions) -> float:
@@ -275,6 +289,9 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
         apart = float(np.linalg.norm(np.subtract(rival.place, evidence.place)))
         kind = RefusalKind.CONTRADICTION
         cause = f'objects and keyframes give poses {apart:.2f} m apart; {_LOOK_ABOUT}'
+    elif rival.is_tilted and rival.likely > 0.5:
+        kind, cause = RefusalKind.WRONG_MOUNT, (
+            'the boxes fit a pose that contradicts the vertical; check tf, imu and the image')
     else:
         where = f' in {rival.map}' if rival.map else ''
         kind, cause = RefusalKind.AMBIGUOUS, (

@@ -39,8 +39,6 @@ _MOST_TURN_DEG = 1.0
 _AS_K, _NEAR_K = (0.98, 1.02, 0.02), (0.2, 1.7, 0.3)
 # Limits that distinguish another lens from the same lens at another resolution.
 _TIMES_K, _AS_SCALED = 1.2, 0.1
-# Baseline of a stereo pair from which on poses are off [m].
-_MOST_BESIDE_M = 0.02
 _CACHED = 64
 
 
@@ -153,9 +151,6 @@ def _doubts(rotation: NDArray[np.float64], projection: NDArray[np.float64], rect
                 and abs(projection[0, 1]) <= _MOST_SKEW * focal_px and projection[1, 0] == 0.0
                 and (projection[2] == (0.0, 0.0, 1.0, 0.0)).all()):
             yield 'P does not have the form [fx 0 cx Tx, 0 fy cy Ty, 0 0 1 0]: set it to K'
-        elif (beside_m := float(np.linalg.norm(projection[:2, 3])) / focal_px) > _MOST_BESIDE_M:
-            yield (f'P is that of the second camera of a stereo pair, {beside_m:.2g} m beside the '
-                   'first: the coordinate frame must be that of the second camera')
 
 
 def _contradiction(projection: NDArray[np.float64], matrix: NDArray[np.float64], sensor: Camera,

@@ -19,9 +19,10 @@ from cliploc_ros.files.storage import read_file
 _MAX_DEPTH = 16
 # Maximum number of values, keys and collections; PyYAML takes 3 us for each. A landmark has about
 # 30.
-_MAX_EVENTS = 6_000_000
-# Maximum number of collections in a list, such as the labels of a landmark as mappings.
-_MOST_IN_LIST = 1000
+_MAX_EVENTS = 2_000_000
+# Maximum number of collections in a list, such as the labels of a landmark as mappings, and of
+# plain values in a list or mapping, which end a hostile file early.
+_MOST_IN_LIST, _MOST_VALUES = 1000, 10_000
 # Words that YAML 1.1, and therefore ROS, reads as booleans.
 _TRUE = frozenset({'y', 'yes', 'true', 'on'})
 _FALSE = frozenset({'n', 'no', 'false', 'off'})
@@ -88,6 +89,9 @@ def _build_tree(text: str) -> Any:
             raise _TreeError(f'line {line}: an alias (*{event.anchor}) is not supported; repeat '
                              'the value')
         if isinstance(event, yaml.ScalarEvent):
+            outer, pending = stack[-1]
+            if len(outer) > _MOST_VALUES and (pending or isinstance(outer, list)):
+                raise _TreeError(f'line {line}: more than {_MOST_VALUES} values side by side')
             _add(stack[-1], _scalar(event), line)
         elif isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
             if len(stack) > _MAX_DEPTH:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.acceptance.verdict import too_tilted
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, is_rigid, pose_error
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
@@ -189,6 +190,8 @@ class Watch:
         odom = observation.odom_from_camera
         fault = '' if image is None else self._faults.add(
             image, map_from_camera if odom is None else odom)
+        if refused := too_tilted(observation.base_tilt_deg(map_from_camera), self._options):
+            fault = refused.reason
         self._belief.wait(observation, map_from_camera)
         if fault:
             return self._report(None, fault)

@@ -108,7 +108,8 @@ def bag_frames(bag: Path, topics: BagTopics, source: PoseSource,
     form = depth or DepthFormat()
     with BagReader(bag) as reader:
         _check_topics(reader, topics)
-        poses = poses_of_images(reader, topics.image, source, str(bag))
+        poses = poses_of_images(reader, topics.image, source, str(bag),
+                                topics.camera_info if topics.intrinsics is None else '')
         cameras = _Cameras.read(reader, topics)
         count, notes = reader.topic(topics.image).message_count, _notes(reader, topics)
         if topics.depth:
@@ -223,6 +224,8 @@ def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat
                 reader, depth)
             pose = poses.pose_at(bag_messages.stamp_ns(reader.first(topics.depth)))
             if pose is not None:
+                if topics.intrinsics is None:
+                    pose = messages.camera_from_frame(reader.first(topics.camera_info)) @ pose
                 return replace(form, camera=DepthCamera(fx, fy, cx, cy, pose))
             problem = 'tf between them does not cover the first depth image'
         except DatasetError as error:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros import messages
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.offline.datasets import bag_messages
@@ -312,17 +313,21 @@ def plain_name(frame_id: str) -> str:
     return frame_id.removeprefix('/')
 
 
-def bag_odometry(bag: Path, image_topic: str, source: PoseSource) -> Poses:
+def bag_odometry(bag: Path, image_topic: str, source: PoseSource, camera_info: str = ''
+                 ) -> Poses:
     """Read the poses of a recording's camera in the odometry frame.
 
     DatasetError: the topic or tf is missing or invalid, or does not overlap the images in time.
     """
     with BagReader(bag) as reader:
-        return poses_of_images(reader, image_topic, source, f'{bag}: odometry')
+        return poses_of_images(reader, image_topic, source, f'{bag}: odometry', camera_info)
 
 
-def poses_of_images(reader: BagReader, image_topic: str, source: PoseSource, where: str) -> Poses:
+def poses_of_images(reader: BagReader, image_topic: str, source: PoseSource, where: str,
+                    camera_info: str) -> Poses:
     """Read the poses of the camera of an image topic.
+
+    `camera_info` is the topic of the camera; '' or one that is missing: it is in its frame.
 
     DatasetError: the poses are missing or invalid, or do not overlap the images in time.
     """
@@ -330,4 +335,8 @@ def poses_of_images(reader: BagReader, image_topic: str, source: PoseSource, whe
     poses = source.read(reader, str(image.header.frame_id))
     first_ns = bag_messages.stamp_ns(image)
     check_clock(poses, first_ns, first_ns + reader.end_ns - reader.start_ns, where)
-    return poses
+    beside = messages.camera_from_frame(reader.first(camera_info))[:3, 3] \
+        if camera_info in reader.topics else np.zeros(3)
+    mount = TimedPoses(np.zeros(1, np.int64), -beside[None], np.array([[0.0, 0.0, 0.0, 1.0]]),
+                       tolerance_ns=_ALWAYS_NS)
+    return TransformChain((), (mount,), poses) if beside.any() else poses

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transforms: the camera's mount from parameters or tf2, all others from tf2."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,8 @@ class CoordinateFrames:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._buffer: Any = None
+        #: Called with each transform that is received, and whether it is static
+        self.on_transform: Callable[[TransformStamped, bool], None] = lambda *_: None
 
     def open(self) -> Any:
         """Subscribe to transforms, so that they are known when the first image arrives.
@@ -41,7 +44,7 @@ class CoordinateFrames:
         buffer = self._buffer
         if buffer is None:
             try:
-                buffer = self._buffer = _make_buffer(self._node)
+                buffer = self._buffer = _make_buffer(self._node, self)
             except ImportError as error:
                 raise NoTransformError('a transform is needed, but tf2_ros is not installed: '
                                        'install it, or set base_from_camera') from error
@@ -82,8 +85,7 @@ class CoordinateFrames:
         if not base_frame:
             return np.eye(4)
         if any(mount):
-            return invert_transform(transform_from_pose(np.array(mount[:3]),
-                                                        np.array(mount[3:])))
+            return invert_transform(transform_from_pose(np.array(mount[:3]), np.array(mount[3:])))
         return self.lookup(camera_frame, base_frame, stamp, timeout_s)
 
     def lookup(self, target_frame: str, source_frame: str, stamp: Time, timeout_s: float,
@@ -106,7 +108,7 @@ class CoordinateFrames:
         return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
 
 
-def _make_buffer(node: Node) -> Any:
+def _make_buffer(node: Node, frames: CoordinateFrames) -> Any:
     """Return a buffer of `/tf` and `/tf_static`; ImportError: tf2_ros is not installed."""
     from tf2_ros import Buffer, TransformListener
 
@@ -129,6 +131,12 @@ def _make_buffer(node: Node) -> Any:
             if self._stamps.goes_back(transform.child_frame_id, stamp_ns(transform.header.stamp)):
                 super().clear()
             super().set_transform(transform, authority)
+            frames.on_transform(transform, False)
+
+        def set_transform_static(self, transform: TransformStamped, authority: str) -> None:
+            """Add a static transform."""
+            super().set_transform_static(transform, authority)
+            frames.on_transform(transform, True)
 
         def clear(self) -> None:
             """Forget all transforms except static ones."""

@@ -339,8 +339,7 @@ class OdometrySource(qos.Listener):
             self.problem = why and \
                 f'the stamp of {self.topic} {why}: its driver must stamp each pose'
             if not why:
-                self._window.add(at_ns, np.array([p.x, p.y, p.z]),
-                                 np.array([q.x, q.y, q.z, q.w]))
+                self._window.add(at_ns, np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
             has_restarted = had_poses and self._window.run != run
             self._heard.notify_all()
         if has_restarted:

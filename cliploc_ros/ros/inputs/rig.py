@@ -206,8 +206,7 @@ class CameraRig:
         """
         fullest = max(({name: frame for name, frame in frames.items()
                         if name in names and frame.received_at >= after}
-                       for frames in reversed([*instants])),
-                      key=len, default={})
+                       for frames in reversed([*instants])), key=len, default={})
         return self._joined(fullest, names) if fullest else None
 
     def _joined(self, frames: Mapping[str, Frame], names: Collection[str]) -> Frame:

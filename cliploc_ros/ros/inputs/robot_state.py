@@ -16,12 +16,13 @@ from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import CameraInfo, Imu
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.observation import Region
 from cliploc_ros.errors import CliplocError
+from cliploc_ros.messages import camera_from_frame
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
@@ -204,8 +205,7 @@ def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
     mean = np.mean(ups, axis=0)
     length = float(np.linalg.norm(mean))
     if not length > _MIN_MEAN_LENGTH:
-        raise NoVerticalError(
-            'the IMU turns too fast: its orientations around the image differ')
+        raise NoVerticalError('the IMU turns too fast: its orientations around the image differ')
     return np.asarray(mean / length)
 
 
@@ -296,24 +296,26 @@ class RobotStateSource:
         `frame_ids` and `map_hash` are those of the loaded maps.
         """
         header = frame.image.header
-        state = self.at(header, parameters.of_camera(frame.camera), deadline, frame.depth_frame)
+        state = self.at(header, parameters.of_camera(frame.camera), deadline, frame.depth_frame,
+                        frame.camera_info)
         beside = []
         for other in frame.beside:
             soon = min(deadline, time.monotonic() + parameters.tf_timeout_s)
             try:
                 beside.append((other, self.at(other.image.header,
                                               parameters.of_camera(other.camera), soon,
-                                              other.depth_frame)))
+                                              other.depth_frame, other.camera_info)))
             except NoTransformError as error:
                 self._warn(other.camera, f'localizing without {other.camera}: {error}')
         return KnownBefore(state, beside, self.prior.region(
             header.stamp, parameters, state.camera_from_base, frame_ids, map_hash))
 
     def at(self, image: Header, parameters: RelocalizerParameters, deadline: float = math.inf,
-           depth_frame: str = '') -> RobotState:
+           depth_frame: str = '', info: CameraInfo | None = None) -> RobotState:
         """Return the robot's state at the stamp of an image.
 
-        Vertical, odometry, and the pose of unregistered depth are optional.
+        Vertical, odometry, and the pose of unregistered depth are optional. `info` of the second
+        camera of a stereo pair puts this camera beside its frame, see messages.camera_from_frame.
 
         The wait for the mount takes at most half of the time until `deadline` (monotonic clock)
         [s], so that half remains for a newer image.
@@ -332,7 +334,8 @@ class RobotStateSource:
                     raise
                 self._node.check_active()
                 time.sleep(_RETRY_S)
-        up_in_camera = None
+        from_frame = np.eye(4) if info is None else camera_from_frame(info)
+        camera_from_base, up_in_camera = from_frame @ camera_from_base, None
         try:
             up_in_camera = self.vertical.up_in_camera(parameters, camera_from_base,
                                                        image.frame_id, image.stamp)
@@ -342,21 +345,21 @@ class RobotStateSource:
         camera_from_depth = None
         if depth_frame not in ('', image.frame_id):
             with suppress(NoTransformError):  # depths_from_msg reports it
-                camera_from_depth = self._lookup(image, depth_frame, parameters)
-        return RobotState(camera_from_base, up_in_camera,
-                          self._place(image, parameters, camera_from_base), camera_from_depth)
+                camera_from_depth = from_frame @ self._lookup(image, depth_frame, parameters)
+        return RobotState(camera_from_base, up_in_camera, self._place(
+            image, parameters, camera_from_base, from_frame), camera_from_depth)
 
     def _place(self, image: Header, parameters: RelocalizerParameters,
-               camera_from_base: NDArray[np.float64]) -> OdometryPlace | None:
+               camera_from_base: NDArray[np.float64], from_frame: NDArray[np.float64]
+               ) -> OdometryPlace | None:
         if parameters.fuse_frames == 1:
             return None
         try:
             body = self.odometry.pose_at(image.stamp)
             self.problems.pop('odometry', None)
-            if body.frame == image.frame_id:
-                return body
-            camera_from_body = camera_from_base if body.frame == parameters.base_frame else \
-                self._lookup(image, body.frame, parameters)
+            camera_from_body = from_frame if body.frame == image.frame_id else \
+                camera_from_base if body.frame == parameters.base_frame else \
+                from_frame @ self._lookup(image, body.frame, parameters)
         except NoOdometryError as error:
             if self.odometry.is_published:
                 self.problems['odometry'] = f'localizing without odometry: {error}'

@@ -178,8 +178,7 @@ class Diagnostics:
         values = {'state': state, **health.values, 'memory [MiB]':
                   f'{pages * os.sysconf("SC_PAGE_SIZE") / 2**20:.0f}'}
         name = self._node.get_fully_qualified_name().lstrip('/')
-        status = DiagnosticStatus(
-            level=health.level, name=f'{name}: status', hardware_id=name,
+        status = DiagnosticStatus(level=health.level, name=f'{name}: status', hardware_id=name,
             message=health.message or state,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
         msg = DiagnosticArray(status=[status])

@@ -40,7 +40,8 @@ class ParameterRow:
     description: str
     #: SI symbol, px or ''.
     unit: str = ''
-    #: Range of a number, including both ends; both are infinite, or neither.
+    #: Range of a number, or of each number of a list, including both ends; both are infinite, or
+    #: neither.
     low: float = -math.inf
     high: float = math.inf
     #: The allowed values of a text; empty: any.
@@ -55,8 +56,6 @@ class ParameterRow:
         """Return a description of the allowed values."""
         if self.choices:
             return ', '.join(self.choices)
-        if isinstance(self.default, bool) or not isinstance(self.default, int | float):
-            return ''
         return '' if math.isinf(self.high) else f'{self.low:g} to {self.high:g}'
 
     @property
@@ -95,6 +94,8 @@ class ParameterRow:
                     self.repeats and value and len(value) % length == 0)):
                 raise OptionsError(f'{self.name}: must be {length} finite numbers')
             value = [float(item) for item in value]
+            if not all(self.low <= item <= self.high for item in value):
+                raise OptionsError(f'{self.name}: {value} must be {self.allowed}')
         if type(value) is not type(self.default):
             raise OptionsError(f'{self.name}: must be of type {type(self.default).__name__}, '
                                f'not {type(value).__name__} ({value!r:.60})')
