@@ -21,7 +21,6 @@ def verified_camera(monkeypatch):
     weights = np.zeros_like(camera_check._WEIGHTS)
     weights[0] = 1.0
     monkeypatch.setattr(camera_check, '_WEIGHTS', weights)
-    monkeypatch.setattr(camera_check, '_UNVERIFIED', -50.0)
 
 
 @pytest.fixture(scope='session')

@@ -38,7 +38,7 @@ def test_together_they_see_enough(rng):
     assert alone <= 3 < 5 <= together
 
 
-def test_cameras_of_one_instant_have_no_odometry_between_them(rng):
+def test_cameras_of_one_instant_have_no_odometry_between_them(rng, verified_camera):
     """Frames with equal names are from one camera that moved."""
     relocalizer = Relocalizer(MAP, replace(OPTIONS, mount_deviation=(0.0, 0.0)))
     frames = look(rng, objects=5)

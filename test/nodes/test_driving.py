@@ -57,7 +57,8 @@ def test_a_robot_that_sees_too_little_in_each_image_wakes_up(own_relocalizer, te
     covariance = np.array(tester.poses[-1].pose.covariance).reshape(6, 6)
     assert np.linalg.norm(error[:3]) < 0.05 and np.linalg.norm(error[3:]) < np.radians(1.0)
     assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.95, 6)
-    assert np.sqrt(np.diag(covariance)[:3]).max() < 1.0
+    # no look has verified the camera
+    assert np.sqrt(np.diag(covariance)[:3]).max() < 1.5
 
 
 def test_the_first_request_after_a_reset_is_right(own_relocalizer, tester, robot):

@@ -5,7 +5,7 @@
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -212,19 +212,24 @@ def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str
     readings = {'': given, 'quaternions are w first (first line of the file: # timestamp tx ty tz '
                 'qw qx qy qz)': np.array([*map(w_first, given)]),
                 'poses are inverse (map in camera)': np.linalg.inv(given)}
-    for of, (what, poses) in product(('', 'map from their frame', 'their body from camera'),
-                                     readings.items()):
-        moves = {'': np.eye(4)[None], 'map from their frame': truth @ np.linalg.inv(poses)}.get(
-            of, np.linalg.inv(poses) @ truth)
-        errors = errors_of(moves[:, None] @ poses if of.startswith('map') else
-                           poses @ moves[:, None]).max(axis=1)
-        if before > 1.0 and errors.min() < min(1.0, (moving if of else before) / _BETTER):
+    candidates: list[tuple[str, str, NDArray[np.float64], NDArray[np.float64]]] = []
+    for reading, poses in readings.items():
+        inverse = np.linalg.inv(poses)
+        left, right = truth @ inverse, inverse @ truth
+        candidates += [('', reading, np.eye(4)[None], poses[None]),
+                       ('map from their frame', reading, left, left[:, None] @ poses),
+                       ('their body from camera', reading, right, poses @ right[:, None])]
+    # a reading that fits alone needs no transform
+    for name, reading, moves, moved in sorted(candidates, key=lambda one: bool(one[0])):
+        errors = errors_of(moved).max(axis=1)
+        if before > 1.0 and errors.min() < min(1.0, (moving if name else before) / _BETTER):
             move = moves[errors.argmin()]
             numbers = [*move[:3, 3], *transforms.quaternion_from_transform(move)]
-            of += of and ' x y z qx qy qz qw ' + ' '.join(f'{each:.4f}' for each in numbers)
+            transform = name and f'{name} x y z qx qy qz qw ' + ' '.join(
+                f'{each:.4f}' for each in numbers)
             return (f'note: {results[0].method}: poses fit after one transform: '
-                    f'{", ".join(filter(None, (what, of)))}; give poses of the camera (z forward) '
-                    'in the map, x y z qx qy qz qw')
+                    f'{", ".join(filter(None, (reading, transform)))}; give poses of the camera '
+                    '(z forward) in the map, x y z qx qy qz qw')
     return ''
 
 

@@ -144,7 +144,6 @@ def record_once(frames: Frames, options: RecordingOptions, file: Path | None = N
                 old, new = recorded.odom_from_camera, linked.odom_from_camera
                 if new is not None and (old is None or not np.array_equal(old, new, True)):
                     save_observations(file, linked)
-                _tell_about_networks(frames, options.detector, linked)
                 return linked
             logger.warning('recording again, because the options changed: %s', file)
         except DatasetError as error:
