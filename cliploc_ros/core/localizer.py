@@ -297,11 +297,9 @@ class Localizer:
         crops = self._crops_of(query, row, source, not compares_all, begin_stage)
         if crops is None or not options.needs_similarities:
             return frame
-        if compares_all:
-            every = np.arange(len(frame.detections))
-            return replace(frame, similarities=crops.compare(every), compared=None)
-        rows = crops.known if frame.compared is None else frame.compared
-        return replace(frame, similarities=crops.compare(rows), compared=rows)
+        rows = None if compares_all else crops.known if frame.compared is None else frame.compared
+        return replace(frame, compared=rows, similarities=crops.compare(
+            np.arange(len(frame.detections)) if rows is None else rows))
 
     def _crops(self, query: Query, source: CropSource | None, deadline: float,
                begin_stage: Callable[[str], None]) -> tuple[Observation, Crops | None]:
@@ -417,7 +415,7 @@ class Localizer:
         if found.map_from_camera is not None and found.evidence is not None:
             self._looks = self._looks.with_look(Look(
                 replace(newest, similarities=None, compared=None), found.map_from_camera,
-                found.evidence.with_right_camera.confidence, found.recognized,
+                replace(found.evidence, camera=1.0).confidence, found.recognized,
                 found.evidence.confidence), found.accepted)
         return found
 

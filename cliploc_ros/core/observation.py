@@ -92,6 +92,13 @@ class Region:
         check_planar(self.covariance)
 
 
+def tilt_deg(map_from_camera: NDArray[np.float64], up_in_camera: NDArray[np.float64] | None
+             ) -> float:
+    """Return the angle of a direction (3,) to the vertical at a pose (4, 4) [deg]; unknown: 0."""
+    return 0.0 if up_in_camera is None else math.degrees(math.acos(
+        np.clip(map_from_camera[2, :3] @ up_in_camera, -1.0, 1.0)))
+
+
 @dataclass(frozen=True)
 class Observation:
     """The detections of a frame, with its camera, time and other input."""
@@ -120,12 +127,6 @@ class Observation:
     #: (3,): the z axis of base_frame, a unit vector in the camera's optical coordinate frame; None
     #: without a base_frame
     base_up_in_camera: NDArray[np.float64] | None = None
-
-    def base_tilt_deg(self, map_from_camera: NDArray[np.float64]) -> float:
-        """Return the tilt of base_frame at a pose (4, 4) [deg]; 0 without a base_frame."""
-        up = self.base_up_in_camera
-        return 0.0 if up is None else math.degrees(math.acos(
-            np.clip(map_from_camera[2, :3] @ up, -1.0, 1.0)))
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

@@ -218,11 +218,11 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
         read = (np.lib.format.read_array_header_1_0 if version == (1, 0)
                 else np.lib.format.read_array_header_2_0)
         shape, _, dtype = read(stream)
-        start = stream.tell()
-    if dtype.hasobject:
-        raise ValueError('it contains Python objects')
-    if (size := math.prod(shape) * dtype.itemsize) != member.file_size - start:
-        raise ValueError(f'it has {member.file_size - start} bytes, expected {size}')
-    with archive.open(member) as stream:
+        size, expected = member.file_size - stream.tell(), math.prod(shape) * dtype.itemsize
+        if dtype.hasobject:
+            raise ValueError('it contains Python objects')
+        if size != expected:
+            raise ValueError(f'it has {size} bytes, expected {expected}')
+        stream.seek(0)
         array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
     return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array

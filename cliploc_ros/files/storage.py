@@ -246,21 +246,19 @@ def _alone_in(folder: Path) -> Iterator[bool]:
     """
     descriptor, deadline = os.open(folder, os.O_RDONLY | os.O_CLOEXEC), time.monotonic() + _TURN_S
     try:
-        while True:
+        can_lock = True
+        while can_lock:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
             except BlockingIOError:
                 if time.monotonic() > deadline:
                     raise OSError(errno.EBUSY, 'another program has been writing there for '
                                                f'{_TURN_S:g} s') from None
                 time.sleep(_TURN_POLL_S)
             except OSError:  # some network file systems cannot lock folders
-                is_alone = False
-                break
-            else:
-                is_alone = True
-                break
-        yield is_alone
+                can_lock = False
+        yield can_lock
     finally:
         os.close(descriptor)
 

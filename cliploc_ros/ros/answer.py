@@ -175,22 +175,20 @@ class RequestCounters:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._counts: Counter[str] = Counter()
-        self._kinds: Counter[RefusalKind] = Counter()
+        self._counts = Counter[str]()
 
     def add(self, answer: Answer) -> None:
         """Count a request."""
         with self._lock:
-            self._counts[answer.verdict] += 1
-            if answer.kind is not None:
-                self._kinds[answer.kind] += 1
+            self._counts.update(['requests', f'requests {answer.verdict}',
+                                 *([f'refused: {answer.kind}'] if answer.kind else [])])
 
     def values(self) -> dict[str, object]:
         """Return the counts since the start of the node."""
         with self._lock:
-            return {'requests': self._counts.total(),
-                    **{f'requests {verdict}': self._counts[verdict] for verdict in Verdict},
-                    **{f'refused: {kind}': self._kinds[kind] for kind in RefusalKind}}
+            return {name: self._counts[name] for name in (
+                'requests', *(f'requests {verdict}' for verdict in Verdict),
+                *(f'refused: {kind}' for kind in RefusalKind))}
 
 
 class CaseRecorder:

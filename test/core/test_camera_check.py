@@ -247,7 +247,7 @@ def drawn(rng, count, low, high):
 def test_boxes_end_at_the_border_of_their_image(low, high, is_other, rng):
     extent = Extent()
     for _ in range(8):
-        extent.add(drawn(rng, 8, low, high))
+        extent = extent.with_boxes(drawn(rng, 8, low, high))
     evidence = extent.log_odds(CAMERA)
     assert evidence == CALIBRATION.camera.extent if is_other else evidence < 1.0
 
@@ -279,7 +279,7 @@ def test_a_view_that_stays_the_same_has_no_border(rng):
     corners = rng.uniform(100.0, 250.0, (8, 2))
     extent, boxes = Extent(), np.hstack([corners, corners + rng.uniform(40.0, 160.0, (8, 2))])
     for _ in range(50):
-        extent.add(boxes + rng.normal(0.0, 0.5, boxes.shape))
+        extent = extent.with_boxes(boxes + rng.normal(0.0, 0.5, boxes.shape))
     assert extent.log_odds(CAMERA) < 1.0
 
 

@@ -35,7 +35,7 @@ from cliploc_ros.errors import OptionsError
 
 
 def test_rare_classes_come_first_and_nothing_twice():
-    index = ClassIndex.of(('a', 'a', 'a', 'b'))
+    index = ClassIndex.of(('a', 'a', 'a', 'b'), {})
     rare = frame_search.class_candidates(index, index.classes_of(('a', 'b', 'a')), 100)
     assert rare.pairs.tolist() == [[1, 3], [0, 0], [0, 1], [0, 2], [2, 0], [2, 1], [2, 2]]
     similarities = np.array([[0.1, 0.9, 0.2, 0.3]] * 3, dtype=np.float32)

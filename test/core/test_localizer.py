@@ -486,7 +486,7 @@ def test_doubts_about_the_camera_count_for_the_view_alone(office_map, office_fra
         office_frames[0][0].observation, np.random.default_rng(0)), odom_from_camera=np.eye(4)),)))
     look, = session._looks.past
     assert look.doubted == found.evidence.confidence < 0.9 < look.confidence
-    assert look.confidence == found.evidence.with_right_camera.confidence
+    assert look.confidence == replace(found.evidence, camera=1.0).confidence
 
 
 def test_a_changed_option_keeps_the_evidence(session):

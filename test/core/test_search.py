@@ -14,7 +14,7 @@ from scene import CAMERA, MAP_FROM_CAMERA, make_room, see_room
 from cliploc_ros.core.geometry.ellipse import ellipse_iou, iou_bound
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.search import strategies
-from cliploc_ros.core.search.frame_search import balanced_order, nearest_candidates, prosac_order
+from cliploc_ros.core.search.frame_search import balanced_order, nearest_candidates
 from cliploc_ros.core.search.scene import Constraint, make_scene
 from cliploc_ros.core.search.screening import make_hypothesis, set_up, verify_beyond
 
@@ -221,7 +221,7 @@ def golden_scenes(office, office_map, queries, observed):
 
 def test_orders_and_masks_are_identical(golden_scenes):
     for _, nearest, potential, values in golden_scenes:
-        assert (prosac_order(nearest).pairs == values['prosac']).all()
+        assert (nearest.ordered(-nearest.similarities).pairs == values['prosac']).all()
         assert (balanced_order(nearest).pairs == values['bprosac']).all()
         assert (potential == values['vmask'].astype(bool)).all()
 

@@ -30,7 +30,7 @@ from cliploc_ros.core.acceptance.look_alikes import lead_over_twin, turned_about
 from cliploc_ros.core.acceptance.looks import EarlierLook
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, Rival, refusal
 from cliploc_ros.core.calibration import CALIBRATION, FILE
-from cliploc_ros.core.fit.covariance import share_within
+from cliploc_ros.core.fit.covariance import shares_within
 from cliploc_ros.core.fit.succession import succeed
 from cliploc_ros.core.geometry.transforms import RIGHT_M
 from cliploc_ros.core.keyframes.places import RecognizedPlace
@@ -129,8 +129,8 @@ def test_the_confidence_counts_the_published_covariance(verified_camera):
     found = Relocalizer(scenes.ROOM, scenes.BY_CLASS).relocalize(
         [scenes.observe(scenes.ROOM, rows=range(4))])
     assert found.evidence.near < 1.0
-    assert found.evidence.near == share_within(
-        RIGHT_M, CALIBRATION.covariance.caution * found.covariance)
+    assert found.evidence.near == shares_within(
+        RIGHT_M, CALIBRATION.covariance.caution * found.covariance[None, :3, :3])
 
 
 def mirrored(observation):
@@ -193,11 +193,10 @@ def test_the_more_a_camera_is_tilted_the_more_speaks_against_it(axis):
                                           (0.4, 0.4, 0.01)])
 def test_the_share_within_a_distance_is_that_of_drawn_positions(deviations_m, rng):
     turn = Rotation.random(random_state=1).as_matrix()
-    covariance = np.eye(6)
-    covariance[:3, :3] = turn @ np.diag(np.square(deviations_m)) @ turn.T
+    covariance = turn @ np.diag(np.square(deviations_m)) @ turn.T
     drawn = rng.normal(size=(200_000, 3)) * deviations_m
     share = (np.linalg.norm(drawn, axis=1) < 1.0).mean()
-    assert share_within(1.0, covariance) == pytest.approx(share, abs=0.04)
+    assert shares_within(1.0, covariance[None]) == pytest.approx(share, abs=0.04)
 
 
 @pytest.mark.parametrize('matching', ['hybrid', 'class'])

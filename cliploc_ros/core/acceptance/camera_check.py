@@ -269,21 +269,15 @@ class Views(NamedTuple):
             for near in SAME_PLACE.agreeing(self.poses))
 
 
-class Extent:
+class Extent(NamedTuple):
     """The area that the boxes of a camera cover, over accepted and refused frames."""
 
-    def __init__(self) -> None:
-        self.boxes = np.empty((0, 4))  #: (n, 4) [px]
+    boxes: NDArray[np.float64] = np.empty((0, 4))  #: (n, 4) [px]
 
-    def add(self, boxes: NDArray[np.float64]) -> None:
-        """Add the boxes (n, 4) of a frame; boxes that were seen before are not added again."""
+    def with_boxes(self, boxes: NDArray[np.float64]) -> 'Extent':
+        """Return this area with the boxes (n, 4) of a frame, without boxes seen before."""
         is_known = (box_ious(boxes, self.boxes) > _TERMS.same_box).any(axis=1)
-        self.boxes = np.concatenate([self.boxes, boxes[~is_known]])[-int(_TERMS.most_boxes):]
-
-    @property
-    def reach(self) -> NDArray[np.float64]:
-        """Return the bounding box (4,) of all boxes: left, top, right, bottom [px]."""
-        return np.append(self.boxes[:, :2].min(axis=0), self.boxes[:, 2:].max(axis=0))
+        return Extent(np.concatenate([self.boxes, boxes[~is_known]])[-int(_TERMS.most_boxes):])
 
     def log_odds(self, camera: Camera) -> float:
         """Return the log odds, at least 0, that the boxes are in the pixels of another image."""
@@ -319,7 +313,7 @@ class _Record:
     def see(self, observation: Observation) -> None:
         """Add the boxes of a frame, unless looks have verified the camera."""
         if self.by_looks.log_odds > _TERMS.fits or self.by_extent > 0.0:
-            self.extent.add(observation.detections.bboxes_xyxy)
+            self.extent = self.extent.with_boxes(observation.detections.bboxes_xyxy)
             self.by_extent = self.extent.log_odds(self.camera)
             self.odds = self.views.odds(self.by_extent)
 
@@ -339,12 +333,6 @@ class _Record:
                 self.views, self.since = self.since, Views()
         self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds()
 
-    def copied(self) -> '_Record':
-        """Return a copy of the state. Views and boxes are shared, as they are never modified."""
-        same = copy(self)
-        same.extent = copy(self.extent)
-        return same
-
     def fields(self) -> dict[str, Any]:
         """Return the state as lists and numbers."""
         return {'camera': asdict(self.camera), 'boxes': self.extent.boxes.tolist(),
@@ -357,7 +345,7 @@ class _Record:
         camera = dict(fields['camera'])
         record = cls(name, Camera(**camera | {'distortion': tuple(camera['distortion'])}))
         boxes = fields['boxes']
-        record.extent.boxes = np.array(boxes, dtype=np.float64).reshape(len(boxes), 4)
+        record.extent = Extent(np.array(boxes, dtype=np.float64).reshape(len(boxes), 4))
         record.views, record.since = (Views._make(
             np.array(part, dtype=empty.dtype).reshape(len(part), *empty.shape[1:])
             for part, empty in zip(
@@ -373,14 +361,8 @@ class _Record:
                     np.abs(views.odds().means) >= _LARGE).any():
                 raise ValueError('views have different lengths, invalid numbers, or are too many')
         record.by_extent = record.extent.log_odds(record.camera)
-        record.odds = record.views.odds(record.by_extent)
-        record.by_looks = record.views.odds()
+        record.odds, record.by_looks = record.views.odds(record.by_extent), record.views.odds()
         return record
-
-    @property
-    def fault(self) -> str:
-        """Return what is certainly wrong with the camera; empty if nothing is."""
-        return self.in_words(self.odds) if self.odds.is_wrong else ''
 
     def in_words(self, odds: CameraOdds) -> str:
         """Describe the errors of a wrong camera in one line."""
@@ -388,9 +370,10 @@ class _Record:
         kind, (focal, aspect, *shift, across, along, size) = list(_KINDS)[row - 1], odds.means[row]
         camera, where = self.camera, f'{self.name}: ' if self.name else ''
         if self.by_extent > _TERMS.view and _OF_OTHER_PIXELS[row - 1]:
-            reach = self.extent.reach
-            return (f'{where}boxes reach from ({reach[0]:.0f}, {reach[1]:.0f}) to '
-                    f'({reach[2]:.0f}, {reach[3]:.0f}) of {camera.width} x {camera.height} px')
+            left, top = self.extent.boxes[:, :2].min(axis=0)
+            right, bottom = self.extent.boxes[:, 2:].max(axis=0)
+            return (f'{where}boxes reach from ({left:.0f}, {top:.0f}) to ({right:.0f}, '
+                    f'{bottom:.0f}) of {camera.width} x {camera.height} px')
         if kind == 'convention':
             return (f'{where}boxes are off by {across:+.2f} of their widths and {along:+.2f} of '
                     'their heights')
@@ -413,8 +396,8 @@ class CameraCheck:
 
     def copied(self) -> 'CameraCheck':
         """Return a copy that later looks do not change."""
-        same = CameraCheck()
-        same._records = {name: record.copied() for name, record in self._records.copy().items()}
+        same = CameraCheck()  # views and boxes are shared, as they are never modified
+        same._records = {name: copy(record) for name, record in self._records.copy().items()}
         return same
 
     def fields(self) -> dict[str, Any]:
@@ -467,7 +450,8 @@ class CameraCheck:
     @property
     def faults(self) -> list[str]:
         """Return a description of each camera that is certainly wrong."""
-        return [record.fault for record in self._records.copy().values() if record.fault]
+        return [record.in_words(record.odds) for record in self._records.copy().values()
+                if record.odds.is_wrong]
 
     @property
     def values(self) -> dict[str, str]:

@@ -45,7 +45,7 @@ from cliploc_ros.core.acceptance.look_alikes import find_twins, lead_over_twin, 
 from cliploc_ros.core.acceptance.looks import NO_LOOKS, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival
 from cliploc_ros.core.calibration import CALIBRATION
-from cliploc_ros.core.fit.covariance import POSE_UNKNOWN, fuse, refined_covariance, share_within
+from cliploc_ros.core.fit.covariance import POSE_UNKNOWN, fuse, refined_covariance, shares_within
 from cliploc_ros.core.fit.finalists import (
     Finalist,
     find_finalists,
@@ -60,6 +60,7 @@ from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.joined_map import Place, place_of
 from cliploc_ros.core.map.visibility import expect
+from cliploc_ros.core.observation import tilt_deg
 from cliploc_ros.core.options import NEVER
 from cliploc_ros.core.search.frame_search import constraint_of, coverage_of, search_frame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
@@ -228,7 +229,8 @@ class Comparison:
             twin=twin and twin.position, twin_map=twin.name if twin else '',
             # as in the paper, unrefined poses are not refused for an uncertain position
             near=1.0 if self.place is None and best.finalist.information is None
-            else share_within(RIGHT_M, CALIBRATION.covariance.caution * covariance),
+            else float(shares_within(
+                RIGHT_M, CALIBRATION.covariance.caution * covariance[None, :3, :3])[0]),
             deviation_m=math.sqrt(np.trace(covariance[:3, :3])), coverage=coverage,
             tried=sum(frame.known_tried for frame in frames),
             # infinite for a search that tried every sample
@@ -238,7 +240,7 @@ class Comparison:
             unexplained=best.support.unexplained, signs=self._signs(best), motion=self._motion(),
             not_mirrored=self._not_mirrored(by_points), uncontradicted=self._uncontradicted(),
             recognized=self.place, prior=self.contenders[0].prior,
-            tilt_deg=self._last.base_tilt_deg(self.poses[0]),
+            tilt_deg=tilt_deg(self.poses[0], self._last.base_up_in_camera),
             earlier=self._looks.earlier(self._last, self.poses[0]), crops_left=0
             if self._last.compared is None
             else len(self._last.detections) - len(self._last.compared))
@@ -271,14 +273,31 @@ class Comparison:
         """Return the probability that the image is not mirrored.
 
         The features of a mirrored image match no keyframe, so a pose that keyframes alone confirm
-        is not checked. To save time, a pose that is refused anyway is not checked either.
+        is not checked. To save time, a pose that is refused anyway is not checked either. A short
+        search of the mirrored image finds the pose if the image is mirrored. The wrong pose is
+        then often far from a reflection of it.
         """
         best, options = self.by_objects, self._joined.options
         if (best is None or not options.refine or by_points >= options.min_confidence
                 or self.likely[0] < options.min_confidence
                 or round(best.support.inliers) < options.min_inliers):
             return 1.0
-        return _chance_not_mirrored(self._joined, best)
+        terms = CALIBRATION.mirror
+        first = [row for row, found in enumerate(best.matches) if found][-int(terms.frames):][0]
+        joined = join_frames(self._joined.landmark_map, options, self._joined.frames[first:])
+        matches, mirrored = best.matches[first:], _mirrored(joined)
+        centers = joined.landmark_map.centers[best._replace(matches=matches).landmarks]
+        reflected = [unrefined(pose) for pose in _reflections(centers) @ best.pose @ _FLIP]
+        starts = [*find_finalists(mirrored.frames, mirrored.rig, False, MAX_DISTINCT)[
+            :int(terms.refined)], max(reflected, key=lambda start: verify_rig(
+                mirrored.rig, start.rotation, start.translation).score)]
+        found = [refined(mirrored, start) for start in starts]
+        supports = supports_of(mirrored, np.array([pose.map_from_camera for pose in found]),
+                               [matches_of(mirrored.rig, pose) for pose in found])
+        own, = utilities([best.support] if len(joined.frames) == len(best.matches)
+                         else supports_of(joined, best.pose[None], [matches]))
+        lead = CALIBRATION.attitude.not_mirrored + float(own - utilities(supports).max())
+        return 1.0 / (1.0 + math.exp(-max(lead, -50.0)))
 
     def _uncontradicted(self) -> float:
         """Return the probability that keyframes are wrong if they recognize only other places.
@@ -399,32 +418,6 @@ def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.
     squares = (steps.T * (weights / weights.sum())) @ steps
     anywhere = np.repeat([np.trace(squares[:3, :3]) / 3, np.trace(squares[3:, 3:]) / 3], 3)
     return np.asarray(squares + np.diag(anywhere))
-
-
-def _chance_not_mirrored(joined: JoinedFrames, best: Contender) -> float:
-    """Return the probability that the image is not mirrored, given the best mirrored pose.
-
-    A short search of the mirrored image finds the pose if the image is mirrored. The wrong pose is
-    then often far from a reflection of it.
-    """
-    terms = CALIBRATION.mirror
-    first = [row for row, found in enumerate(best.matches) if found][-int(terms.frames):][0]
-    joined = join_frames(joined.landmark_map, joined.options, joined.frames[first:])
-    matches = best.matches[first:]
-    mirrored = _mirrored(joined)
-    centers = joined.landmark_map.centers[
-        sorted({match.landmark for of_frame in matches for match in of_frame})]
-    reflected = [unrefined(pose) for pose in _reflections(centers) @ best.pose @ _FLIP]
-    starts = [*find_finalists(mirrored.frames, mirrored.rig, False, MAX_DISTINCT)[
-        :int(terms.refined)], max(reflected, key=lambda start: verify_rig(
-            mirrored.rig, start.rotation, start.translation).score)]
-    found = [refined(mirrored, start) for start in starts]
-    supports = supports_of(mirrored, np.array([pose.map_from_camera for pose in found]),
-                           [matches_of(mirrored.rig, pose) for pose in found])
-    own, = utilities([best.support] if len(joined.frames) == len(best.matches)
-                     else supports_of(joined, best.pose[None], [matches]))
-    lead = CALIBRATION.attitude.not_mirrored + float(own - utilities(supports).max())
-    return 1.0 / (1.0 + math.exp(-max(lead, -50.0)))
 
 
 def _mirrored(joined: JoinedFrames) -> JoinedFrames:

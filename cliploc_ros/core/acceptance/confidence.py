@@ -45,7 +45,7 @@ from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import DEFAULT_SIGMA_M, LandmarkMap
 from cliploc_ros.core.map.similarities import Similarities, pair_similarities, sampled_spread
-from cliploc_ros.core.observation import Detections, Region
+from cliploc_ros.core.observation import Observation, Region
 from cliploc_ros.core.search.scene import Scene
 
 # Box coordinates are clipped to this, so that areas stay finite [px].
@@ -100,24 +100,21 @@ class ComparedFrame(NamedTuple):
     same: NDArray[np.float64]
 
 
-def compared_frame(landmark_map: LandmarkMap, detections: Detections, scene: Scene,
-                   similarities: Similarities | None, similarity_rows: NDArray[np.int64]
-                   ) -> ComparedFrame:
+def compared_frame(landmark_map: LandmarkMap, scene: Scene, seen: Observation) -> ComparedFrame:
     """Compute the data of a frame that supports need; see ComparedFrame for the arguments."""
-    index = landmark_map.classes
-    classes = index.classes_of(detections.class_ids)
+    index, class_ids, rows = landmark_map.classes, seen.detections.class_ids, seen.similarity_rows
+    classes = index.classes_of(class_ids)
     # a class that is rare in the map may be common in the place where the camera is
-    common = np.array([CALIBRATION.common.get(name, 0.0) for name in detections.class_ids])
+    common = np.array([CALIBRATION.common.get(name, 0.0) for name in class_ids])
     rarities = -np.log(np.maximum(
         np.maximum(index.sizes_of(classes), 1) / max(len(landmark_map), 1), common))
     means, deviations = np.zeros(len(classes)), np.ones(len(classes))
-    compared = similarity_rows >= 0
-    if similarities is not None and compared.any():
-        means[compared], deviations[compared] = sampled_spread(
-            similarities, similarity_rows[compared])
-    return ComparedFrame(scene, classes, rarities, index.are_own(classes), similarities,
-                         similarity_rows, means, np.maximum(deviations, 1e-6),
-                         one_thing(detections.bboxes_xyxy))
+    compared = rows >= 0
+    if seen.similarities is not None and compared.any():
+        means[compared], deviations[compared] = sampled_spread(seen.similarities, rows[compared])
+    return ComparedFrame(scene, classes, rarities, index.are_own(classes), seen.similarities, rows,
+                         means, np.maximum(deviations, 1e-6),
+                         one_thing(seen.detections.bboxes_xyxy))
 
 
 def support(landmark_map: LandmarkMap, frames: Sequence[ComparedFrame],

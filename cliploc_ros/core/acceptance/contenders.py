@@ -47,13 +47,10 @@ class JoinedFrames:
     @cached_property
     def compared(self) -> list[ComparedFrame]:
         """Return the data of each frame that the supports of all poses need."""
-        compared = []
-        for frame in self.frames:
-            seen = frame.observation if self.options.needs_similarities \
-                else replace(frame.observation, similarities=None)
-            compared.append(compared_frame(self.landmark_map, seen.detections, frame.scene,
-                                           seen.similarities, seen.similarity_rows))
-        return compared
+        return [compared_frame(self.landmark_map, frame.scene, frame.observation
+                               if self.options.needs_similarities
+                               else replace(frame.observation, similarities=None))
+                for frame in self.frames]
 
     @property
     def knows_vertical(self) -> bool:

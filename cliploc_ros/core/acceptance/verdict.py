@@ -3,7 +3,7 @@
 """The decision to accept or refuse the leading pose. A wrong pose is worse than none."""
 
 import math
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 from enum import StrEnum, auto
 from typing import NamedTuple
 
@@ -160,11 +160,6 @@ class Evidence:
     def confidence(self) -> float:
         """Return the probability that the leading pose is within 1 m of the truth."""
         return max(self.likely * self.found, self.by_points) * self.certainty
-
-    @property
-    def with_right_camera(self) -> 'Evidence':
-        """Return the evidence for the pose if all cameras are right."""
-        return replace(self, camera=1.0, camera_fault='')
 
     @property
     def confidence_of_view(self) -> float:

@@ -68,14 +68,6 @@ def odometry_deviations(first_from_second: NDArray[np.float64]) -> NDArray[np.fl
                       + np.radians(_TERMS.odometry_deg_per_m) * way_m], 3)
 
 
-def share_within(radius_m: float, covariance: NDArray[np.float64]) -> float:
-    """Return the probability that a position is within a distance of the truth.
-
-    The covariance (6, 6) is that of refined_covariance.
-    """
-    return float(shares_within(radius_m, covariance[None, :3, :3])[0])
-
-
 def shares_within(radius_m: float, covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probability (k,) that a position is within a distance, for k covariances.
 

@@ -220,14 +220,10 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
     header = {'version': VERSION, 'descriptors': layer.kind.name, 'frame_id': layer.frame_id,
               'deviation_per_metre': layer.deviation_per_metre, 'camera': first,
               'other_cameras': others, 'set': layer.set_digest}
-    names = [name for name in _SCHEMA.fields
-             if name != 'header' and getattr(layer, name) is not None]
-    arrays: dict[str, NDArray[Any]] = {'header': np.array(json.dumps(header))} | {
-        name: np.asarray(getattr(layer, name)) for name in names}
-    _SCHEMA.write(path, {
-        name: array.astype(np.str_) if _SCHEMA.fields[name].type == 'text'
-        else array.astype(_SCHEMA.fields[name].type, copy=False)
-        for name, array in arrays.items()})
+    _SCHEMA.write(path, {'header': np.array(json.dumps(header))} | {
+        name: np.asarray(getattr(layer, name), np.str_ if entry.type == 'text' else entry.type)
+        for name, entry in _SCHEMA.fields.items()
+        if name != 'header' and getattr(layer, name) is not None})
 
 
 def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds = ONLY_SIFT
@@ -241,7 +237,7 @@ def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds
     try:
         layer = _layer_of(arrays, kinds)
         _check_map(layer, landmark_map)
-    except ArrayError as error:
+    except (ArrayError, ValueError) as error:
         raise _SCHEMA.invalid(path, error) from error
     return layer
 
@@ -292,10 +288,7 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
 
 def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:
     """Raise ArrayError if the layer is of another map. A few landmarks may have changed."""
-    try:
-        check_set(layer.set_digest, landmark_map.map_set.family)
-    except ValueError as error:
-        raise ArrayError(str(error)) from error
+    check_set(layer.set_digest, landmark_map.map_set.family)
     if layer.frame_id != landmark_map.frame_id:
         raise ArrayError(f"belongs to a map in frame '{layer.frame_id}', expected "
                          f"'{landmark_map.frame_id}'")

@@ -4,7 +4,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,12 +91,14 @@ class _Matched(NamedTuple):
     shares: NDArray[np.float32]
 
     def select(self, chosen: NDArray[np.int64]) -> '_Matched':
-        columns: Any = self
-        return _Matched(*(column[chosen] for column in columns))
+        return _Matched._make(column[chosen] for column in self)
 
-    def join(self, other: '_Matched') -> '_Matched':
-        pairs: Any = zip(self, other, strict=True)
-        return _Matched(*(np.concatenate(pair) for pair in pairs))
+    def join(self, *others: '_Matched') -> '_Matched':
+        return _Matched(*map(np.concatenate, zip(self, *others, strict=True)))
+
+
+_NO_MATCH = _Matched(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0, np.int64),
+                     np.empty(0, np.int64), np.empty(0, np.float32))
 
 
 def query_features(image_rgb: NDArray[np.uint8], kind: FeatureKind = SIFT,
@@ -353,22 +355,17 @@ class KeyframeLocalizer:
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:
-        features, points, keyframes = [np.empty(0, np.int64)], [np.empty((0, 3))], []
-        rows, shares = [np.empty(0, np.int64)], [np.empty(0, np.float32)]
+        found = []
         for keyframe in chosen:
             if time.monotonic() > deadline:
                 break
             pairs, its = self.layer.kind.match(descriptors, self.layer.unit_descriptors(keyframe))
             inside = self.layer.points_in_map(keyframe)[pairs[:, 1]]
-            known = np.isfinite(inside).all(axis=1)
-            features.append(pairs[known, 0])
-            points.append(inside[known])
-            keyframes += [keyframe] * int(known.sum())
-            rows.append(self.layer.offsets[keyframe] + pairs[known, 1])
-            shares.append(its[known])
-        return _Matched(np.concatenate(features), np.concatenate(points),
-                        np.array(keyframes, dtype=np.int64), np.concatenate(rows),
-                        np.concatenate(shares))
+            found.append(_Matched(
+                pairs[:, 0], inside, np.full(len(pairs), keyframe),
+                self.layer.offsets[keyframe] + pairs[:, 1], its,
+            ).select(np.nonzero(np.isfinite(inside).all(axis=1))[0]))
+        return _NO_MATCH.join(*found)
 
     def _expects(self, keyframes: NDArray[np.int64], pose: NDArray[np.float64], camera: Camera
                  ) -> NDArray[np.bool_]:

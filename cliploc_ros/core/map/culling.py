@@ -39,6 +39,11 @@ class SortedLandmarks(NamedTuple):
     classes: NDArray[np.int32]  #: (m,): class number
 
 
+#: An empty table.
+NO_LANDMARKS = SortedLandmarks(np.empty((0, 9)), np.empty(0), np.empty(0, dtype=np.int64),
+                               np.empty(0, dtype=np.int32))
+
+
 class Groups(NamedTuple):
     """The landmarks of the detected classes: g classes, w landmarks, m spheres.
 
@@ -80,12 +85,6 @@ def sort_landmarks(centers: NDArray[np.float64], shapes: NDArray[np.float64],
     squares *= 1.0 + 1e-9
     return SortedLandmarks(np.column_stack([centers, shapes]), np.sqrt(squares),
                            np.ascontiguousarray(numbers), classes.astype(np.int32))
-
-
-def no_landmarks() -> SortedLandmarks:
-    """Return an empty table."""
-    return SortedLandmarks(np.empty((0, 9)), np.empty(0), np.empty(0, dtype=np.int64),
-                           np.empty(0, dtype=np.int32))
 
 
 def make_groups(sorted_landmarks: SortedLandmarks, classes: NDArray[np.int64],

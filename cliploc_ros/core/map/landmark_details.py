@@ -45,17 +45,11 @@ class LandmarkDetails:
             return self.labels
         return ((label, max(weight for _, weight in self.labels)), *self.labels)
 
-    def likely_classes(self) -> tuple[str, ...]:
-        """Return the classes with a share of at least LEAST_CLASS_SHARE."""
-        weights = dict(self.class_weights or ())
-        least = LEAST_CLASS_SHARE * sum(weights.values())
-        return tuple(name for name, weight in weights.items() if weight >= least)
-
     def class_shares(self) -> tuple[tuple[str, float], ...]:
-        """Return the likely classes, each with its weight divided by the greatest weight."""
+        """Return the classes of at least LEAST_CLASS_SHARE, weighted as in ClassIndex."""
         weights = dict(self.class_weights or ())
-        most = max(weights.values(), default=1.0)
-        return tuple((name, weights[name] / most) for name in self.likely_classes())
+        least, most = LEAST_CLASS_SHARE * sum(weights.values()), max(weights.values(), default=1.0)
+        return tuple((name, weight / most) for name, weight in weights.items() if weight >= least)
 
 
 def join_details(parts: Sequence[tuple[str, str, LandmarkDetails]]) -> LandmarkDetails:

@@ -66,17 +66,13 @@ class ClassIndex:
     weights: Mapping[tuple[int, int], float] = field(default_factory=dict)
 
     @staticmethod
-    def of(landmark_classes: Sequence[str], others: Sequence[tuple[int, str]] = (),
-           weights: Mapping[tuple[int, str], float] | None = None) -> 'ClassIndex':
+    def of(landmark_classes: Sequence[str], weights: Mapping[tuple[int, str], float]
+           ) -> 'ClassIndex':
         """Build the index of a map's classes.
 
-        Parameters
-        ----------
-        others : sequence of (int, str)
-            Unique pairs of a landmark and another of its classes.
-        weights : mapping, optional
-            Weight of each pair of a landmark and one of its classes, see ClassIndex.
+        Weights are those of pairs of a landmark and one of its classes, its own or another class.
         """
+        others = [(row, name) for row, name in weights if name != landmark_classes[row]]
         names = [*landmark_classes, *(name for _, name in others)]
         numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
         classes = np.array([numbers[name] for name in names], dtype=np.int64)
@@ -85,7 +81,7 @@ class ClassIndex:
         return ClassIndex(numbers, classes[:count], landmarks[np.lexsort((landmarks, classes))],
                           np.append(0, np.cumsum(np.bincount(classes))).astype(np.int64),
                           {(row, numbers[name]): weight
-                           for (row, name), weight in (weights or {}).items()})
+                           for (row, name), weight in weights.items()})
 
     @cached_property
     def members(self) -> NDArray[np.int64]:
@@ -238,11 +234,9 @@ class LandmarkMap:
     @cached_property
     def classes(self) -> ClassIndex:
         """Return the landmarks by class: their own classes, and classes they are mistaken for."""
-        others = [(row, name) for row, detail in enumerate(self.details)
-                  for name in detail.likely_classes() if name != self.class_ids[row]]
-        weights = {(row, name): share for row, detail in enumerate(self.details)
-                   for name, share in detail.class_shares()}
-        return ClassIndex.of(self.class_ids, others, weights)
+        return ClassIndex.of(self.class_ids, {
+            (row, name): share for row, detail in enumerate(self.details)
+            for name, share in detail.class_shares()})
 
     @cached_property
     def sorted_landmarks(self) -> SortedLandmarks:
@@ -422,12 +416,7 @@ def _numbers(value: Any, count: int, where: str) -> tuple[float, ...]:
     values = tuple(value) if isinstance(value, list | tuple) or hasattr(value, 'tolist') else ()
     numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
     if len(values) != count or not numeric:
-        raise MapError(f'{where}: must be {count} numbers, not {_shorten(value)}')
+        raise MapError(f'{where}: must be {count} numbers, not {value!r:.60}')
     if not all(abs(v) <= sys.float_info.max for v in values):  # ints may be larger
-        raise MapError(f'{where}: {_shorten(value)} has values that are not finite')
+        raise MapError(f'{where}: {value!r:.60} has values that are not finite')
     return tuple(map(float, values))
-
-
-def _shorten(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + '...'

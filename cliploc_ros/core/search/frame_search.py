@@ -115,11 +115,6 @@ def nearest_candidates(similarities: Similarities, k: int) -> Candidates:
                       np.tile(np.arange(k), detection_count), values.ravel().astype(np.float64))
 
 
-def prosac_order(candidates: Candidates) -> Candidates:
-    """Sort the candidates by decreasing similarity (Chum and Matas 2005)."""
-    return candidates.ordered(-candidates.similarities)
-
-
 def balanced_order(candidates: Candidates) -> Candidates:
     """Sort by rank, then by decreasing similarity: all nearest landmarks, all second-nearest, ...
 
@@ -241,8 +236,8 @@ def _candidates(landmark_map: LandmarkMap, class_ids: Sequence[str],
     """
     index = landmark_map.classes
     if nearest is not None:
-        if options.algorithm == 'prosac':
-            nearest = prosac_order(nearest)
+        if options.algorithm == 'prosac':  # decreasing similarity (Chum and Matas 2005)
+            nearest = nearest.ordered(-nearest.similarities)
         elif options.algorithm in ('b-prosac', 'auto'):
             nearest = balanced_order(nearest)
         if options.matching == 'clip' or options.algorithm != 'auto':

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.map.culling import Groups, SortedLandmarks, make_groups, no_landmarks
+from cliploc_ros.core.map.culling import NO_LANDMARKS, Groups, SortedLandmarks, make_groups
 
 #: A vertical (7,) consists of the up direction in the camera (3,) and in the map (3,), unit
 #: vectors, and the standard deviation of the angle between them [rad]. Zeros: unknown.
@@ -81,7 +81,7 @@ def make_scene(bboxes: NDArray[np.float64], centers: NDArray[np.float64],
     single = single[np.lexsort(single.T)]
     shown, starts = np.unique(single[:, 1], return_index=True)
     if sorted_landmarks is None or classes is None:
-        sorted_landmarks, classes = no_landmarks(), np.full(len(boxes), -1, dtype=np.int64)
+        sorted_landmarks, classes = NO_LANDMARKS, np.full(len(boxes), -1, dtype=np.int64)
     by_landmark = Potential(shown, np.append(starts, len(single)),
                             np.ascontiguousarray(single[:, 0]))
     if depths is None:

@@ -97,22 +97,16 @@ def set_up(scene: Scene, constraint: Constraint | None = None) -> Bench:
                       potential.detections, scene.sorted_landmarks.landmarks, scene.groups)
     sample = Sample(np.empty((3, 3)), np.empty((3, 4)), np.empty((3, 9)),
                     np.empty((3 * MAX_SOLUTIONS, 6)), np.empty(MAX_SOLUTIONS))
-    return Bench(candidates, (constraint or Constraint()).as_array(), targets, sample,
-                 Poses(np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3))),
-                 _overlaps(targets))
-
-
-def _overlaps(targets: Targets) -> Overlaps:
-    """Allocate the buffers for the verification of one pose."""
-    single, members = len(targets.landmarks), targets.groups.members
-    shown = np.diff(targets.groups.starts)
-    pairs = len(targets.detections) + int(
+    single, members, shown = len(table), scene.groups.members, np.diff(scene.groups.starts)
+    pairs = len(potential.detections) + int(
         np.bincount(members[:, 1], minlength=len(shown)) @ shown)
     owners = np.empty(single + len(members), dtype=np.int64)
     owners[:single] = np.arange(single)
-    return Overlaps(np.empty((2, len(members)), dtype=np.int64), np.empty((len(owners), 6)),
-                    owners, np.empty((pairs, 2), dtype=np.int64), np.empty(pairs),
-                    np.empty(len(targets.boxes)))
+    overlaps = Overlaps(np.empty((2, len(members)), dtype=np.int64), np.empty((len(owners), 6)),
+                        owners, np.empty((pairs, 2), dtype=np.int64), np.empty(pairs),
+                        np.empty(len(scene.box_ellipses)))
+    return Bench(candidates, (constraint or Constraint()).as_array(), targets, sample,
+                 Poses(np.empty((MAX_SOLUTIONS, 3, 3)), np.empty((MAX_SOLUTIONS, 3))), overlaps)
 
 
 @compiled

@@ -43,7 +43,7 @@ from cliploc_ros.core.geometry.transforms import (
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.visibility import Expected, expect
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import Observation, tilt_deg
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.search.frame_search import SearchedFrame, constraint_of, match_frame
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN
@@ -191,9 +191,5 @@ def by_keyframes(recognizer: ImageRecognizer, alignment: Alignment,
 def by_vertical(map_from_camera: NDArray[np.float64], up_in_camera: NDArray[np.float64] | None,
                 deviation_deg: float) -> float:
     """Return the log odds, at most 0, that a pose (4, 4) is right, from the vertical (3,)."""
-    if up_in_camera is None:
-        return 0.0
-    cosine = float(map_from_camera[2, :3] @ up_in_camera)
-    tilt_deg = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
-    sigmas = tilt_deg / math.hypot(deviation_deg, _TERMS.slope_deg)
+    sigmas = tilt_deg(map_from_camera, up_in_camera) / math.hypot(deviation_deg, _TERMS.slope_deg)
     return -min(CALIBRATION.attitude.wrong_mount, 0.5 * sigmas ** 2)

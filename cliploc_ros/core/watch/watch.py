@@ -22,7 +22,7 @@ from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, is_rigid, pose_error
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.map.visibility import Missing
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import Observation, tilt_deg
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import vertical_of
 from cliploc_ros.core.watch.camera import CameraTurn, ImageFaults, TurnEstimate
@@ -190,7 +190,8 @@ class Watch:
         odom = observation.odom_from_camera
         fault = '' if image is None else self._faults.add(
             image, map_from_camera if odom is None else odom)
-        if refused := too_tilted(observation.base_tilt_deg(map_from_camera), self._options):
+        if refused := too_tilted(tilt_deg(map_from_camera, observation.base_up_in_camera),
+                                    self._options):
             fault = refused.reason
         self._belief.wait(observation, map_from_camera)
         if fault:
