@@ -84,7 +84,6 @@ class Relocalization:
     best_iteration: int = 0
     coverage: float = 1.0  #: Share of its samples that the search tried, 0 to 1
     search_ms: float = 0.0  #: Time of association, search and verification [ms]
-    stamp_ns: int = 0  #: Stamp of the newest observation [ns]
     source: str = 'objects'  #: The source of the best pose: 'objects', 'keyframes' or 'both'
     #: Kind of the refusal, for use by programs; None when accepted
     refusal_kind: RefusalKind | None = None
@@ -285,8 +284,7 @@ class Relocalizer:
         compared = Comparison(joined, met, looks, recognizer)
         result = Relocalization(
             False, '', tried=sum(frame.progress.tried for frame in frames),
-            coverage=coverage_of(frames), stamp_ns=frames[-1].observation.stamp_ns,
-            recognition=compared.recognition, frames=len(frames))
+            coverage=coverage_of(frames), recognition=compared.recognition, frames=len(frames))
         if not compared.contenders:
             kind, reason = _nothing_found(self.landmark_map, frames)
             return replace(result, reason=reason, refusal_kind=kind, search_ms=budget.elapsed_ms)

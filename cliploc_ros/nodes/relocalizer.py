@@ -109,7 +109,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
 
     def load(self) -> str:
         """Load map and network."""
-        return self._pipeline.load()
+        return self._pipeline.load().description
 
     def unload(self) -> None:
         """Drop map and network."""

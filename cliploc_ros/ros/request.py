@@ -79,16 +79,21 @@ class Pipeline:
         self._pose = node.create_publisher(PoseWithCovarianceStamped, '~/pose', qos.POSE)
         self._visualization = Visualization(node)
 
-    def load(self) -> str:
-        """Load map and network; return a description of them in one line."""
-        return self._use(load_localizer(self._node, self._node.settings.snapshot())).description
+    def load(self, former: FrameLocalizer | None = None) -> FrameLocalizer:
+        """Load map and network, and return them. Keep the network of a former localizer."""
+        localizer = load_localizer(self._node, self._node.settings.snapshot(), former)
+        self.localizer = localizer
+        self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
+                                    else localizer.keyframes.localizer.layer)
+        self.on_map()
+        return localizer
 
     def reload_map(self) -> FrameLocalizer:
         """Read the map again; return the new localizer."""
         former = self.localizer
         if former is None:
             raise NotActiveError(f'the node is {self._node.state}')
-        return self._use(load_localizer(self._node, self._node.settings.snapshot(), former))
+        return self.load(former)
 
     def unload(self) -> None:
         """Drop map and network."""
@@ -159,13 +164,6 @@ class Pipeline:
                 self._visualization.show_debug_image, image, localized.seen,
                 localized.landmark_map, found, answer.message))
         return answer
-
-    def _use(self, localizer: FrameLocalizer) -> FrameLocalizer:
-        self.localizer = localizer
-        self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
-                                    else localizer.keyframes.localizer.layer)
-        self.on_map()
-        return localizer
 
 
 class Requests:

@@ -276,10 +276,9 @@ def test_points_tell_focal_length_and_aspect_also_where_few_agree_with_the_given
     _, points, bearings = look(rng, 400, noise_px=1.0)
     bearings[::4] = rng.permutation(bearings[::4])
     start = invert_transform(find_pose(points, bearings * (x, y)).map_from_camera)
-    found, deviations, inliers = free_focal(points, bearings * (x, y), start)
+    found, deviations = free_focal(points, bearings * (x, y), start)
     assert (abs(found - 0.5 * np.log((x * y, x / y))) < 3.0 * deviations).all()
     assert (deviations < 0.004).all()
-    assert len(inliers) > 250
 
 
 def test_few_points_points_on_a_line_and_points_that_agree_on_nothing_give_no_pose():

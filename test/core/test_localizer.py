@@ -222,7 +222,7 @@ class Says:
 def test_a_filter_gets_the_covariance_of_the_pose_that_keyframes_gave():
     fine = np.diag([1e-4] * 3 + [1e-5] * 3)
     session = Localizer(RELOCALIZER, Says(RecognizedPlace(
-        MAP_FROM_CAMERA, fine, 0.5 * fine, 200, 0.9, 0.9,
+        MAP_FROM_CAMERA, fine, 0.5 * fine, 200, 0.9,
         pixels=np.array([[0.0, 0.0], [640.0, 480.0]]))))
     image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
 
@@ -430,7 +430,7 @@ def test_any_link_may_be_broken_and_keyframes_and_inexact_odometry_hold_it(room,
     elsewhere, here = (link_of(room, walk, 'gggn', met=(5.0, where)).holds
                        for where in ('elsewhere', 'here'))
     assert elsewhere < last.holds < here
-    place = RecognizedPlace(walk[-1], np.eye(6) * 1e-4, np.eye(6) * 1e-4, 200, 0.9, 0.9)
+    place = RecognizedPlace(walk[-1], np.eye(6) * 1e-4, np.eye(6) * 1e-4, 200, 0.9)
     assert link_of(room, walk, 'gggn', seen=Recognition((place,))).holds > 0.99
     first, last = see(room, walk[0]), see(room, walk[1])
     last = replace(last, odom_from_camera=last.odom_from_camera @ moved(np.eye(4), 0.2, 0.0))
@@ -469,7 +469,7 @@ def test_a_look_repeats_a_view_as_far_as_odometry_has_not_moved(degrees, metres,
 
 
 def test_looks_by_keyframes_remain_and_the_farthest_is_compared():
-    place = RecognizedPlace(pose(), np.eye(6), np.eye(6), 99, 0.9, 0.9)
+    place = RecognizedPlace(pose(), np.eye(6), np.eye(6), 99, 0.9)
     looks = Looks()
     for seconds, metres in ((0.0, 0.0), (1.0, -3.0), (2.0, 1.0)):
         looks = looks.with_look(Look(frame(seconds, 0.0, metres), pose(), 0.8, place), True)
@@ -518,7 +518,7 @@ def test_a_search_of_keyframes_that_time_cuts_off_is_named_and_repeated():
         assert not session.query.by_keyframes
         answers.append(late.refusal_kind)
         again = Localizer(RELOCALIZER, Says(RecognizedPlace(
-            MAP_FROM_CAMERA, np.eye(6) * 1e-4, np.eye(6) * 1e-4, 200, 0.9, 0.9))).answer(
+            MAP_FROM_CAMERA, np.eye(6) * 1e-4, np.eye(6) * 1e-4, 200, 0.9))).answer(
                 session.query)
         assert again.reason == late.reason
         assert 'keyframes: time was up; raise timeout_s' in late.reason

@@ -54,8 +54,8 @@ def place(x=0.0, inliers=200, confirmed=0.9, reach=1.0, **fields):
     """Return points over the middle of the image, within a share of its width and height."""
     rng, size = np.random.default_rng(0), np.array([CAMERA.width, CAMERA.height])
     pixels = size * (0.5 + reach * rng.uniform(-0.55, 0.55, (inliers, 2)))
-    return RecognizedPlace(moved(x), FINE, 0.5 * FINE, inliers, confirmed, 0.9, (40, 44),
-                           pixels=pixels, **fields)
+    return RecognizedPlace(moved(x), FINE, 0.5 * FINE, inliers, confirmed, pixels=pixels,
+                           **fields)
 
 
 def ask(recognizer=None, objects=12, options=BY_CLASS, room=ROOM, **known):
@@ -317,7 +317,7 @@ def look(points, bearings, rng, keyframe=0, wrong=None):
     found = find_pose(points, bearings + noise)
     pose = found.map_from_camera if wrong is None else wrong @ found.map_from_camera
     return RecognizedPlace(
-        pose, 20.0 * found.covariance + SHARED, SHARED, len(found.inliers), 0.8, 0.8,
+        pose, 20.0 * found.covariance + SHARED, SHARED, len(found.inliers), 0.8,
         keyframes=(keyframe,), shares=(1.0,), points=points[found.inliers])
 
 

@@ -49,7 +49,7 @@ OPTIONS = RelocalizerOptions()
 SURE = Evidence(inliers=9, likely=0.99)
 GENUINE = Signs(math.log(30), 0.8, 0.0, 0.0, 1.0, 0.5, 0.0)
 SMALL = GENUINE._replace(reach=0.3, confirmed=0.4)
-RECOGNIZED = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 200, 0.9, 0.9)
+RECOGNIZED = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 200, 0.9)
 
 
 def looks(*confidences, doubted=0.0, same_view=0.0):

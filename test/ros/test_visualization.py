@@ -167,7 +167,7 @@ def layer_of(ROOM, **images):
 def recognized(found):
     """Answer from five of the points, which are 100 px further up in the image."""
     pixels = np.column_stack([np.linspace(50, 290, 5), np.full(5, 140.0)])
-    seen = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 5, 0.8, 0.8, keyframes=(0,),
+    seen = RecognizedPlace(np.eye(4), np.eye(6), np.eye(6), 5, 0.8, keyframes=(0,),
                            pixels=pixels, rows=np.arange(5))
     return replace(found, recognition=Recognition((seen,)))
 

@@ -166,9 +166,7 @@ class Camera:
         if not self.is_pinhole:
             is_near = (np.linalg.norm(points, axis=2) <= _WIDEST_BOX).all(axis=1)
             points[~is_near] = np.nan
-        edges: NDArray[np.float64] = np.stack(
-            [points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], axis=-1)
-        return edges
+        return np.asarray(points[:, range(4), [0, 1, 0, 1]])
 
     def bboxes_in_pixels(self, edges: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert boxes (n, 4) on the plane z = 1 to undistorted boxes (n, 4) [px]."""

@@ -329,15 +329,11 @@ class KeyframeLocalizer:
         """Evaluate the evidence for and against a place."""
         used, counts = self._used(place)
         pose, shares = place.map_from_camera, counts[used] / counts.sum()
-        # Cells with inliers among the comparable cells. A cell without features, such as an
-        # occluded cell, is not comparable. The expected share assumes a geometric distribution of
-        # the inliers in a cell, because their density varies from cell to cell.
+        # cells with inliers among the comparable cells; a cell without features, such as an
+        # occluded cell, is not comparable
         seen = _count(look.features.pixels, look.camera)
         comparable = (seen >= _LEAST_SEEN) & self._expects(used, pose, look.camera)
-        cells = int(np.count_nonzero(place.cells[comparable])), int(comparable.sum())
-        confirmed = expected = 0.0
-        if cells[1]:
-            confirmed, expected = cells[0] / cells[1], place.agreed / (cells[1] + place.agreed)
+        confirmed = np.count_nonzero(place.cells[comparable]) / max(1, int(comparable.sum()))
         among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
         free = free_focal(among.points, look.bearings[among.features], invert_transform(pose))
         ratio, aspect, deviation, of_aspect = 1.0, 1.0, np.inf, np.inf
@@ -347,7 +343,7 @@ class KeyframeLocalizer:
         shared = self._shared(pose, counts)
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
         return RecognizedPlace(
-            pose, covariance, shared, place.agreed, confirmed, expected, cells, ratio, deviation,
+            pose, covariance, shared, place.agreed, confirmed, ratio, deviation,
             aspect, of_aspect, look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
             tuple(shares.tolist()), look.features.pixels[place.inliers.features],
             place.inliers.rows, place.inliers.points, is_thorough,

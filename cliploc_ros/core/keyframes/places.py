@@ -18,13 +18,9 @@ class RecognizedPlace(NamedTuple):
     shared: NDArray[np.float64]
     #: Number of agreeing features, without features that agree with a place found earlier
     inliers: int
-    #: Share of the comparable cells of the image that contain inliers, 0 to 1
+    #: Share of the comparable cells of the image that contain inliers, 0 to 1. Comparable are cells
+    #: where the keyframes predict points and the image has features.
     confirmed: float
-    #: Expected value of `confirmed` for this number of inliers, 0 to 1
-    expected: float
-    #: Number of confirming and of comparable cells. A cell is comparable if the keyframes predict
-    #: points in it and the image has features there.
-    cells: tuple[int, int] = (0, 0)
     #: Focal length estimated from the points, as a multiple of the camera's, and its relative
     #: standard deviation; 1 and inf without an estimate. At right poses the ratio is close to 1.
     #: Wrong intrinsics, or a picture of the place at another scale, give another ratio.

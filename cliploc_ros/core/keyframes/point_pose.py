@@ -97,7 +97,7 @@ def refine(points: NDArray[np.float64], bearings: NDArray[np.float64],
 
 def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
                camera_from_map: NDArray[np.float64]
-               ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]] | None:
+               ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Estimate the focal lengths that fit the points best; return None with too few inliers.
 
     The tolerance decreases step by step, because points may disagree only due to a wrong focal
@@ -118,12 +118,9 @@ def free_focal(points: NDArray[np.float64], bearings: NDArray[np.float64],
         Logarithms of the focal length, as a multiple of the given value, and of its aspect: the
         root of the ratio x to y. Their standard deviations, due to the noise of the features
         alone.
-    inliers : ndarray (k,) of int
-        Rows of the agreeing points.
     """
     fit = _fit(points, bearings, _Fit(camera_from_map, np.zeros(2), np.eye(8)), _WRONG_FOCAL)
-    return fit and (fit[0].logarithms,
-                    np.sqrt(np.diag(np.linalg.inv(fit[0].information))[6:]), fit[1])
+    return fit and (fit[0].logarithms, np.sqrt(np.diag(np.linalg.inv(fit[0].information))[6:]))
 
 
 class _Fit(NamedTuple):

@@ -172,15 +172,13 @@ class LandmarkMap:
 
     def with_more(self, other: 'LandmarkMap') -> 'LandmarkMap':
         """Return the map with the landmarks of another map appended."""
-        def details(part: LandmarkMap) -> tuple[LandmarkDetails, ...]:
-            return part.details or (LandmarkDetails(),) * len(part)
-
         return LandmarkMap(
             self.frame_id, self.landmark_ids + other.landmark_ids, self.labels + other.labels,
             self.class_ids + other.class_ids, np.concatenate([self.centers, other.centers]),
             np.concatenate([self.semi_axes, other.semi_axes]),
             np.concatenate([self.quats_xyzw, other.quats_xyzw]),
-            details(self) + details(other) if self.details or other.details else (), self.map_set)
+            self.every_detail + other.every_detail if self.details or other.details else (),
+            self.map_set)
 
     def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
         """Return the map with the labels and classes of parts added to their whole landmarks.
@@ -188,12 +186,17 @@ class LandmarkMap:
         The array into (L,) has the row of the landmark that each landmark is a part of, or its own
         row.
         """
-        details = list(self.details or [LandmarkDetails()] * len(self))
+        details = list(self.every_detail)
         for row in np.unique(into[into != np.arange(len(into))]).tolist():
             parts = [row, *(part for part in np.nonzero(into == row)[0].tolist() if part != row)]
             details[row] = join_details([
                 (self.labels[part], self.class_ids[part], details[part]) for part in parts])
         return replace(self, details=tuple(details))
+
+    @property
+    def every_detail(self) -> tuple[LandmarkDetails, ...]:
+        """Return the optional fields of each landmark, L of them."""
+        return self.details or (LandmarkDetails(),) * len(self)
 
     def prepare(self) -> None:
         """Compute the indices in advance, so that the first request does not wait for them."""
@@ -208,7 +211,7 @@ class LandmarkMap:
     @cached_property
     def position_sigmas(self) -> NDArray[np.float64]:
         """Return the standard deviation of each centre on each axis (L,) [m]."""
-        given = [detail.position_sigma for detail in self.details] or [None] * len(self)
+        given = (detail.position_sigma for detail in self.every_detail)
         return np.array([DEFAULT_SIGMA_M if sigma is None else sigma for sigma in given])
 
     @cached_property
@@ -218,18 +221,14 @@ class LandmarkMap:
         0 where the map has no value.
         """
         given = [(detail.shared_sigma or 0.0, detail.shared_sigma_deg or 0.0)
-                 for detail in self.details]
-        if not given:
-            return np.zeros((len(self), 2))
-        return np.array(given) * [1.0, np.radians(1.0)]
+                 for detail in self.every_detail]
+        return np.reshape(given, (-1, 2)) * [1.0, np.radians(1.0)]
 
     @property
     def weighted_labels(self) -> tuple[WeightedLabels, ...]:
         """Return all labels of each landmark, with their weights."""
-        if not self.details:
-            return tuple(((label, 1.0),) for label in self.labels)
         return tuple(detail.labels_with(label)
-                     for detail, label in zip(self.details, self.labels, strict=True))
+                     for detail, label in zip(self.every_detail, self.labels, strict=True))
 
     @cached_property
     def classes(self) -> ClassIndex:

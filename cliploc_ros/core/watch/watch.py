@@ -194,9 +194,8 @@ class Watch:
                                     self._options):
             fault = refused.reason
         self._belief.wait(observation, map_from_camera)
-        if fault:
-            return self._report(None, fault)
-        return self._report(self._weigh(observation, map_from_camera, recognizer))
+        return self._report(None if fault else self._weigh(
+            observation, map_from_camera, recognizer), fault)
 
     def _weigh(self, observation: Observation, given: NDArray[np.float64],
                recognizer: ImageRecognizer | None) -> LookEvidence:
@@ -223,7 +222,7 @@ class Watch:
             self._turn.add(alignment, given, weight > CALIBRATION.watch.new_view)
         return evidence
 
-    def _report(self, evidence: LookEvidence | None, fault: str = '') -> WatchReport:
+    def _report(self, evidence: LookEvidence | None, fault: str) -> WatchReport:
         """Return the state, with a reason that says what happened and what to do."""
         terms, belief = CALIBRATION.watch, self._belief
         likely, state = belief.probability, WatchState.UNCERTAIN
