@@ -144,7 +144,7 @@ def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],
 def unrefined(map_from_camera: NDArray[np.float64]) -> Finalist:
     """Return a pose (4, 4) of another source as a finalist without score or sample."""
     pose = invert_transform(map_from_camera)
-    return Finalist(np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), 0.0, 0, 0, _NONE)
+    return Finalist(np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), 0.0, 0, _NONE)
 
 
 def refined(joined: JoinedFrames, start: Finalist) -> Finalist:

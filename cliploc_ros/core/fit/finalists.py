@@ -51,7 +51,6 @@ class Finalist(NamedTuple):
     translation: NDArray[np.float64]
     score: float  #: Sum of the IoUs of its inliers in all frames
     iteration: int  #: Iteration that found it, from 1
-    frame: int  #: Frame whose search found it
     #: (s,): its minimal sample: three candidates, or two if the vertical is known
     sample: NDArray[np.int64]
     #: (6, 6): see Refined; None without refinement
@@ -124,7 +123,7 @@ def _leaders_of(frames: Sequence[SearchedFrame], rig: Rig, frame: int) -> list[F
     camera = rig.cameras[frame]
     back, offset = camera[:, :3].T, camera[:, 3]
     return [Finalist(back @ leaders.rotations[row], back @ (leaders.translations[row] - offset),
-                     float(leaders.scores[row]), int(leaders.iterations[row]), frame,
+                     float(leaders.scores[row]), int(leaders.iterations[row]),
                      leaders.samples[row][leaders.samples[row] >= 0])
             for row in leaders.ranked()]
 

@@ -18,8 +18,8 @@ class RecognizedPlace(NamedTuple):
     shared: NDArray[np.float64]
     #: Number of agreeing features, without features that agree with a place found earlier
     inliers: int
-    #: Share of the comparable cells of the image that contain inliers, 0 to 1. Comparable are cells
-    #: where the keyframes predict points and the image has features.
+    #: Share of the comparable cells of the image that contain inliers, 0 to 1: of the cells
+    #: where the keyframes predict points and the image has features
     confirmed: float
     #: Focal length estimated from the points, as a multiple of the camera's, and its relative
     #: standard deviation; 1 and inf without an estimate. At right poses the ratio is close to 1.
