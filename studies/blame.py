@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from cliploc_ros.command import run_command
 from cliploc_ros.core.acceptance.confidence import Support, tilt_handicaps, utilities
-from cliploc_ros.core.acceptance.contenders import contenders_of, join_frames, refined, unrefined
+from cliploc_ros.core.acceptance.contenders import join_frames, unrefined
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
@@ -66,7 +66,7 @@ def blame(landmark_map: LandmarkMap, relocalizer: Relocalizer, query: PosedQuery
     errors = [pose_error(hypothesis.map_from_camera, query.map_from_camera)[0]
               for hypothesis in found.hypotheses]
     joined = join_frames(landmark_map, relocalizer.options, frames)
-    true, = contenders_of(joined, [refined(joined, unrefined(query.map_from_camera))], [True])
+    true, = joined.contenders([joined.refined(unrefined(query.map_from_camera))], [True])
     candidates = [{match.landmark for match in matches
                    if [match.detection, match.landmark] in frame.scene.pairs.tolist()}
                   for frame, matches in zip(frames, true.matches, strict=True)]

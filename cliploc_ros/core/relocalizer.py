@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.acceptance.camera_check import CameraCheck, CameraLook, looks_of
 from cliploc_ros.core.acceptance.comparison import Comparison, search_contenders
 from cliploc_ros.core.acceptance.confidence import Support
-from cliploc_ros.core.acceptance.contenders import (
-    Contender,
-    JoinedFrames,
-    join_frames,
-    without_depth,
-)
+from cliploc_ros.core.acceptance.contenders import Contender, JoinedFrames, join_frames
 from cliploc_ros.core.acceptance.depth_check import DepthCheck, check_depth
 from cliploc_ros.core.acceptance.links import Link, weakest_link
 from cliploc_ros.core.acceptance.looks import NO_LOOKS, Looks
@@ -279,7 +274,7 @@ class Relocalizer:
         met = self._meet(joined, budget)
         depth = check_depth(joined.rig, met[0].finalist) if met else None
         if depth is not None and not depth.is_passed:
-            joined = without_depth(joined)
+            joined = joined.without_depth()
             met = self._meet(joined, budget)
         compared = Comparison(joined, met, looks, recognizer)
         result = Relocalization(

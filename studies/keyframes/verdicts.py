@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.confidence import counted_points
-from cliploc_ros.core.acceptance.contenders import contenders_of, join_frames, unrefined
+from cliploc_ros.core.acceptance.contenders import join_frames, unrefined
 from cliploc_ros.core.acceptance.genuine import Signs
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import pose_error
@@ -119,7 +119,7 @@ def place_rows(case: StoredCase) -> list[Row]:
         look = record.looks[-1]
         joined = join_frames(case.landmark_map, record.options, [look.searched])
         places = [place for seen in look.seen for place in seen.places]
-        for place, contender in zip(places, contenders_of(joined, [
+        for place, contender in zip(places, joined.contenders([
                 unrefined(place.map_from_camera) for place in places], [True] * len(places)),
                 strict=True):
             rows.append(_row(case, record, place.map_from_camera, [

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.geometry.transforms import Tolerance
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.core.watch.look import LookEvidence, align, log_odds, look_at, measure
+from cliploc_ros.core.watch.look import LookEvidence, align, look_at, measure
 from studies.reports import fit_logistic, table
 from studies.watch.judge import displaced, drifting, kidnapped, simulated_drive, turned_camera
 
@@ -78,7 +78,7 @@ def report(looks: Sequence[Look], calibration: Calibration) -> str:
     rows = []
     for kind in (*dict.fromkeys(look.kind for look in looks), 'all'):
         known = [look for look in looks if kind in (look.kind, 'all') and look.evidence.known >= 3]
-        odds = np.array([log_odds(look.evidence, True, calibration) for look in known])
+        odds = np.array([look.evidence.log_odds(True, calibration) for look in known])
         right = np.array([look.is_right for look in known])
         rows.append([kind, len(known), f'{odds[right].mean():.1f}', f'{odds[~right].mean():.1f}',
                      f'{(odds[right] < 0.0).mean():.2f}', f'{(odds[~right] > 0.0).mean():.2f}',

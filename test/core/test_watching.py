@@ -17,14 +17,7 @@ from cliploc_ros.core.map.visibility import Expected, Missing, expect
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.camera import ImageFaults
-from cliploc_ros.core.watch.look import (
-    LookEvidence,
-    align,
-    by_vertical,
-    log_odds,
-    look_at,
-    measure,
-)
+from cliploc_ros.core.watch.look import LookEvidence, align, by_vertical, look_at, measure
 from cliploc_ros.core.watch.watch import Belief, Watch, WatchState
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
@@ -84,7 +77,7 @@ TERMS = CALIBRATION.watch
 def test_each_sign_of_a_look_counts_for_or_against_the_pose(changed, sign):
     look = LookEvidence(known=4, matched=2, unexplained=0, utility=1.0, expected=4, missed=0,
                         away_m=0.0, away_deg=0.0, crowd=0.0)
-    assert sign * (log_odds(look._replace(**changed), True) - log_odds(look, True)) > 0.3
+    assert sign * (look._replace(**changed).log_odds(True) - look.log_odds(True)) > 0.3
 
 
 @pytest.fixture(scope='module')

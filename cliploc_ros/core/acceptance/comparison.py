@@ -26,33 +26,18 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.acceptance.camera_check import CALIBRATED
 from cliploc_ros.core.acceptance.confidence import (
     confidences,
-    none_right,
     objects_utility,
     points_utility,
     utilities,
 )
-from cliploc_ros.core.acceptance.contenders import (
-    Contender,
-    JoinedFrames,
-    contenders_of,
-    join_frames,
-    refined,
-    supports_of,
-    unrefined,
-)
+from cliploc_ros.core.acceptance.contenders import Contender, JoinedFrames, join_frames, unrefined
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, signs_of
 from cliploc_ros.core.acceptance.look_alikes import find_twins, lead_over_twin, turned_about_axis
 from cliploc_ros.core.acceptance.looks import NO_LOOKS, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, Rival
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import POSE_UNKNOWN, fuse, refined_covariance, shares_within
-from cliploc_ros.core.fit.finalists import (
-    Finalist,
-    find_finalists,
-    instants_of,
-    matches_of,
-    meetings_of,
-)
+from cliploc_ros.core.fit.finalists import Finalist, find_finalists, matches_of, meetings_of
 from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE
@@ -76,7 +61,7 @@ def search_contenders(joined: JoinedFrames, finalists: Sequence[Finalist],
     Poses that ignore the known vertical (not is_upright, (m,)) come last. Without refinement, the
     pose with the greatest score comes first, as in the paper.
     """
-    contenders = contenders_of(joined, finalists, is_upright.tolist())
+    contenders = joined.contenders(finalists, is_upright.tolist())
     if not joined.options.refine:
         return contenders
     contenders.sort(key=lambda contender: -contender.rank)
@@ -102,7 +87,7 @@ class Comparison:
     def __init__(self, joined: JoinedFrames, met: Sequence[Contender], looks: Looks = NO_LOOKS,
                  recognizer: ImageRecognizer | None = None) -> None:
         self._joined, self._looks, self._recognizer = joined, looks, recognizer
-        self._last, self._none = joined.frames[-1].observation, none_right(joined.setting)
+        self._last, self._none = joined.frames[-1].observation, joined.none_right
         contenders, seen = list(met), None
         if recognizer is not None:
             guesses = contenders[:int(CALIBRATION.keyframes.guesses)]
@@ -170,9 +155,9 @@ class Comparison:
         either: the objects that the pose does not explain may never have been mapped.
         """
         most = CALIBRATION.attitude.vertical_sigmas
-        found = contenders_of(self._joined, [unrefined(place.map_from_camera)
-                                             for place in seen.places],
-                              [place.tilt_error <= most for place in seen.places])
+        found = self._joined.contenders(
+            [unrefined(place.map_from_camera) for place in seen.places],
+            [place.tilt_error <= most for place in seen.places])
         proposed = []
         for contender, place in zip(found, seen.places, strict=True):
             points, objects = points_utility(place), objects_utility(contender.support)
@@ -204,7 +189,7 @@ class Comparison:
         finalist, covariance = best.finalist, POSE_UNKNOWN
         if finalist.information is None or finalist.information.any():
             covariance = refined_covariance(
-                joined.rig, finalist.rotation, finalist.translation, instants_of(joined.frames),
+                joined.rig, finalist.rotation, finalist.translation, joined.instants,
                 joined.landmark_map.shared_sigmas, CALIBRATION.covariance.wrong_share,
                 joined.options.mount_deviation, CALIBRATED)
         if finalist.information is not None:
@@ -291,11 +276,11 @@ class Comparison:
         starts = [*find_finalists(mirrored.frames, mirrored.rig, False, MAX_DISTINCT)[
             :int(terms.refined)], max(reflected, key=lambda start: verify_rig(
                 mirrored.rig, start.rotation, start.translation).score)]
-        found = [refined(mirrored, start) for start in starts]
-        supports = supports_of(mirrored, np.array([pose.map_from_camera for pose in found]),
-                               [matches_of(mirrored.rig, pose) for pose in found])
+        found = [mirrored.refined(start) for start in starts]
+        supports = mirrored.supports(np.array([pose.map_from_camera for pose in found]),
+                                     [matches_of(mirrored.rig, pose) for pose in found])
         own, = utilities([best.support] if len(joined.frames) == len(best.matches)
-                         else supports_of(joined, best.pose[None], [matches]))
+                         else joined.supports(best.pose[None], [matches]))
         lead = CALIBRATION.attitude.not_mirrored + float(own - utilities(supports).max())
         return 1.0 / (1.0 + math.exp(-max(lead, -50.0)))
 
@@ -348,7 +333,7 @@ class Comparison:
         found = np.concatenate([twins, turned])
         rooms = np.append(alike.are_rooms, np.zeros(len(turned), dtype=np.bool_))
         inside = np.nonzero((low <= found[:, 2, 3]) & (found[:, 2, 3] <= high))[0]
-        places = [refined(joined, unrefined(found[row])) for row in inside]
+        places = [joined.refined(unrefined(found[row])) for row in inside]
         poses = np.array([best.pose, *(place.map_from_camera for place in places)])
         # drop the places that refinement moved back to the leading pose
         elsewhere = ~SAME_ANSWER.agreeing(poses)[0]
@@ -358,7 +343,7 @@ class Comparison:
         if len(others) == 0:
             return 1.0, None
         rows = inside[others - 1]
-        rivals = contenders_of(joined, [places[row - 1] for row in others], [True] * len(others))
+        rivals = joined.contenders([places[row - 1] for row in others], [True] * len(others))
         leads = self._leads_of_points(poses[others], rooms[rows])
         for number, (rival, row) in enumerate(zip(rivals, rows, strict=True)):
             if row < len(twins):

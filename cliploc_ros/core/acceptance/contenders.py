@@ -16,13 +16,14 @@ from cliploc_ros.core.acceptance.confidence import (
     Setting,
     Support,
     compared_frame,
+    none_right,
     region_odds,
     support,
     tilt_handicaps,
     utilities,
 )
 from cliploc_ros.core.calibration import CALIBRATION
-from cliploc_ros.core.fit.finalists import Finalist, Match, matches_of
+from cliploc_ros.core.fit.finalists import Finalist, Match, instants_of, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform
@@ -32,59 +33,6 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.search.frame_search import SearchedFrame
 
 _NONE = np.empty(0, dtype=np.int64)
-
-
-@dataclass(frozen=True)
-class JoinedFrames:
-    """The data on which poses are compared: F searched frames, joined to a rig, and the map."""
-
-    landmark_map: LandmarkMap
-    options: RelocalizerOptions
-    frames: Sequence[SearchedFrame]
-    rig: Rig  #: The rig of these frames
-    cameras: NDArray[np.float64]  #: (F, 4, 4): camera_from_last of each frame
-
-    @cached_property
-    def compared(self) -> list[ComparedFrame]:
-        """Return the data of each frame that the supports of all poses need."""
-        return [compared_frame(self.landmark_map, frame.scene, frame.observation
-                               if self.options.needs_similarities
-                               else replace(frame.observation, similarities=None))
-                for frame in self.frames]
-
-    @property
-    def knows_vertical(self) -> bool:
-        """Return whether the vertical of any frame is known."""
-        return bool(self.rig.verticals[:, 6].any())
-
-    @property
-    def setting(self) -> Setting:
-        """Return the conditions that, with the supports, determine the risk of a wrong pose."""
-        return Setting(len(self.landmark_map),
-                       self.options.vertical_deviation_deg if self.knows_vertical else math.inf)
-
-
-def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
-                frames: Sequence[SearchedFrame]) -> JoinedFrames:
-    """Join searched frames, the last of which is to be localized.
-
-    Raises
-    ------
-    OptionsError
-        odom_from_camera is missing or not a rigid transform; there are no frames or too many.
-    """
-    cameras = cameras_from_last([frame.observation for frame in frames])
-    rig = make_rig([frame.scene for frame in frames], cameras,
-                   np.stack([frame.vertical for frame in frames]), landmark_map.position_sigmas)
-    return JoinedFrames(landmark_map, options, frames, rig, cameras)
-
-
-def without_depth(joined: JoinedFrames) -> JoinedFrames:
-    """Return the joined frames without their depths."""
-    return join_frames(joined.landmark_map, joined.options, [frame._replace(
-        observation=replace(frame.observation, depths=None),
-        scene=frame.scene._replace(depths=np.zeros_like(frame.scene.depths)))
-        for frame in joined.frames])
 
 
 class Contender(NamedTuple):
@@ -118,37 +66,93 @@ class Contender(NamedTuple):
         return self.odds + self.prior
 
 
-def contenders_of(joined: JoinedFrames, finalists: Sequence[Finalist], upright: Sequence[bool]
-                ) -> list[Contender]:
-    """Return poses as contenders, with their odds by objects."""
-    poses = np.array([finalist.map_from_camera for finalist in finalists]).reshape(-1, 4, 4)
-    matches = [matches_of(joined.rig, finalist) for finalist in finalists]
-    supports = supports_of(joined, poses, matches)
-    handicaps = np.where(upright, 0.0, CALIBRATION.attitude.wrong_mount) \
-        if joined.knows_vertical else tilt_handicaps(poses, joined.options.tilt_deviation_deg)
-    region = joined.frames[-1].observation.region
-    priors = np.zeros(len(poses)) if region is None else region_odds(joined.landmark_map, region,
-                                                                     poses)
-    return list(map(Contender, finalists, poses, matches, supports, upright, handicaps.tolist(),
-                    (utilities(supports) - handicaps).tolist(), priors.tolist()))
+@dataclass(frozen=True)
+class JoinedFrames:
+    """The data on which poses are compared: F searched frames, joined to a rig, and the map."""
+
+    landmark_map: LandmarkMap
+    options: RelocalizerOptions
+    frames: Sequence[SearchedFrame]
+    rig: Rig  #: The rig of these frames
+    cameras: NDArray[np.float64]  #: (F, 4, 4): camera_from_last of each frame
+
+    @cached_property
+    def compared(self) -> list[ComparedFrame]:
+        """Return the data of each frame that the supports of all poses need."""
+        return [compared_frame(self.landmark_map, frame.scene, frame.observation
+                               if self.options.needs_similarities
+                               else replace(frame.observation, similarities=None))
+                for frame in self.frames]
+
+    @property
+    def knows_vertical(self) -> bool:
+        """Return whether the vertical of any frame is known."""
+        return bool(self.rig.verticals[:, 6].any())
+
+    @property
+    def none_right(self) -> float:
+        """Return the utility of the case that no pose is right."""
+        return none_right(Setting(
+            len(self.landmark_map),
+            self.options.vertical_deviation_deg if self.knows_vertical else math.inf))
+
+    @property
+    def instants(self) -> NDArray[np.int64]:
+        """Return the number (F,) of each frame's instant, see instants_of."""
+        return instants_of(self.frames)
+
+    def without_depth(self) -> 'JoinedFrames':
+        """Return the joined frames without their depths."""
+        return join_frames(self.landmark_map, self.options, [frame._replace(
+            observation=replace(frame.observation, depths=None),
+            scene=frame.scene._replace(depths=np.zeros_like(frame.scene.depths)))
+            for frame in self.frames])
+
+    def contenders(self, finalists: Sequence[Finalist], upright: Sequence[bool]
+                   ) -> list[Contender]:
+        """Return poses as contenders, with their odds by objects."""
+        poses = np.array([finalist.map_from_camera for finalist in finalists]).reshape(-1, 4, 4)
+        matches = [matches_of(self.rig, finalist) for finalist in finalists]
+        supports = self.supports(poses, matches)
+        handicaps = np.where(upright, 0.0, CALIBRATION.attitude.wrong_mount) \
+            if self.knows_vertical else tilt_handicaps(poses, self.options.tilt_deviation_deg)
+        region = self.frames[-1].observation.region
+        priors = np.zeros(len(poses)) if region is None else region_odds(
+            self.landmark_map, region, poses)
+        return list(map(Contender, finalists, poses, matches, supports, upright,
+                        handicaps.tolist(), (utilities(supports) - handicaps).tolist(),
+                        priors.tolist()))
+
+    def supports(self, poses: NDArray[np.float64],
+                 matches: Sequence[list[tuple[Match, ...]]]) -> list[Support]:
+        """Return the support of each pose (m, 4, 4), from its matches in each frame."""
+        last_from_cameras = np.linalg.inv(self.cameras)
+        return [support(self.landmark_map, self.compared, pose @ last_from_cameras, found)
+                for pose, found in zip(poses, matches, strict=True)]
+
+    def refined(self, start: Finalist) -> Finalist:
+        """Refine a pose that the search did not find, if the options ask for refinement."""
+        if not self.options.refine:
+            return start
+        return start._replace(**refine_rig(self.rig, start.rotation, start.translation)._asdict())
 
 
-def supports_of(joined: JoinedFrames, poses: NDArray[np.float64],
-                matches: Sequence[list[tuple[Match, ...]]]) -> list[Support]:
-    """Return the support of each pose (m, 4, 4), from its matches in each frame."""
-    last_from_cameras = np.linalg.inv(joined.cameras)
-    return [support(joined.landmark_map, joined.compared, pose @ last_from_cameras, found)
-            for pose, found in zip(poses, matches, strict=True)]
+def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
+                frames: Sequence[SearchedFrame]) -> JoinedFrames:
+    """Join searched frames, the last of which is to be localized.
+
+    Raises
+    ------
+    OptionsError
+        odom_from_camera is missing or not a rigid transform; there are no frames or too many.
+    """
+    cameras = cameras_from_last([frame.observation for frame in frames])
+    rig = make_rig([frame.scene for frame in frames], cameras,
+                   np.stack([frame.vertical for frame in frames]), landmark_map.position_sigmas)
+    return JoinedFrames(landmark_map, options, frames, rig, cameras)
 
 
 def unrefined(map_from_camera: NDArray[np.float64]) -> Finalist:
     """Return a pose (4, 4) of another source as a finalist without score or sample."""
     pose = invert_transform(map_from_camera)
     return Finalist(np.ascontiguousarray(pose[:3, :3]), pose[:3, 3].copy(), 0.0, 0, _NONE)
-
-
-def refined(joined: JoinedFrames, start: Finalist) -> Finalist:
-    """Refine a pose that the search did not find, if the options ask for refinement."""
-    if not joined.options.refine:
-        return start
-    return start._replace(**refine_rig(joined.rig, start.rotation, start.translation)._asdict())

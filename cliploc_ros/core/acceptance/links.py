@@ -29,17 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.comparison import Comparison
-from cliploc_ros.core.acceptance.confidence import none_right
-from cliploc_ros.core.acceptance.contenders import (
-    Contender,
-    JoinedFrames,
-    contenders_of,
-    join_frames,
-    refined,
-    unrefined,
-)
+from cliploc_ros.core.acceptance.contenders import Contender, JoinedFrames, join_frames, unrefined
 from cliploc_ros.core.calibration import CALIBRATION
-from cliploc_ros.core.fit.finalists import instants_of
 from cliploc_ros.core.geometry.transforms import SAME_LOOK, invert_transform
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.search.frame_search import SearchedFrame
@@ -61,12 +52,12 @@ def weakest_link(joined: JoinedFrames, pose: NDArray[np.float64], seen: Recognit
     `seen` has the places of the newest image by keyframes. `meet` returns the best poses of some
     of the frames, see search_contenders.
     """
-    instants, stamps = instants_of(joined.frames), [
+    instants, stamps = joined.instants, [
         frame.observation.stamp_ns for frame in joined.frames]
     starts = [row for row in range(1, len(stamps)) if instants[row] != instants[row - 1]]
     if not starts:
         return Link()
-    none, terms = none_right(joined.setting), CALIBRATION.links
+    none, terms = joined.none_right, CALIBRATION.links
 
     def part(first: int, end: int) -> tuple[JoinedFrames, NDArray[np.float64], float]:
         """Return some of the frames, the pose of their last camera, and its utility."""
@@ -74,15 +65,15 @@ def weakest_link(joined: JoinedFrames, pose: NDArray[np.float64], seen: Recognit
         own = join_frames(joined.landmark_map, joined.options, frames)
         its = pose @ invert_transform(joined.cameras[end - 1])
         # odometry is not exact
-        fits = [unrefined(its), refined(own, unrefined(its))]
+        fits = [unrefined(its), own.refined(unrefined(its))]
         fits = [fit for fit in fits if SAME_LOOK.agree(fit.map_from_camera, its)]
         # the support of a pose without matches does not count unexplained objects
         index = joined.landmark_map.classes
         lost = CALIBRATION.objects.unexplained * sum(
             index.are_own(index.classes_of(frame.observation.detections.class_ids)).sum()
             for frame in frames) / len(frames)
-        return own, its, max(fit.odds if fit.support.inliers else lost for fit in contenders_of(
-            own, fits, [True] * len(fits)))
+        return own, its, max(fit.odds if fit.support.inliers else lost for fit in own.contenders(
+            fits, [True] * len(fits)))
 
     newest, its, utility = part(starts[-1], len(stamps))
     met = meet(newest)

@@ -24,14 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.confidence import points_utility, utilities
-from cliploc_ros.core.acceptance.contenders import (
-    Contender,
-    JoinedFrames,
-    contenders_of,
-    join_frames,
-    refined,
-    unrefined,
-)
+from cliploc_ros.core.acceptance.contenders import Contender, JoinedFrames, join_frames, unrefined
 from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.verification import scores_of
 from cliploc_ros.core.geometry.transforms import (
@@ -72,6 +65,17 @@ class Alignment(NamedTuple):
     away_m: float  #: Distance from the given pose
     away_deg: float
 
+    def by_keyframes(self, recognizer: ImageRecognizer, given: NDArray[np.float64]) -> float:
+        """Return the log odds that the given pose (4, 4) is right, from keyframes."""
+        terms = CALIBRATION.keyframes
+        seen = recognizer.recognize([given], constraint_of(self.joined.frames[0].observation,
+                                                           self.joined.options))
+        here, elsewhere = (max([0.0] + [
+            points_utility(place) for place in seen.places
+            if SAME_ANSWER.agree(place.map_from_camera, given) == near]) for near in (True, False))
+        missed = 0.0 if here or not seen.is_complete else terms.missed * recognizer.coverage(given)
+        return here - elsewhere + missed
+
 
 def look_at(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions
             ) -> JoinedFrames:
@@ -100,8 +104,8 @@ def align(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Alignme
     finalists = [unrefined(map_from_camera),
                  *(unrefined(starts[row]) for row in _APART.distinct(starts, int(_TERMS.refined)))]
     if len(finalists) > 1:
-        finalists += [refined(joined, finalist) for finalist in finalists]
-    found = contenders_of(joined, finalists, [True] * len(finalists))
+        finalists += [joined.refined(finalist) for finalist in finalists]
+    found = joined.contenders(finalists, [True] * len(finalists))
     errors = [pose_error(contender.pose, map_from_camera) for contender in found]
     near = [row for row, error in enumerate(errors)
             if error[0] < SAME_NEIGHBOURHOOD.distance_m
@@ -140,6 +144,18 @@ class LookEvidence(NamedTuple):
             'missed': float(self.missed), 'away': math.log1p((self.away_m / _TERMS.away_m) ** 2),
             'turned': math.log1p((self.away_deg / _TERMS.turned_deg) ** 2), 'crowd': self.crowd}
 
+    def log_odds(self, is_full: bool, calibration: Calibration = CALIBRATION) -> float:
+        """Return the log odds that the given pose is right, from the objects of a look.
+
+        At a right pose, the place may be unmapped or the view without objects. So the evidence of
+        a look that is not full against a pose is limited.
+        """
+        terms = calibration.watch
+        if not self.known:
+            return 0.0  # something may occlude all objects
+        found = sum(terms[name] * value for name, value in self.terms.items())
+        return min(max(found, terms.least if is_full else terms.least_unsure), terms.most)
+
 
 def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
     """Measure the evidence of an aligned look, and find the landmarks that it should show."""
@@ -159,33 +175,6 @@ def measure(alignment: Alignment) -> tuple[LookEvidence, Expected]:
     return LookEvidence(int(own.sum()), round(fit.support.inliers), unexplained, float(utility),
                         len(found.landmarks), int((~found.was_seen).sum()), alignment.away_m,
                         alignment.away_deg, math.log1p(pairs)), found
-
-
-def log_odds(evidence: LookEvidence, is_full: bool, calibration: Calibration = CALIBRATION
-             ) -> float:
-    """Return the log odds that the given pose is right, from the objects of a look.
-
-    At a right pose, the place may be unmapped or the view without objects. So the evidence of a
-    look that is not full against a pose is limited.
-    """
-    terms = calibration.watch
-    if not evidence.known:
-        return 0.0  # something may occlude all objects
-    found = sum(terms[name] * value for name, value in evidence.terms.items())
-    return min(max(found, terms.least if is_full else terms.least_unsure), terms.most)
-
-
-def by_keyframes(recognizer: ImageRecognizer, alignment: Alignment,
-                 given: NDArray[np.float64]) -> float:
-    """Return the log odds that a given pose (4, 4) is right, from keyframes."""
-    joined, terms = alignment.joined, CALIBRATION.keyframes
-    constraint = constraint_of(joined.frames[0].observation, joined.options)
-    seen = recognizer.recognize([given], constraint)
-    here, elsewhere = (max([0.0] + [
-        points_utility(place) for place in seen.places
-        if SAME_ANSWER.agree(place.map_from_camera, given) == near]) for near in (True, False))
-    missed = 0.0 if here or not seen.is_complete else terms.missed * recognizer.coverage(given)
-    return here - elsewhere + missed
 
 
 def by_vertical(map_from_camera: NDArray[np.float64], up_in_camera: NDArray[np.float64] | None,

@@ -26,15 +26,7 @@ from cliploc_ros.core.observation import Observation, tilt_deg
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import vertical_of
 from cliploc_ros.core.watch.camera import CameraTurn, ImageFaults, TurnEstimate
-from cliploc_ros.core.watch.look import (
-    LookEvidence,
-    align,
-    by_keyframes,
-    by_vertical,
-    log_odds,
-    look_at,
-    measure,
-)
+from cliploc_ros.core.watch.look import LookEvidence, align, by_vertical, look_at, measure
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
@@ -207,10 +199,10 @@ class Watch:
         # where the map is out of date, unexplained objects are no evidence of a wrong pose
         is_full = evidence.is_full(self._belief.has_jumped) and (
             self._belief.has_jumped or not self._missing.is_outdated)
-        odds = log_odds(evidence, is_full) + by_vertical(
+        odds = evidence.log_odds(is_full) + by_vertical(
             given, observation.up_in_camera, self._options.vertical_deviation_deg)
         if recognizer is not None:
-            by_points = by_keyframes(recognizer, alignment, given)
+            by_points = alignment.by_keyframes(recognizer, given)
             is_full |= by_points < CALIBRATION.watch.elsewhere
             odds += by_points
         if odds == 0.0:
