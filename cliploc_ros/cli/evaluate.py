@@ -347,7 +347,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap',
         recording = recording_options(options, EVERY_FRAME, options.every, camera)
         found = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
                                  options.landmark_embeddings)
-        if without := frames.count - len(found):
+        if without := frames.count - len(found.frames):
             print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',
                   flush=True)
         if options.save_queries is not None:

@@ -46,7 +46,7 @@ def queries(office, office_map) -> Queries:
 @pytest.fixture(scope='session')
 def observed(queries):
     """Turn a recorded query frame into an observation."""
-    camera = replace(queries[0].observation.camera, width=640, height=480)
+    camera = replace(queries.frames[0].observation.camera, width=640, height=480)
     return lambda frame: replace(frame.observation, camera=camera)
 
 

@@ -6,7 +6,7 @@ The networks run once: mapping, evaluation and the map editor read the same obse
 file also holds the similarities to a map's labels, so that all methods get identical input.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -94,18 +94,6 @@ class Queries:
 
     landmark_ids: tuple[str, ...]  #: The landmark of each column of the similarities
     frames: tuple[PosedQuery, ...]  #: In the file's order; all have the same camera
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self.frames)
-
-    def __iter__(self) -> Iterator[PosedQuery]:
-        """Iterate over the frames."""
-        return iter(self.frames)
-
-    def __getitem__(self, index: int) -> PosedQuery:
-        """Return a frame."""
-        return self.frames[index]
 
 
 def _stamps_ns(arrays: npz.Arrays) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ The recordings have the topics of the nodes, with recorded detections if there a
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -30,8 +30,6 @@ _SECONDS = {'s': Decimal(1), 'ms': Decimal('1e-3'), 'us': Decimal('1e-6'), 'µs'
 _METRES = {'mm': 0.001, 'cm': 0.01}
 # Files of the dataset have quaternions of four decimals.
 _MAX_NORM_ERROR = 0.05
-#: Wraps an iterable of the stamp [ns] and file of each image, and shows progress.
-Progress = Callable[[Iterable[tuple[int, Path]]], Iterable[tuple[int, Path]]]
 _NAMESPACE = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*/?|/?')
 _IMU_FRAME = 'imu'  # of the accelerometer; TUM does not give its mount
 _CODECS = {b'\x89PNG': 'png', b'\xff\xd8\xff': 'jpeg'}
@@ -217,9 +215,9 @@ class ConversionOptions:
 
 
 def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
-                options: ConversionOptions, detections: Mapping[int, Detections] | None = None,
-                progress: Progress = iter) -> Counter[str]:
-    """Write a sequence as a rosbag2 recording.
+                options: ConversionOptions, detections: Mapping[int, Detections] | None = None
+                ) -> Counter[str]:
+    """Write a sequence as a rosbag2 recording; show a progress bar on a terminal.
 
     Return the numbers of ``poses`` (images with ground truth), ``detections`` (images with an
     entry of recorded detections, which may be empty) and ``accelerations``.
@@ -237,10 +235,10 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
         The folder to make.
     detections : mapping of int to Detections, optional
         Recorded detections by stamp [ns].
-    progress : callable
-        Wraps the iterable of images, to show progress.
     """
-    # only this needs rosbags; core tests with few packages read trajectories
+    # only this needs rosbags and tqdm; core tests with few packages read trajectories
+    from tqdm import tqdm
+
     from cliploc_ros.offline.datasets import bag_messages
     from cliploc_ros.offline.datasets.bags import BagWriter
 
@@ -264,8 +262,8 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
         bag.add_topic(pose_topic, bag_messages.POSE)
         if detections is not None:
             bag.add_topic(boxes_topic, bag_messages.DETECTIONS)
-        for stamp_ns, path in progress(
-                list(zip(sequence.stamps_ns, sequence.image_paths, strict=True))):
+        for stamp_ns, path in zip(sequence.stamps_ns, tqdm(
+                sequence.image_paths, unit='image', disable=None), strict=True):
             # decoded in any case, to refuse a damaged file before a node receives it
             pixels_rgb, _ = read_color(ImageFile(stamp_ns, path, camera))
             if is_compressed:

@@ -94,7 +94,7 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
     return tuple(replace(query, observation=replace(
         query.observation, similarities=np.ascontiguousarray(
             np.asarray(query.observation.similarities, dtype=np.float32)[:, columns])))
-        for query in queries if every_frame or query.is_main)
+        for query in queries.frames if every_frame or query.is_main)
 
 
 def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float

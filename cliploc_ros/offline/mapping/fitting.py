@@ -26,7 +26,7 @@ from cliploc_ros.offline.mapping.landmarks import (
     linearize_box,
     move_ellipsoid,
 )
-from cliploc_ros.offline.mapping.views import Views
+from cliploc_ros.offline.mapping.views import NO_SIZE, Views
 
 #: Scale of the Cauchy loss, in standard deviations of an edge.
 LOSS_SCALE = 1.5
@@ -86,7 +86,8 @@ def centre_covariance(views: Views, rows: NDArray[np.int64], center: NDArray[np.
     centre, the covariance is a large multiple of the identity. The size of the class is ignored.
     """
     information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-    accumulate(views.without_sizes, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
+    without_sizes = views._replace(sizes=np.full_like(views.sizes, NO_SIZE))
+    accumulate(without_sizes, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
     alike = 1.0 + _ALIKE * len(np.unique(views.viewpoints[views.frames[rows]]))
     try:
         covariance = alike * np.linalg.inv(information)[:3, :3]
@@ -101,9 +102,8 @@ def centre_covariance(views: Views, rows: NDArray[np.int64], center: NDArray[np.
 def descend(views, rows, center, basis, iterations):
     """Improve center and basis in place, and return the cost."""
     information, gradient = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE)), np.zeros(LANDMARK_SIZE)
-    trial_information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-    trial_gradient = np.zeros(LANDMARK_SIZE)
-    trial_center, trial_basis = np.zeros(3), np.zeros((3, 3))
+    trial_information, trial_gradient = information.copy(), gradient.copy()
+    trial_center, trial_basis = center.copy(), basis.copy()
     cost = accumulate(views, rows, center, basis, information, gradient)
     damping = 1e-3
     for _ in range(iterations):
@@ -171,9 +171,7 @@ def accumulate(views, rows, center, basis, information, gradient):
         cost += share * add_depth(views, row, center, share, information, gradient)
     size = _largest(views.sizes[rows], np.zeros_like(rows), 1)[0]
     cost += add_axis_prior(basis, size, information, gradient)
-    for i in range(LANDMARK_SIZE):
-        for j in range(i):
-            information[j, i] = information[i, j]
+    information += np.tril(information, -1).T
     return cost
 
 
@@ -364,9 +362,5 @@ def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_pose
         lower = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
         cost += add_axis_prior(bases[landmark], sizes[landmark], lower,
                                landmark_gradient[landmark])
-        for i in range(LANDMARK_SIZE):
-            for j in range(i + 1):
-                of_landmarks[landmark, i, j] += lower[i, j]
-                if i != j:
-                    of_landmarks[landmark, j, i] += lower[i, j]
+        of_landmarks[landmark] += lower + np.tril(lower, -1).T
     return cost

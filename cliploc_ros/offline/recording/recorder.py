@@ -15,6 +15,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ from cliploc_ros.offline.datasets.observations import load_observations, save_ob
 from cliploc_ros.offline.datasets.poses import Poses
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections, group_cameras
 from cliploc_ros.offline.mapping.views import KeyframeFilter, KeyframeOptions
-from cliploc_ros.offline.recording.networks import LoadNetworks, SeenFrame
+from cliploc_ros.offline.recording.networks import SeenFrame, load_networks
 from cliploc_ros.units import NS_PER_S
 
 logger = logging.getLogger(__name__)
@@ -72,14 +73,14 @@ class RecordingOptions:
     scheduler: str = ''  #: Address of a Dask scheduler; '' for none
 
     @property
-    def networks(self) -> LoadNetworks:
+    def networks(self) -> Callable[[], Callable[[RawFrame], SeenFrame | str]]:
         """Return a function that loads the networks.
 
         PyTorch's rounding depends on the number of threads. With one thread per worker, the result
         is the same for any number of workers and on a cluster.
         """
         threads = 0 if self.workers == 1 and not self.scheduler else 1
-        return LoadNetworks(self.detector, self.clip, threads)
+        return partial(load_networks, self.detector, self.clip, threads)
 
 
 def observation_file(frames: Frames, options: RecordingOptions) -> Path:
