@@ -39,8 +39,8 @@ def office_map(office) -> LandmarkMap:
 
 
 @pytest.fixture(scope='session')
-def queries(office, office_map) -> Queries:
-    return load_queries(office / 'queries.npz', office_map.landmark_ids)
+def queries(office) -> Queries:
+    return load_queries(office / 'queries.npz')
 
 
 @pytest.fixture(scope='session')

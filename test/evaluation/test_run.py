@@ -94,6 +94,10 @@ def test_similarities_follow_the_maps_order(room, recording, questions):
     for query, other in zip(make_queries(turned, room), questions, strict=True):
         np.testing.assert_array_equal(query.observation.similarities,
                                       other.observation.similarities)
+    for other_ids, names in ((turned.landmark_ids[1:], turned.landmark_ids[0]),
+                             (('lamp', *turned.landmark_ids, 'vase'), "lamp' and 1 more")):
+        with pytest.raises(DatasetError, match=f'another map.*{names}'):
+            make_queries(replace(turned, landmark_ids=other_ids), room)
 
 
 def test_what_a_robot_asks_about_a_frame(questions):

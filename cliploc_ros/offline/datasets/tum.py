@@ -152,18 +152,18 @@ def _role(name: str) -> str:
     return f'{kind}{word[-1]}' if kind and word[-1] in 'xyzw' else ''
 
 
-def read_tum_accelerometer(path: Path) -> tuple[list[int], NDArray[np.float64]]:
-    """Read the stamps [ns] and accelerations (n, 3) [m/s^2] of an accelerometer.txt.
+def read_tum_accelerometer(path: Path) -> list[tuple[int, NDArray[np.float64]]]:
+    """Read the stamps [ns] and accelerations (3,) [m/s^2] of an accelerometer.txt.
 
     DatasetError: a line does not hold four finite numbers; the message names file and line.
     """
-    stamps_ns, rows = [], []
+    found = []
     for where, (stamp, *cells) in parsing.read_cells(path, 'timestamp ax ay az'):
-        stamps_ns.append(parsing.parse_stamp_ns(stamp, where))
-        rows.append(parsing.parse_all(cells, float, where))
-        if not np.all(np.isfinite(rows[-1])):
+        acceleration = np.array(parsing.parse_all(cells, float, where))
+        if not np.isfinite(acceleration).all():
             raise DatasetError(f'{where}: {" ".join(cells)!r} is not finite')
-    return stamps_ns, np.array(rows).reshape(-1, 3)
+        found.append((parsing.parse_stamp_ns(stamp, where), acceleration))
+    return found
 
 
 def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
@@ -253,8 +253,7 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
     boxes_topic = options.topic('detections')
     frame, written = options.camera_frame, Counter[str]()
     accelerometer = sequence.folder / 'accelerometer.txt'
-    stamps_ns, accelerations = (read_tum_accelerometer(accelerometer) if accelerometer.exists()
-                                else ([], np.empty((0, 3))))
+    accelerations = read_tum_accelerometer(accelerometer) if accelerometer.exists() else []
     with BagWriter(output, options.storage) as bag:
         bag.add_topic(image_topic, bag_messages.COMPRESSED_IMAGE if is_compressed
                       else bag_messages.IMAGE)
@@ -287,10 +286,10 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
                 bag.write(pose_topic, stamp_ns, bag_messages.pose_message(
                     stamp_ns, options.world_frame, map_from_camera))
                 written['poses'] += 1
-        if stamps_ns:
+        if accelerations:
             imu_topic = options.topic('imu')
             bag.add_topic(imu_topic, bag_messages.IMU)
-            for stamp_ns, acceleration in zip(stamps_ns, accelerations, strict=True):
+            for stamp_ns, acceleration in accelerations:
                 bag.write(imu_topic, stamp_ns, bag_messages.imu_message(
                     stamp_ns, _IMU_FRAME, acceleration))
                 written['accelerations'] += 1

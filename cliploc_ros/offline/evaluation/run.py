@@ -184,7 +184,8 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     write_text(out / 'run.json', json.dumps(about, indent=1) + '\n')
     write_text(out / 'table.md', '\n\n'.join([summary.as_markdown(rows), *remarks, '\n'.join(
         f'- {name}: {value}' for name, value in facts)]) + '\n')
-    write_text(out / 'results.json', summary.as_json(shown))
+    lines = ',\n'.join(json.dumps(vars(result)) for result in shown)
+    write_text(out / 'results.json', f'[\n{lines}\n]\n')
     write_text(out / 'table.tex', ''.join(
         f'% {name}: {value}\n' for name, value in facts) + summary.as_latex(rows))
     write_text(out / 'summary.csv', summary.as_csv(summaries, summary.relative_errors(

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Associate boxes with landmarks: one to one in every frame, with the greatest total overlap."""
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -16,23 +14,19 @@ from cliploc_ros.offline.mapping.views import Views
 ASSOCIATION_IOU = 0.2
 
 
-class Overlaps(NamedTuple):
-    """Pairs of a box and a landmark with its class that overlap, in the order of the boxes."""
+def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float
+                  ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Return the pairs of a box and a landmark with its class that overlap by more than min_iou.
 
-    #: (p,)
-    boxes: NDArray[np.int64]
-    landmarks: NDArray[np.int64]
-    ious: NDArray[np.float64]  #: (p,): of box and projected box, clipped to the image
-
-
-def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float) -> Overlaps:
-    """Return the pairs that overlap by more than min_iou, for each class of a landmark."""
+    They are the boxes, the landmarks, and the IoUs of box and projected box, clipped to the image
+    (p,), in the order of the boxes.
+    """
     names = landmarks.names[np.argsort(landmarks.names[:, 1], kind='stable')]
     starts = np.searchsorted(names[:, 1], np.arange(views.classes.max(initial=0) + 2))
     boxes, numbers, ious = _overlaps(views, landmarks.centers, landmarks.bases, names[:, 0],
                                      starts, min_iou)
     order = np.lexsort((numbers, boxes))
-    return Overlaps(boxes[order], numbers[order], ious[order])
+    return boxes[order], numbers[order], ious[order]
 
 
 @compiled

@@ -92,9 +92,9 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 
 def best_ious(views: Views, landmarks: Landmarks) -> NDArray[np.float64]:
     """Return the greatest IoU (n,) of each box with any landmark of its class, 0 for none."""
-    overlaps = find_overlaps(views, landmarks, 0.0)
+    boxes, _, ious = find_overlaps(views, landmarks, 0.0)
     best = np.zeros(len(views.frames))
-    np.maximum.at(best, overlaps.boxes, overlaps.ious)
+    np.maximum.at(best, boxes, ious)
     return best
 
 
