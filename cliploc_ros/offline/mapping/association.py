@@ -35,10 +35,7 @@ def _overlaps(views, centers, bases, members, starts, min_iou):
 
     Class k has the landmarks members[starts[k]:starts[k + 1]].
     """
-    capacity = 4 * len(views.frames) + 64
-    boxes, landmarks = np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64)
-    ious = np.empty(capacity)
-    count = 0
+    boxes, landmarks, ious = [], [], []
     projected = np.empty((len(centers), 4))
     projected_in = np.full(len(centers), -1)
     visible = np.zeros(len(centers), dtype=np.bool_)
@@ -54,14 +51,10 @@ def _overlaps(views, centers, bases, members, starts, min_iou):
                 continue
             iou = box_iou(projected[landmark], views.edges[row], views.bounds[frame])
             if iou > min_iou:
-                if count == capacity:
-                    capacity *= 2
-                    boxes = np.append(boxes, np.empty_like(boxes))
-                    landmarks = np.append(landmarks, np.empty_like(landmarks))
-                    ious = np.append(ious, np.empty_like(ious))
-                boxes[count], landmarks[count], ious[count] = row, landmark, iou
-                count += 1
-    return boxes[:count].copy(), landmarks[:count].copy(), ious[:count].copy()
+                boxes.append(row)
+                landmarks.append(landmark)
+                ious.append(iou)
+    return np.array(boxes), np.array(landmarks), np.array(ious)
 
 
 def associate(views: Views, landmarks: Landmarks, min_iou: float = ASSOCIATION_IOU,

@@ -311,20 +311,17 @@ def _hidden(place, near, boxes, distances, radii, is_solid, shown, edges, first,
     count = 0
     for k in range(len(_GRID)):
         x, y = x0 + a * _GRID[k, 0], y0 + b * _GRID[k, 1]
-        is_hidden = False
         for other in near:
             if (is_solid[other] and other != place
                     and distances[other] + radii[other] < distances[place]
                     and _covers(boxes[other], x, y)):
-                is_hidden = True
+                count += 1
                 break
-        if not is_hidden:
+        else:
             for row in range(first, last):
                 if shown[row] < 0 and _covers(edges[row], x, y):
-                    is_hidden = True
+                    count += 1
                     break
-        if is_hidden:
-            count += 1
     return count / len(_GRID)
 
 

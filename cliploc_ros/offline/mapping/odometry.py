@@ -111,7 +111,7 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
     if not kept.all():
         first_s = given.stamps_s[frames[before[~kept][0]]]
         note += f'; jumps left out: {np.count_nonzero(~kept)}, the first at {first_s:.2f} s'
-    return Steps(*(column[kept] for column in pairs.steps)), note
+    return Steps._make(column[kept] for column in pairs.steps), note
 
 
 class _Compared(NamedTuple):

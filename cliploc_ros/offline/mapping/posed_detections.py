@@ -141,10 +141,9 @@ def group_cameras(cameras: Sequence[Camera]
     rows = {}
     for camera in dict.fromkeys(cameras):
         for row, other in enumerate(found):
-            differences = np.array([camera.fx - other.fx, camera.fy - other.fy,
-                                    camera.cx - other.cx, camera.cy - other.cy]) / other.fx
-            if ((camera.width, camera.height) == (other.width, other.height)
-                    and np.abs(differences).max() < _SAME_CAMERA):
+            change = np.abs(camera.matrix - other.matrix).max() / other.fx
+            if (camera.width, camera.height) == (other.width, other.height) and (
+                    change < _SAME_CAMERA):
                 rows[camera] = row
                 break
         else:

@@ -72,16 +72,6 @@ class RecordingOptions:
     workers: int = 1  #: Number of local processes; the result does not depend on it
     scheduler: str = ''  #: Address of a Dask scheduler; '' for none
 
-    @property
-    def networks(self) -> Callable[[], Callable[[RawFrame], SeenFrame | str]]:
-        """Return a function that loads the networks.
-
-        PyTorch's rounding depends on the number of threads. With one thread per worker, the result
-        is the same for any number of workers and on a cluster.
-        """
-        threads = 0 if self.workers == 1 and not self.scheduler else 1
-        return partial(load_networks, self.detector, self.clip, threads)
-
 
 def observation_file(frames: Frames, options: RecordingOptions) -> Path:
     """Return the path of the observation file next to a source; see `describe`."""
@@ -258,6 +248,10 @@ def _record(frames: Frames, options: RecordingOptions, described: str, outputs: 
         logger.warning('using the boxes of %d images of earlier runs: %s', len(earlier),
                        outputs.path)
     seen, unusable, is_kept = list[SeenFrame](), list[str](), bool(earlier)
+    # PyTorch's rounding depends on the number of threads: with one thread per worker, the result
+    # is the same for any number of workers and on a cluster
+    networks = partial(load_networks, options.detector, options.clip,
+                       threads=0 if options.workers == 1 and not options.scheduler else 1)
 
     def unseen(raws: Iterator[RawFrame]) -> Iterator[RawFrame]:
         for raw in raws:
@@ -267,7 +261,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, outputs: 
                 seen.append(_again(found, raw))
     try:
         with _read_keyframes(frames, options.keyframes) as (raws, filters):
-            for _, result in run_tasks(options.networks, unseen(raws), workers=options.workers,
+            for _, result in run_tasks(networks, unseen(raws), workers=options.workers,
                                        scheduler=options.scheduler):
                 if isinstance(result, str):
                     unusable.append(result)
