@@ -226,15 +226,13 @@ def _open_outputs(path: Path) -> Iterator[Log]:
 
 def _again(seen: SeenFrame, raw: RawFrame) -> SeenFrame:
     """Return an earlier output for an image with its present pose and depth."""
-    unknown = np.full(len(seen.scores), np.nan, dtype=np.float32)
-    depths = unknown, unknown
+    depths = spreads = np.full(len(seen.scores), np.nan, dtype=np.float32)
     if raw.depth is not None:
-        frame = raw.decode()
-        assert frame.depth is not None
-        depths = depths_of_boxes(frame.depth, frame.camera, seen.bboxes_in_image)
+        _, camera = raw.color()
+        depths, spreads = depths_of_boxes(raw.depth(), camera, seen.bboxes_in_image)
     assert raw.map_from_camera is not None
-    return replace(seen, map_from_camera=raw.map_from_camera, depths=depths[0],
-                   depth_spreads=depths[1])
+    return replace(seen, map_from_camera=raw.map_from_camera, depths=depths,
+                   depth_spreads=spreads)
 
 
 def _record(frames: Frames, options: RecordingOptions, described: str, outputs: Log,
