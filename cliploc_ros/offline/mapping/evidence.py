@@ -110,10 +110,7 @@ def is_expected(views, cameras, center, basis, reach):
     """Return a mask of the frames (F,) in which an ellipsoid is visible within reach [m]."""
     expected, box = np.zeros(len(cameras), dtype=np.bool_), np.empty(4)
     for frame in range(len(cameras)):
-        distance_2 = 0.0
-        for i in range(3):
-            distance_2 += (center[i] - cameras[frame, i]) ** 2
-        if distance_2 > reach * reach:
+        if np.square(center - cameras[frame]).sum() > reach * reach:
             continue
         expected[frame] = project_box(
             views.rotations[frame], views.translations[frame], center, basis, box
@@ -264,9 +261,8 @@ def _count_views(views, centers, bases, radii, reaches, least, is_solid, shown):
                 near[in_front] = place
                 in_front += 1
         was_seen = np.zeros(count, dtype=np.bool_)
-        for row in range(first, last):
-            if shown[row] >= 0:
-                was_seen[shown[row]] = True
+        numbers = shown[first:last]
+        was_seen[numbers[numbers >= 0]] = True
         in_view = was_seen.copy()
         for i in range(in_front):
             place = near[i]

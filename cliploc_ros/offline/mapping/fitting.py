@@ -107,9 +107,7 @@ def descend(views, rows, center, basis, iterations):
     cost = accumulate(views, rows, center, basis, information, gradient)
     damping = 1e-3
     for _ in range(iterations):
-        damped = information.copy()
-        for i in range(LANDMARK_SIZE):
-            damped[i, i] += damping * information[i, i] + 1e-9
+        damped = information + np.diag(damping * np.diag(information) + 1e-9)
         step = np.linalg.solve(damped, -gradient)
         limit_step(step, basis)
         move_ellipsoid(center, basis, step, trial_center, trial_basis)
@@ -134,9 +132,8 @@ def descend(views, rows, center, basis, iterations):
 def limit_step(step, basis):
     """Shorten a step (9,) that exceeds the range of its linearization."""
     size = sqrt((basis * basis).sum())
-    largest = sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2]) / size
-    for i in range(3, LANDMARK_SIZE):
-        largest = max(largest, abs(step[i]))
+    length = sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    largest = max(length / size, np.abs(step[3:]).max())
     if largest > _MAX_STEP:
         step *= _MAX_STEP / largest
 
@@ -171,7 +168,8 @@ def accumulate(views, rows, center, basis, information, gradient):
         cost += share * add_depth(views, row, center, share, information, gradient)
     size = _largest(views.sizes[rows], np.zeros_like(rows), 1)[0]
     cost += add_axis_prior(basis, size, information, gradient)
-    information += np.tril(information, -1).T
+    # only the lower triangle was summed up
+    information[:] = np.tril(information) + np.tril(information, -1).T
     return cost
 
 
@@ -188,11 +186,9 @@ def add_depth(views, row, center, share, information, gradient):
         depth += direction[i] * center[i]
     residual = (depth - views.depths[row]) * stiffness
     weight = share * robust_weight(residual)
-    for i in range(3):
-        scaled = weight * stiffness * direction[i]
-        gradient[i] += scaled * residual
-        for j in range(i + 1):
-            information[i, j] += scaled * stiffness * direction[j]
+    scaled = weight * stiffness * direction
+    gradient[:3] += scaled * residual
+    information[:3, :3] += np.outer(scaled * stiffness, direction)
     return robust_cost(residual)
 
 
@@ -251,12 +247,11 @@ def add_axis_prior(basis, size, information, gradient):
             weight = robust_weight(excess)
             gradient[diagonal[k]] += 0.5 * weight * size[1] * excess
             information[diagonal[k], diagonal[k]] += 0.25 * weight * size[1] * size[1]
+        slopes = (0.5 * (np.arange(3) == k) - 1.0 / 6.0) / _AXIS_SPREAD
         for i in range(3):
-            slope = ((0.5 if i == k else 0.0) - 1.0 / 6.0) / _AXIS_SPREAD
-            gradient[diagonal[i]] += slope * residual
+            gradient[diagonal[i]] += slopes[i] * residual
             for j in range(i + 1):
-                other = ((0.5 if j == k else 0.0) - 1.0 / 6.0) / _AXIS_SPREAD
-                information[diagonal[i], diagonal[j]] += slope * other
+                information[diagonal[i], diagonal[j]] += slopes[i] * slopes[j]
     # The off-diagonal numbers rotate the axes, which boxes of a sphere do not constrain: weak
     # damping without a target keeps the equations regular.
     for off in (4, 5, 7):
@@ -333,12 +328,7 @@ def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_pose
         # a pose error in the map's axes moves the map the opposite way in the camera's axes
         by_pose = np.concatenate((-by_motion[:, :3] @ rotation, -by_motion[:, 3:] @ rotation),
                                  axis=1)
-        x, y, z = views.levers[frame]
-        for edge in range(4):
-            across = by_pose[edge, :3]
-            by_pose[edge, 3] += y * across[2] - z * across[1]
-            by_pose[edge, 4] += z * across[0] - x * across[2]
-            by_pose[edge, 5] += x * across[1] - y * across[0]
+        by_pose[:, 3:] += np.cross(views.levers[frame], by_pose[:, :3])
         for edge in range(4):
             residual = edge_residual(views, row, edge, box)
             if residual == 0.0:
@@ -347,17 +337,11 @@ def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_pose
             stiffness = views.stiffness[row, edge]
             weight = share * robust_weight(residual) * stiffness * stiffness
             pull = share * robust_weight(residual) * stiffness * residual
-            for i in range(LANDMARK_SIZE):
-                landmark_gradient[landmark, i] += pull * by_landmark[edge, i]
-                for j in range(LANDMARK_SIZE):
-                    of_landmarks[landmark, i, j] += (weight * by_landmark[edge, i]
-                                                     * by_landmark[edge, j])
-            for i in range(POSE_SIZE):
-                pose_gradient[frame, i] += pull * by_pose[edge, i]
-                for j in range(POSE_SIZE):
-                    of_poses[frame, i, j] += weight * by_pose[edge, i] * by_pose[edge, j]
-                for j in range(LANDMARK_SIZE):
-                    of_boxes[place, i, j] += weight * by_pose[edge, i] * by_landmark[edge, j]
+            landmark_gradient[landmark] += pull * by_landmark[edge]
+            pose_gradient[frame] += pull * by_pose[edge]
+            of_landmarks[landmark] += np.outer(weight * by_landmark[edge], by_landmark[edge])
+            of_poses[frame] += np.outer(weight * by_pose[edge], by_pose[edge])
+            of_boxes[place] += np.outer(weight * by_pose[edge], by_landmark[edge])
     for landmark in range(len(centers)):
         lower = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
         cost += add_axis_prior(bases[landmark], sizes[landmark], lower,

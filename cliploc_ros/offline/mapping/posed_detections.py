@@ -103,8 +103,7 @@ class PosedDetections:
         """Return the detections of some frames, in the order given."""
         frames = np.asarray(frames, dtype=np.int64)
         starts, ends = self.frame_offsets[frames], self.frame_offsets[frames + 1]
-        rows = [np.arange(start, end) for start, end in zip(starts, ends, strict=True)]
-        boxes = np.concatenate([np.empty(0, dtype=np.int64), *rows])
+        boxes = np.concatenate([np.arange(0), *map(np.arange, starts, ends)])
         return replace(
             self, frame_offsets=np.cumsum(np.concatenate([[0], ends - starts])),
             **self._rows(_PER_BOX, boxes), **self._rows(_PER_FRAME, frames))
