@@ -168,8 +168,7 @@ def accumulate(views, rows, center, basis, information, gradient):
         cost += share * add_depth(views, row, center, share, information, gradient)
     size = _largest(views.sizes[rows], np.zeros_like(rows), 1)[0]
     cost += add_axis_prior(basis, size, information, gradient)
-    # only the lower triangle was summed up
-    information[:] = np.tril(information) + np.tril(information, -1).T
+    information += np.tril(information, -1).T
     return cost
 
 
@@ -186,9 +185,11 @@ def add_depth(views, row, center, share, information, gradient):
         depth += direction[i] * center[i]
     residual = (depth - views.depths[row]) * stiffness
     weight = share * robust_weight(residual)
-    scaled = weight * stiffness * direction
-    gradient[:3] += scaled * residual
-    information[:3, :3] += np.outer(scaled * stiffness, direction)
+    for i in range(3):
+        scaled = weight * stiffness * direction[i]
+        gradient[i] += scaled * residual
+        for j in range(i + 1):
+            information[i, j] += scaled * stiffness * direction[j]
     return robust_cost(residual)
 
 
@@ -337,11 +338,17 @@ def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_pose
             stiffness = views.stiffness[row, edge]
             weight = share * robust_weight(residual) * stiffness * stiffness
             pull = share * robust_weight(residual) * stiffness * residual
-            landmark_gradient[landmark] += pull * by_landmark[edge]
-            pose_gradient[frame] += pull * by_pose[edge]
-            of_landmarks[landmark] += np.outer(weight * by_landmark[edge], by_landmark[edge])
-            of_poses[frame] += np.outer(weight * by_pose[edge], by_pose[edge])
-            of_boxes[place] += np.outer(weight * by_pose[edge], by_landmark[edge])
+            for i in range(LANDMARK_SIZE):
+                landmark_gradient[landmark, i] += pull * by_landmark[edge, i]
+                for j in range(LANDMARK_SIZE):
+                    of_landmarks[landmark, i, j] += (weight * by_landmark[edge, i]
+                                                     * by_landmark[edge, j])
+            for i in range(POSE_SIZE):
+                pose_gradient[frame, i] += pull * by_pose[edge, i]
+                for j in range(POSE_SIZE):
+                    of_poses[frame, i, j] += weight * by_pose[edge, i] * by_pose[edge, j]
+                for j in range(LANDMARK_SIZE):
+                    of_boxes[place, i, j] += weight * by_pose[edge, i] * by_landmark[edge, j]
     for landmark in range(len(centers)):
         lower = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
         cost += add_axis_prior(bases[landmark], sizes[landmark], lower,
