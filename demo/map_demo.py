@@ -20,7 +20,7 @@ from cliploc_ros.offline.evaluation.recorded_queries import make_queries_of
 from cliploc_ros.offline.evaluation.run import run_methods
 from cliploc_ros.offline.evaluation.summary import Summary, summarize
 from cliploc_ros.offline.evaluation.trials import make_queries
-from cliploc_ros.offline.recording.networks import LoadNetworks
+from cliploc_ros.offline.recording.networks import load_networks
 from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo.map_review import (
     PICTURE,
@@ -83,7 +83,7 @@ def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
     clip = ClipOptions(pretrained=str(options.assets / 'clip'))
     sequence = read_tum(options.assets / 'sequence')
     print(f'localizing all {len(sequence)} images of the wake-ups in both maps', flush=True)
-    look = LoadNetworks(DetectorOptions(model=str(options.assets / 'yolo.onnx')), clip)()
+    look = load_networks(DetectorOptions(model=str(options.assets / 'yolo.onnx')), clip)
     recorded = record_every_frame(
         read_folder(sequence.folder, FolderOptions(layout='tum')), look)
     method = Method(options.method, options.values.options())

@@ -289,7 +289,8 @@ def _class_weights(node: Fields, class_names: Sequence[str]) -> tuple[tuple[str,
 def _labels(node: Fields, field: str, class_names: Sequence[str]) -> Mapping[str, float]:
     """Return the first number of each class in a field."""
     found: dict[str, float] = {}
-    for key, values in node.mapping(field).items():
+    shares = Fields(node.values.get(field) or {}, f"{node.where}: field '{field}'").values
+    for key, values in shares.items():
         where = f"{node.where}: '{field}' of class {key[:40]!r}"
         first = Fields({'share': values[0] if isinstance(values, list) and values else None},
                        where).number('share')

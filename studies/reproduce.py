@@ -24,14 +24,12 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from cliploc_ros.cli import build_map, evaluate
 from cliploc_ros.command import positive_int, run_main
@@ -368,8 +366,7 @@ def write_bags(recording: Recording, frames: Path, folder: Path) -> None:
             convert_tum(
                 replace(sequence, stamps_ns=tuple(sequence.stamps_ns[row] for row in chosen_rows),
                         image_paths=tuple(sequence.image_paths[row] for row in chosen_rows)),
-                camera, folder / name, ConversionOptions(image_format='compressed'),
-                progress=partial(tqdm, desc=name, unit='image', disable=None))
+                camera, folder / name, ConversionOptions(image_format='compressed'))
 
 
 def _table(folder: Path, paper: Mapping[str, Sequence[str]]) -> list[tuple[str, ...]]:

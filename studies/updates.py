@@ -254,12 +254,13 @@ def _elsewhere(part: Part, displaced: Rows, places: Floats, removed: Rows) -> Po
     """Return the later part with some objects in other places, and some removed."""
     views, true, boxes = part.views, part.true, part.later.bboxes_xyxy.copy()
     depths = None if part.later.depths is None else part.later.depths.copy()
-    nameless = find_overlaps(views._replace(classes=np.zeros_like(views.classes)),
-                             true._replace(classes=np.zeros_like(true.classes)), MIN_MEDIAN_IOU)
-    on_gone = np.isin(nameless.landmarks, np.concatenate([displaced, removed]))
+    near, things, _ = find_overlaps(
+        views._replace(classes=np.zeros_like(views.classes)),
+        true._replace(classes=np.zeros_like(true.classes)), MIN_MEDIAN_IOU)
+    on_gone = np.isin(things, np.concatenate([displaced, removed]))
     kept = np.ones(len(boxes), dtype=np.bool_)
     # other boxes on a changed object are removed as well
-    kept[nameless.boxes[on_gone & (part.shown[nameless.boxes] < 0)]] = False
+    kept[near[on_gone & (part.shown[near] < 0)]] = False
     kept[np.isin(part.shown, removed)] = False
     here, there = np.empty(4), np.empty(4)
     for row, place in zip(displaced, places, strict=True):

@@ -333,8 +333,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap',
     from cliploc_ros.offline.evaluation.trials import join_cameras, make_queries
 
     if options.queries is not None:
-        return make_queries(load_queries(options.queries, landmark_map.landmark_ids),
-                            landmark_map, every_frame=True)
+        return make_queries(load_queries(options.queries), landmark_map, every_frame=True)
     from cliploc_ros.cli.sources import read_cameras_of_map, recording_options
     from cliploc_ros.offline.evaluation.recorded_queries import recorded_queries, with_images
     from cliploc_ros.offline.recording.recorder import EVERY_FRAME
@@ -347,7 +346,7 @@ def _read_queries(options: argparse.Namespace, landmark_map: 'LandmarkMap',
         recording = recording_options(options, EVERY_FRAME, options.every, camera)
         found = recorded_queries(frames, landmark_map, recording, list(map(str, options.map)),
                                  options.landmark_embeddings)
-        if without := frames.count - len(found):
+        if without := frames.count - len(found.frames):
             print(f'skipped without ground truth within 20 ms: {without} of {frames.count} images',
                   flush=True)
         if options.save_queries is not None:

@@ -58,8 +58,6 @@ def make_parser() -> argparse.ArgumentParser:
 def convert(options: argparse.Namespace) -> int:
     """Convert a folder; print what was written, and how many images have no pose or detections."""
     # Imported late, so that --help is fast.
-    from tqdm import tqdm
-
     from cliploc_ros.offline.datasets import tum
     from cliploc_ros.offline.datasets.folders import read_sequence
 
@@ -76,8 +74,7 @@ def convert(options: argparse.Namespace) -> int:
         tum.ConversionOptions(
             options.storage, options.image_format, prefix=options.prefix,
             camera_frame=options.camera_frame, world_frame=options.world_frame),
-        detections,
-        progress=lambda images: tqdm(images, unit='image', disable=None))  # on a terminal only
+        detections)
     print(f'wrote {options.output}: {len(sequence)} images, {written["poses"]} ground-truth '
           f'poses, {written["detections"]} detection messages, {written["accelerations"]} '
           f'accelerations in {time.monotonic() - begin:.1f} s')

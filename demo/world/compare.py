@@ -11,6 +11,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from cliploc_ros.offline.evaluation.recorded_queries import make_queries_of
 from cliploc_ros.offline.evaluation.run import compare_methods
 from cliploc_ros.offline.evaluation.trials import make_queries
 from cliploc_ros.offline.posed_query import PosedQuery
-from cliploc_ros.offline.recording.networks import RunNetworks
+from cliploc_ros.offline.recording.networks import run_networks
 from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo import ASSETS
 from demo.truth import SAME_OBJECT_IOU, TrueFrame, read_frames
@@ -46,7 +47,8 @@ def record(sequence: Path, landmark_map: LandmarkMap, cache_dir: Path) -> Querie
                        pretrained=str(ASSETS / 'clip.safetensors'))
     encoder, labels = load_encoder_for_map(clip, landmark_map, [], 'text')
     frames = read_folder(sequence, FolderOptions(layout='tum'))
-    recorded = record_every_frame(frames, RunNetworks(detector.detect, encoder))
+    recorded = record_every_frame(frames, partial(
+        run_networks, detector.detect, encoder))
     return make_queries_of(recorded, landmark_map, labels)
 
 
@@ -95,7 +97,7 @@ def run(arguments: list[str]) -> int:
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_compare_') as cache:
         queries = record(ASSETS / 'sequence', landmark_map, Path(cache))
     save_queries(options.out / 'queries.npz', queries)
-    first, third, count = score_clip(tuple(queries), list(read_frames(ASSETS / 'sequence')),
+    first, third, count = score_clip(queries.frames, list(read_frames(ASSETS / 'sequence')),
                                      landmark_map.landmark_ids)
     print(f'detector: mAP50 {score_detector(ASSETS / "sequence"):.3f}; CLIP: top-1 {first:.3f}, '
           f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')

@@ -98,7 +98,7 @@ class Recording(NamedTuple):
     def load(self) -> Place:
         """Return the place."""
         landmark_map = LandmarkMap.from_file(self.landmark_map)
-        found = load_queries(self.queries, landmark_map.landmark_ids)
+        found = load_queries(self.queries)
         queries: Sequence[PosedQuery] = make_queries(found, landmark_map, every_frame=True)
         if not self.has_depth:
             queries = _without_depth(queries)

@@ -6,6 +6,7 @@ import pickle
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,7 +34,7 @@ from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions, RawFrame
 from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.offline.recording.networks import MAX_DETECTIONS, RunNetworks
+from cliploc_ros.offline.recording.networks import MAX_DETECTIONS, run_networks
 from cliploc_ros.offline.recording.recorder import record_every_frame
 from demo import ASSETS
 from studies.keyframes.cases import (
@@ -164,7 +165,7 @@ def _build(place: Place, folder: Path, looker: Looker) -> tuple[LandmarkMap, Key
     if not path.exists():
         frames = frames_of_raws(Path(place.name), place.mapped)
         landmark_map = build_map(
-            record_every_frame(frames, RunNetworks(looker.detect))).landmark_map \
+            record_every_frame(frames, partial(run_networks, looker.detect, None))).landmark_map \
             if place.map_file is None else LandmarkMap.from_file(place.map_file)
         layer = build_layer(frames, landmark_map, LayerOptions(0.0, 0.0))
         print(f'{place.name}: {len(landmark_map)} landmarks, {len(layer)} keyframes, '

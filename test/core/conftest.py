@@ -39,14 +39,14 @@ def office_map(office) -> LandmarkMap:
 
 
 @pytest.fixture(scope='session')
-def queries(office, office_map) -> Queries:
-    return load_queries(office / 'queries.npz', office_map.landmark_ids)
+def queries(office) -> Queries:
+    return load_queries(office / 'queries.npz')
 
 
 @pytest.fixture(scope='session')
 def observed(queries):
     """Turn a recorded query frame into an observation."""
-    camera = replace(queries[0].observation.camera, width=640, height=480)
+    camera = replace(queries.frames[0].observation.camera, width=640, height=480)
     return lambda frame: replace(frame.observation, camera=camera)
 
 

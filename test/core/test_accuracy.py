@@ -68,8 +68,8 @@ def test_five_frames_joined_by_odometry(case, office_map, queries, judge, thresh
     frames = trials.make_queries(queries, office_map, every_frame=True)
     if case != 'nothing':
         frames = trials.with_vertical(frames, 1.0, 0)
-    frames = trials.with_neighbours(frames, [frame.group for frame in queries], 0.01, 0.5, 0)
-    asked = [frame for frame in frames if queries[frame.number].is_main]
+    frames = trials.with_neighbours(frames, [frame.group for frame in frames], 0.01, 0.5, 0)
+    asked = [frame for frame in frames if frame.is_main]
     found, within = judge(OPTIONS if case == 'nothing' else HEIGHTS, asked)
     assert all(found.success(limit) >= one
                for limit, one in zip(LIMITS_M, least['success'], strict=True))

@@ -360,8 +360,8 @@ def test_bad_odometry_is_named(room, walk):
 def office_frames(office_map, queries):
     """Return pairs of places of the office: frames of the first, and one image of the second."""
     frames = make_queries(queries, office_map, every_frame=True)
-    linked = [query for query in with_neighbours(frames, [frame.group for frame in queries])
-              if queries[query.number].is_main]
+    linked = [query for query in with_neighbours(frames, [frame.group for frame in frames])
+              if query.is_main]
     return [(linked[row], linked[(row + 11) % len(linked)]) for row in range(0, len(linked), 4)]
 
 

@@ -129,7 +129,7 @@ def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries,
     """As with a wrong mount: the pose from boxes without the vertical is among the rivals."""
     relocalizer, rng = Relocalizer(office_map, RelocalizerOptions()), np.random.default_rng(0)
     accepted, wrong = 0, 0
-    for frame in (frame for frame in queries if frame.is_main):
+    for frame in (frame for frame in queries.frames if frame.is_main):
         up = frame.map_from_camera[2, :3]
         axis = np.cross(up, rng.normal(size=3))
         up = Rotation.from_rotvec(np.radians(tilt_deg) * axis / np.linalg.norm(axis)).apply(up)

@@ -201,7 +201,7 @@ def golden_scenes(office, office_map, queries, observed):
     """Return scene, B-PROSAC pairs and golden values of each query that has them."""
     golden = np.load(office / 'golden.npz')
     scenes = []
-    for number, frame in enumerate(frame for frame in queries if frame.is_main):
+    for number, frame in enumerate(frame for frame in queries.frames if frame.is_main):
         values = {name.removeprefix(f'q{number}_'): golden[name] for name in golden.files
                   if name.startswith(f'q{number}_')}
         if 'H' not in values:  # fewer than three boxes

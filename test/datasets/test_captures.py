@@ -11,6 +11,7 @@ import shutil
 import struct
 import time
 import tracemalloc
+from functools import partial
 
 import capture_folders as captures
 import cv2
@@ -34,7 +35,7 @@ from cliploc_ros.offline.mapping.building import build_map
 from cliploc_ros.offline.mapping.make_map import scale_of_objects
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.tilt import find_vertical, tilt_note
-from cliploc_ros.offline.recording.networks import RunNetworks
+from cliploc_ros.offline.recording.networks import run_networks
 from cliploc_ros.offline.recording.recorder import record_every_frame
 
 pytestmark = pytest.mark.needs('pycolmap')
@@ -46,7 +47,7 @@ OPTIONS = MappingOptions(min_baseline_deg=5.0, estimate_pose_errors=False)
 def look():
     """Return the demo's detector, which runs once on equal pixels."""
     network = load_detector(DetectorOptions(model=str(captures.ASSETS / 'yolo.onnx')))
-    return RunNetworks(captures.once_for_each(network.detect))
+    return partial(run_networks, captures.once_for_each(network.detect), None)
 
 
 @pytest.fixture(scope='session')
@@ -128,7 +129,7 @@ def test_images_with_their_own_cameras(shots, look, tmp_path):
     recorded = record_every_frame(frames, look)
     assert len(recorded.cameras) == 1 and recorded.open_edges is not None
     own = Camera(640, 480, 500 * focus[4], 500 * focus[4], 320 + 4 / 9 - 0.5, 239.5)
-    boxes = look.detect(next(read_folder(folder, METRES).select([3]).read()).image_rgb)
+    boxes = look.args[0](next(read_folder(folder, METRES).select([3]).read()).image_rgb)
     rows = slice(*recorded.frame_offsets[3:5])
     np.testing.assert_allclose(
         recorded.cameras[0].normalize_bboxes(recorded.bboxes_xyxy[rows]),

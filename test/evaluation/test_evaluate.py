@@ -128,7 +128,7 @@ def test_frames_of_a_group_are_fused(files, recording, room, tmp_path, evaluate_
 
 def test_the_files_say_what_was_compared(files, recording, tmp_path, evaluate_here):
     poses = tmp_path / 'theirs.txt'
-    truth = recording[0].map_from_camera
+    truth = recording.frames[0].map_from_camera
     x, y, z, w = quaternion_from_transform(truth)
     for file, quaternion in ((poses, (x, y, z, w)), (tmp_path / 'w.txt', (w, x, y, z))):
         numbers = ' '.join(map(str, [*truth[:3, 3], *quaternion]))
@@ -141,7 +141,7 @@ def test_the_files_say_what_was_compared(files, recording, tmp_path, evaluate_he
         str(file): hashlib.sha256(file.read_bytes()).hexdigest()[:12]
         for file in (files / 'queries.npz', files / 'map.yaml', poses)}
     assert (about['queries'], about['landmarks'], about['seed']) == (
-        len(recording), len(recording.landmark_ids), 7)
+        len(recording.frames), len(recording.landmark_ids), 7)
     assert about['similarities'].startswith('unknown')
     assert '--methods class_bf --poses theirs=' in about['options']
     assert '--trials' not in about['options']
@@ -204,7 +204,7 @@ def test_a_bag_a_folder_and_the_saved_queries_say_the_same(walk, evaluated_bag, 
             assert result.pop(name) == pytest.approx(other.pop(name), abs=1e-6)
         assert result == other
     results = results_of(walk / 'from_bag')
-    queries = len(load_queries(walk / 'saved.npz'))
+    queries = len(load_queries(walk / 'saved.npz').frames)
     assert queries == IMAGES - 1
     assert len(results) == (2 + 1) * queries  # auto draws no samples, and runs one trial
     right = [row for row in results if row['error_m'] is not None and row['error_m'] < 0.5]

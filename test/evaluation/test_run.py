@@ -27,6 +27,7 @@ from cliploc_ros.offline.evaluation.trials import (
     find_misfit,
     given_results,
     make_queries,
+    run_trial,
     with_neighbours,
     with_vertical,
 )
@@ -81,10 +82,13 @@ def test_workers_do_not_matter_and_get_the_queries_once(results, room, questions
         found = run_methods(room, methods, Counted(questions), trials=3, workers=workers)
         assert without_times(found) == without_times(results)
     assert len(sent) == 2
-    parts = []
-    run_methods(room, parse_methods(['auto'], PAPER, len(room)), [*questions, *questions],
-                trials=1, advance=parts.append)
-    assert [len(part) for part in parts] == [2 * len(questions)], 'one localizer gets all'
+    asked, (auto,) = [*questions, *questions], parse_methods(['auto'], PAPER, len(room))
+    alone = [result for query in asked for result in run_trial(room, auto, 0, [query])]
+    together = without_times(run_methods(room, [auto], asked, trials=1))
+    assert together == without_times(sorted(
+        run_trial(room, auto, 0, asked), key=lambda result: result.query))
+    assert together != without_times(sorted(
+        alone, key=lambda result: result.query)), 'one localizer gets all'
 
 
 def test_similarities_follow_the_maps_order(room, recording, questions):
@@ -94,6 +98,10 @@ def test_similarities_follow_the_maps_order(room, recording, questions):
     for query, other in zip(make_queries(turned, room), questions, strict=True):
         np.testing.assert_array_equal(query.observation.similarities,
                                       other.observation.similarities)
+    for other_ids, names in ((turned.landmark_ids[1:], turned.landmark_ids[0]),
+                             (('lamp', *turned.landmark_ids, 'vase'), "lamp' and 1 more")):
+        with pytest.raises(DatasetError, match=f'another map.*{names}'):
+            make_queries(replace(turned, landmark_ids=other_ids), room)
 
 
 def test_what_a_robot_asks_about_a_frame(questions):

@@ -18,7 +18,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.frames import RawFrame
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.views import make_views
-from cliploc_ros.offline.recording.networks import RunNetworks
+from cliploc_ros.offline.recording.networks import run_networks
 
 NETWORKS = ('--model', ASSETS / 'yolo.onnx')
 # Distortion of the TUM sequences fr1.
@@ -86,7 +86,7 @@ def test_boxes_of_an_ideal_fisheye_are_undistorted():
     found = Detections(np.array([[400.0, 210.0, 480.0, 270.0], [600.0, 230.0, 638.0, 250.0]]),
                        ('cup', 'tv'), np.array([0.9, 0.9]))
     raw = RawFrame(0, 0, np.eye(4), lambda: (np.zeros((480, 640, 3), dtype=np.uint8), lens))
-    seen = RunNetworks(lambda image: found)(raw)
+    seen = run_networks(lambda image: found, None, raw)
     assert seen.class_ids.tolist() == ['cup'] and seen.open_edges.tolist() == [[False] * 4]
     across = np.hypot(120.0, 30.0) / 200.0  # for the middle of the upper edge
     np.testing.assert_allclose(seen.bboxes_xyxy[0], [

@@ -29,7 +29,7 @@ from cliploc_ros.offline.mapping.options import CheckOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.posed_query import PosedQuery
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.offline.recording.networks import LoadNetworks
+from cliploc_ros.offline.recording.networks import load_networks
 from cliploc_ros.offline.recording.recorder import record_every_frame
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Keyframes
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
@@ -71,8 +71,8 @@ def rooms(shared_data):
     walked, asked = (read_folder(ASSETS / name, FolderOptions(layout='tum'))
                      for name in ('mapping', 'sequence'))
     asked = asked.select(range(0, asked.count, 16))
-    recorded = record_every_frame(asked, LoadNetworks(
-        DetectorOptions(model=str(ASSETS / 'yolo.onnx')), None)())
+    recorded = record_every_frame(asked, load_networks(
+        DetectorOptions(model=str(ASSETS / 'yolo.onnx')), None))
     return (landmark_map, build_layer(walked.select(range(0, walked.count, 4)), landmark_map,
                                       EVERY),
             with_images(make_queries(make_queries_of(recorded, landmark_map, None), landmark_map),

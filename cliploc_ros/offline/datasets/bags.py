@@ -175,14 +175,11 @@ class BagReader:
         if not connections:
             return
         stream = self._reader.messages(connections, start_ns, stop_ns)
-        while True:
-            try:
-                connection, stamp_ns, data = next(stream)
-            except StopIteration:
-                return
-            except Exception as error:  # from the library, SQLite or the operating system
-                raise self._unreadable(error) from error
-            yield BagMessage(connection.topic, stamp_ns, bytes(data))
+        try:
+            for connection, stamp_ns, data in stream:
+                yield BagMessage(connection.topic, stamp_ns, bytes(data))
+        except Exception as error:  # from the library, SQLite or the operating system
+            raise self._unreadable(error) from error
 
     def readable(self, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
         """Yield the topic and object of each message; unreadable messages are left out."""

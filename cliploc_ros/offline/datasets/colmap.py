@@ -30,24 +30,22 @@ class _Model(NamedTuple):
     name: str
     focals: int  #: Number of focal lengths
     distortion: str = ''  #: Distortion model
-    #: Index, in OpenCV's order of coefficients, of each distortion value in the file
-    places: tuple[int, ...] = ()
+    coefficients: int = 0  #: Number of its first coefficients, in OpenCV's order
 
     @property
     def length(self) -> int:
-        return self.focals + 2 + len(self.places)
+        return self.focals + 2 + self.coefficients
 
 
 # By COLMAP's number of the model. COLMAP's pixel origin is the corner of the first pixel, OpenCV's
 # is its centre.
 _MODELS = {
     0: _Model('SIMPLE_PINHOLE', 1), 1: _Model('PINHOLE', 2),
-    2: _Model('SIMPLE_RADIAL', 1, 'plumb_bob', (0,)), 3: _Model('RADIAL', 1, 'plumb_bob', (0, 1)),
-    4: _Model('OPENCV', 2, 'plumb_bob', (0, 1, 2, 3)),
-    5: _Model('OPENCV_FISHEYE', 2, 'equidistant', (0, 1, 2, 3)),
-    6: _Model('FULL_OPENCV', 2, 'rational_polynomial', (0, 1, 2, 3, 4, 5, 6, 7)),
-    8: _Model('SIMPLE_RADIAL_FISHEYE', 1, 'equidistant', (0,)),
-    9: _Model('RADIAL_FISHEYE', 1, 'equidistant', (0, 1)),
+    2: _Model('SIMPLE_RADIAL', 1, 'plumb_bob', 1), 3: _Model('RADIAL', 1, 'plumb_bob', 2),
+    4: _Model('OPENCV', 2, 'plumb_bob', 4), 5: _Model('OPENCV_FISHEYE', 2, 'equidistant', 4),
+    6: _Model('FULL_OPENCV', 2, 'rational_polynomial', 8),
+    8: _Model('SIMPLE_RADIAL_FISHEYE', 1, 'equidistant', 1),
+    9: _Model('RADIAL_FISHEYE', 1, 'equidistant', 2),
     14: _Model('SIMPLE_FISHEYE', 1, 'equidistant'), 15: _Model('FISHEYE', 2, 'equidistant')}
 _LENGTHS = {'': 0, 'plumb_bob': 4, 'equidistant': 4, 'rational_polynomial': 8}
 _OTHERS = {7: 'FOV', 10: 'THIN_PRISM_FISHEYE', 11: 'RAD_TAN_THIN_PRISM_FISHEYE',
@@ -126,9 +124,7 @@ def _check_same(model: Path, cameras: Mapping[int, Camera], images: Sequence[_Po
 
 def models_of(folder: Path) -> list[Path]:
     """Return the folders of models in a folder; a model may lack a file."""
-    places = [folder / place for place in _PLACES]
-    sparse = folder / 'sparse'
-    places += sorted(sparse.iterdir()) if sparse.is_dir() else []
+    places = [*(folder / place for place in _PLACES), *sorted(folder.glob('sparse/*'))]
     return [place for place in dict.fromkeys(places) if any(
         (place / f'{part}.{end}').is_file() for part in _PARTS for end in ('bin', 'txt'))]
 
@@ -171,7 +167,7 @@ def _camera(where: str, number: int, name: str, size: tuple[int, int], values: S
         raise DatasetError(f'{where}: {model.name} has {model.length} values, not {len(values)}')
     fx, fy, (cx, cy) = values[0], values[model.focals - 1], values[model.focals:model.focals + 2]
     distortion = np.zeros(_LENGTHS[model.distortion])
-    distortion[list(model.places)] = values[model.focals + 2:]
+    distortion[:model.coefficients] = values[model.focals + 2:]
     return parsing.camera_of(where, *size, fx, fy, cx - 0.5, cy - 0.5, model.distortion,
                              tuple(distortion.tolist()))
 

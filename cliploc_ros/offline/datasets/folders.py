@@ -294,10 +294,8 @@ def _seven_scenes(folder: Path, options: frames.FolderOptions) -> frames.Capture
         raise DatasetError(f'{folder}: has neither rgb.txt (TUM RGB-D) nor frame-000000.color.jpg '
                            '(7-Scenes); give a folder of one of these layouts')
     files = []
-    form = frames.DepthFormat(options.depth.unit_m or MILLIMETRE,
-                              options.depth.camera or _SEVEN_SCENES_DEPTH)
-    assert form.camera is not None
-    depth_from_color = transforms.invert_transform(form.camera.color_from_depth)
+    depth_camera = options.depth.camera or _SEVEN_SCENES_DEPTH
+    depth_from_color = transforms.invert_transform(depth_camera.color_from_depth)
     for number, path in sorted(images.items()):
         stem = path.name.partition('.')[0]
         depth, pose = folder / f'{stem}.depth.png', folder / f'{stem}.pose.txt'
@@ -308,7 +306,7 @@ def _seven_scenes(folder: Path, options: frames.FolderOptions) -> frames.Capture
             else map_from_depth @ depth_from_color, depth if depth.exists() else None))
     if all(file.pose is None for file in files):
         raise DatasetError(f'{folder}: no image has a valid .pose.txt beside it')
-    return frames.Capture(tuple(files), depth=form)
+    return frames.Capture(tuple(files), depth=frames.DepthFormat(MILLIMETRE, depth_camera))
 
 
 def _read_pose(path: Path) -> NDArray[np.float64] | None:

@@ -107,16 +107,13 @@ def views_of_folder(path: Path) -> PosedDetections:
     if not capture.is_metric:
         raise DatasetError(f'{path}: the unit of {layout.name} is unknown; also give '
                            '`observations`, which build_map writes with `scale`')
-    posed, cameras = [], []
-    for raw in read_folder(path).read_raw(lambda place, stamp_ns, pose: pose is not None):
-        posed.append((raw.stamp_ns, raw.map_from_camera))
-        cameras.append(capture.files[raw.place].camera.pinhole)
+    posed = list(read_folder(path).read_raw(lambda place, stamp_ns, pose: pose is not None))
     if not posed:
         raise DatasetError(f'{path}: no image has a pose')
-    each, rows, names = group_cameras(cameras)
+    each, rows, names = group_cameras([capture.files[raw.place].camera.pinhole for raw in posed])
     return PosedDetections(
-        cameras=each, map_from_camera=np.array([pose for _, pose in posed]),
-        stamps_s=np.array([stamp for stamp, _ in posed]) / NS_PER_S,
+        cameras=each, map_from_camera=np.array([raw.map_from_camera for raw in posed]),
+        stamps_s=np.array([raw.stamp_ns for raw in posed]) / NS_PER_S,
         frame_offsets=np.zeros(len(posed) + 1, dtype=np.int64), bboxes_xyxy=np.empty((0, 4)),
         class_names=(), classes=np.empty(0, dtype=np.int64), scores=np.empty(0),
         camera_rows=None if names == ('',) else rows, camera_names=names)

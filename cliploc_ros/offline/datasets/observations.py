@@ -6,7 +6,6 @@ The networks run once: mapping, evaluation and the map editor read the same obse
 file also holds the similarities to a map's labels, so that all methods get identical input.
 """
 
-from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -36,7 +35,9 @@ def _check_stamps(name: str, arrays: npz.Arrays) -> None:
 
 #: Fields of files of frames with boxes: F frames, n boxes.
 FRAME_FIELDS = {
-    'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE,)),
+    'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE, npz.Check(
+        'has a focal length that is not above 0',
+        lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
     'boxes_xyxy': npz.Field('numbers', ('n', 4), (npz.FINITE, npz.BOX)),
     'frame_offsets': npz.Field('integers', ('F+1',), (npz.Offsets('boxes_xyxy', 'boxes'),)),
     'class_ids': npz.Field('text', ('n',)),
@@ -72,9 +73,6 @@ _QUERIES = npz.Schema('query file', {
     'landmark_ids': npz.Field('text', ('L',), (
         npz.UNIQUE, npz.Check('is empty', lambda ids: ids == ''))),
     **FRAME_FIELDS,
-    'intrinsics_fx_fy_cx_cy': npz.Field('numbers', (4,), (npz.FINITE, npz.Check(
-        'has a focal length that is not above 0',
-        lambda numbers: (numbers <= 0) & (np.arange(4) < 2)))),
     'image_size': npz.Field('integers', (2,), (npz.Check(
         'is not above 0', lambda sides: sides <= 0),), is_optional=True),
     # half precision rounds some cosines to just above 1
@@ -95,18 +93,6 @@ class Queries:
     landmark_ids: tuple[str, ...]  #: The landmark of each column of the similarities
     frames: tuple[PosedQuery, ...]  #: In the file's order; all have the same camera
 
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self.frames)
-
-    def __iter__(self) -> Iterator[PosedQuery]:
-        """Iterate over the frames."""
-        return iter(self.frames)
-
-    def __getitem__(self, index: int) -> PosedQuery:
-        """Return a frame."""
-        return self.frames[index]
-
 
 def _stamps_ns(arrays: npz.Arrays) -> NDArray[np.int64]:
     """Return the exact stamps (F,) [ns]; without them, the float64 seconds rounded to 1 us.
@@ -117,20 +103,9 @@ def _stamps_ns(arrays: npz.Arrays) -> NDArray[np.int64]:
     return arrays.get('stamps_ns', rounded).astype(np.int64)
 
 
-def load_queries(path: str | Path, landmark_ids: Collection[str] | None = None) -> Queries:
-    """Read and validate a query file.
-
-    With the `landmark_ids` of a map, the file must contain no other landmarks. DatasetError: the
-    message names file, array and error.
-    """
-    path = Path(path)
-    arrays = _QUERIES.read(path)
-    unknown = [landmark for landmark in map(str, arrays['landmark_ids'])
-               if landmark_ids is not None and landmark not in landmark_ids]
-    if unknown:
-        more = f' (and {len(unknown) - 1} more)' if len(unknown) > 1 else ''
-        raise DatasetError(f'{path}: array landmark_ids has {unknown[0]!r}, which the map does '
-                           f'not know{more}')
+def load_queries(path: str | Path) -> Queries:
+    """Read and validate a query file; DatasetError: the message names file, array and error."""
+    arrays = _QUERIES.read(Path(path))
     # files of older releases lack the size of the image
     size = 2 * arrays['intrinsics_fx_fy_cx_cy'][2:]
     camera = camera_from_numbers(arrays.get('image_size', size.round().clip(1)),

@@ -236,10 +236,6 @@ class Fields:
         """Return a list."""
         return self._typed(name, list, 'a list')
 
-    def mapping(self, name: str) -> dict[str, Any]:
-        """Return a mapping; an empty one if the field is missing."""
-        return self._typed(name, dict, 'a mapping', {})
-
     def size(self, width: str, height: str) -> tuple[int, int]:
         """Return width and height [px]."""
         return round(self.number(width)), round(self.number(height))

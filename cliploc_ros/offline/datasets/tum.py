@@ -7,7 +7,7 @@ The recordings have the topics of the nodes, with recorded detections if there a
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
@@ -30,8 +30,6 @@ _SECONDS = {'s': Decimal(1), 'ms': Decimal('1e-3'), 'us': Decimal('1e-6'), 'µs'
 _METRES = {'mm': 0.001, 'cm': 0.01}
 # Files of the dataset have quaternions of four decimals.
 _MAX_NORM_ERROR = 0.05
-#: Wraps an iterable of the stamp [ns] and file of each image, and shows progress.
-Progress = Callable[[Iterable[tuple[int, Path]]], Iterable[tuple[int, Path]]]
 _NAMESPACE = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*/?|/?')
 _IMU_FRAME = 'imu'  # of the accelerometer; TUM does not give its mount
 _CODECS = {b'\x89PNG': 'png', b'\xff\xd8\xff': 'jpeg'}
@@ -154,18 +152,18 @@ def _role(name: str) -> str:
     return f'{kind}{word[-1]}' if kind and word[-1] in 'xyzw' else ''
 
 
-def read_tum_accelerometer(path: Path) -> tuple[list[int], NDArray[np.float64]]:
-    """Read the stamps [ns] and accelerations (n, 3) [m/s^2] of an accelerometer.txt.
+def read_tum_accelerometer(path: Path) -> list[tuple[int, NDArray[np.float64]]]:
+    """Read the stamps [ns] and accelerations (3,) [m/s^2] of an accelerometer.txt.
 
     DatasetError: a line does not hold four finite numbers; the message names file and line.
     """
-    stamps_ns, rows = [], []
+    found = []
     for where, (stamp, *cells) in parsing.read_cells(path, 'timestamp ax ay az'):
-        stamps_ns.append(parsing.parse_stamp_ns(stamp, where))
-        rows.append(parsing.parse_all(cells, float, where))
-        if not np.all(np.isfinite(rows[-1])):
+        acceleration = np.array(parsing.parse_all(cells, float, where))
+        if not np.isfinite(acceleration).all():
             raise DatasetError(f'{where}: {" ".join(cells)!r} is not finite')
-    return stamps_ns, np.array(rows).reshape(-1, 3)
+        found.append((parsing.parse_stamp_ns(stamp, where), acceleration))
+    return found
 
 
 def read_image_list(path: Path) -> tuple[tuple[int, ...], tuple[Path, ...]]:
@@ -217,9 +215,9 @@ class ConversionOptions:
 
 
 def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
-                options: ConversionOptions, detections: Mapping[int, Detections] | None = None,
-                progress: Progress = iter) -> Counter[str]:
-    """Write a sequence as a rosbag2 recording.
+                options: ConversionOptions, detections: Mapping[int, Detections] | None = None
+                ) -> Counter[str]:
+    """Write a sequence as a rosbag2 recording; show a progress bar on a terminal.
 
     Return the numbers of ``poses`` (images with ground truth), ``detections`` (images with an
     entry of recorded detections, which may be empty) and ``accelerations``.
@@ -237,10 +235,10 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
         The folder to make.
     detections : mapping of int to Detections, optional
         Recorded detections by stamp [ns].
-    progress : callable
-        Wraps the iterable of images, to show progress.
     """
-    # only this needs rosbags; core tests with few packages read trajectories
+    # only this needs rosbags and tqdm; core tests with few packages read trajectories
+    from tqdm import tqdm
+
     from cliploc_ros.offline.datasets import bag_messages
     from cliploc_ros.offline.datasets.bags import BagWriter
 
@@ -255,8 +253,7 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
     boxes_topic = options.topic('detections')
     frame, written = options.camera_frame, Counter[str]()
     accelerometer = sequence.folder / 'accelerometer.txt'
-    stamps_ns, accelerations = (read_tum_accelerometer(accelerometer) if accelerometer.exists()
-                                else ([], np.empty((0, 3))))
+    accelerations = read_tum_accelerometer(accelerometer) if accelerometer.exists() else []
     with BagWriter(output, options.storage) as bag:
         bag.add_topic(image_topic, bag_messages.COMPRESSED_IMAGE if is_compressed
                       else bag_messages.IMAGE)
@@ -264,8 +261,8 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
         bag.add_topic(pose_topic, bag_messages.POSE)
         if detections is not None:
             bag.add_topic(boxes_topic, bag_messages.DETECTIONS)
-        for stamp_ns, path in progress(
-                list(zip(sequence.stamps_ns, sequence.image_paths, strict=True))):
+        for stamp_ns, path in zip(sequence.stamps_ns, tqdm(
+                sequence.image_paths, unit='image', disable=None), strict=True):
             # decoded in any case, to refuse a damaged file before a node receives it
             pixels_rgb, _ = read_color(ImageFile(stamp_ns, path, camera))
             if is_compressed:
@@ -289,10 +286,10 @@ def convert_tum(sequence: TumSequence, camera: Camera, output: str | Path,
                 bag.write(pose_topic, stamp_ns, bag_messages.pose_message(
                     stamp_ns, options.world_frame, map_from_camera))
                 written['poses'] += 1
-        if stamps_ns:
+        if accelerations:
             imu_topic = options.topic('imu')
             bag.add_topic(imu_topic, bag_messages.IMU)
-            for stamp_ns, acceleration in zip(stamps_ns, accelerations, strict=True):
+            for stamp_ns, acceleration in accelerations:
                 bag.write(imu_topic, stamp_ns, bag_messages.imu_message(
                     stamp_ns, _IMU_FRAME, acceleration))
                 written['accelerations'] += 1

@@ -57,9 +57,8 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
                 queries: Sequence[PosedQuery],
                 *, trials: int, workers: int = 1, scheduler: str = '',
                 layer: KeyframeLayer | None = None,
-                noisy: Sequence[Sequence[PosedQuery]] = (),
-                advance: Callable[[list[Result]], object] = lambda results: None) -> list[Result]:
-    """Run methods on queries.
+                noisy: Sequence[Sequence[PosedQuery]] = ()) -> list[Result]:
+    """Run methods on queries; show a progress bar on a terminal.
 
     Parameters
     ----------
@@ -71,8 +70,6 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
         Keyframes of the map, which are used for queries with images.
     noisy : sequence of sequence of PosedQuery, optional
         For each trial, the queries with the noise of simulated sensors in that trial.
-    advance : callable, optional
-        Called with the results of each finished part.
 
     Returns
     -------
@@ -88,28 +85,25 @@ def run_methods(landmark_map: LandmarkMap, methods: Sequence[Method],
     parts = [
         (method, trial, places)
         for method in sorted(methods, key=lambda method: not method.draws_nothing)
-        for trial in range(count_trials(method, trials, bool(noisy)))
+        for trial in range(trials if noisy or not method.draws_nothing else 1)
         for places in batched(range(len(queries)), max(1, len(queries)) if method.accumulates
                               else 1 if method.draws_nothing else _QUERIES_A_PART)]
     results = list[Result]()
     # a single part is done sooner than a process starts
     workers = workers if len(parts) > 1 else 1
     make_search = partial(_make_search, landmark_map, noisy or [queries], layer)
-    with closing(run_tasks(make_search, parts, workers=workers, scheduler=scheduler)) as finished:
+    tasks = run_tasks(make_search, parts, workers=workers, scheduler=scheduler)
+    total = sum(len(places) for _, _, places in parts)
+    with closing(tasks) as finished, tqdm(total=total, unit='search', disable=None) as bar:
         for (method, trial, places), found in finished:
             if found is None:
                 raise WorkersError(
                     f'workers died repeatedly at {method.name}, trial {trial}, queries '
                     f'{places[0]}-{places[-1]}; run again with fewer workers')
             results += found
-            advance(found)
+            bar.update(len(found))
     order = {method.name: number for number, method in enumerate(methods)}
     return sorted(results, key=lambda result: (order[result.method], result.trial, result.query))
-
-
-def count_trials(method: Method, trials: int, are_noisy: bool = False) -> int:
-    """Return the number of trials that differ: 1 without random samples and noisy sensors."""
-    return trials if are_noisy or not method.draws_nothing else 1
 
 
 def _make_search(landmark_map: LandmarkMap, queries: Sequence[Sequence[PosedQuery]],
@@ -158,13 +152,7 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
                      options=replace(method.options, iterations=count))
              for method in methods if not method.draws_nothing
              for count in sweep or () if count != method.options.iterations]
-    everything = [*methods, *swept]
-    total = len(queries) * sum(
-        count_trials(method, running['trials'], bool(running.get('noisy')))
-        for method in everything)
-    with tqdm(total=total, unit='search', disable=None) as bar:
-        results = run_methods(landmark_map, everything, queries,
-                              advance=lambda results: bar.update(len(results)), **running)
+    results = run_methods(landmark_map, [*methods, *swept], queries, **running)
     own = [result for result in results if _AT not in result.method]
     write_trajectories(out / 'trajectories', queries, own)
     shown = [*own, *chain.from_iterable(of_others.values())]
@@ -184,7 +172,8 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     write_text(out / 'run.json', json.dumps(about, indent=1) + '\n')
     write_text(out / 'table.md', '\n\n'.join([summary.as_markdown(rows), *remarks, '\n'.join(
         f'- {name}: {value}' for name, value in facts)]) + '\n')
-    write_text(out / 'results.json', summary.as_json(shown))
+    lines = ',\n'.join(json.dumps(vars(result)) for result in shown)
+    write_text(out / 'results.json', f'[\n{lines}\n]\n')
     write_text(out / 'table.tex', ''.join(
         f'% {name}: {value}\n' for name, value in facts) + summary.as_latex(rows))
     write_text(out / 'summary.csv', summary.as_csv(summaries, summary.relative_errors(

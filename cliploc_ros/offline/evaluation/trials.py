@@ -85,16 +85,15 @@ def make_queries(queries: Queries, landmark_map: LandmarkMap, every_frame: bool 
     recorded with another map.
     """
     column = {landmark_id: number for number, landmark_id in enumerate(queries.landmark_ids)}
-    missing = [name for name in landmark_map.landmark_ids if name not in column]
-    if missing:
-        more = f' and {len(missing) - 1} more' if missing[1:] else ''
-        raise DatasetError(f"the queries lack the map's landmark '{missing[0]}'{more}: they were "
-                           'recorded with another map')
+    if others := sorted(column.keys() ^ set(landmark_map.landmark_ids)):
+        more = f' and {len(others) - 1} more' if others[1:] else ''
+        raise DatasetError('the queries were recorded with another map: only one of both has the '
+                           f"landmark '{others[0]}'{more}")
     columns = [column[landmark_id] for landmark_id in landmark_map.landmark_ids]
     return tuple(replace(query, observation=replace(
         query.observation, similarities=np.ascontiguousarray(
             np.asarray(query.observation.similarities, dtype=np.float32)[:, columns])))
-        for query in queries if every_frame or query.is_main)
+        for query in queries.frames if every_frame or query.is_main)
 
 
 def join_cameras(queries: Mapping[str, Sequence[PosedQuery]], tolerance_s: float

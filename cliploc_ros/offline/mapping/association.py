@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Associate boxes with landmarks: one to one in every frame, with the greatest total overlap."""
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -16,23 +14,19 @@ from cliploc_ros.offline.mapping.views import Views
 ASSOCIATION_IOU = 0.2
 
 
-class Overlaps(NamedTuple):
-    """Pairs of a box and a landmark with its class that overlap, in the order of the boxes."""
+def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float
+                  ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Return the pairs of a box and a landmark with its class that overlap by more than min_iou.
 
-    #: (p,)
-    boxes: NDArray[np.int64]
-    landmarks: NDArray[np.int64]
-    ious: NDArray[np.float64]  #: (p,): of box and projected box, clipped to the image
-
-
-def find_overlaps(views: Views, landmarks: Landmarks, min_iou: float) -> Overlaps:
-    """Return the pairs that overlap by more than min_iou, for each class of a landmark."""
+    They are the boxes, the landmarks, and the IoUs of box and projected box, clipped to the image
+    (p,), in the order of the boxes.
+    """
     names = landmarks.names[np.argsort(landmarks.names[:, 1], kind='stable')]
     starts = np.searchsorted(names[:, 1], np.arange(views.classes.max(initial=0) + 2))
     boxes, numbers, ious = _overlaps(views, landmarks.centers, landmarks.bases, names[:, 0],
                                      starts, min_iou)
     order = np.lexsort((numbers, boxes))
-    return Overlaps(boxes[order], numbers[order], ious[order])
+    return boxes[order], numbers[order], ious[order]
 
 
 @compiled
@@ -41,10 +35,7 @@ def _overlaps(views, centers, bases, members, starts, min_iou):
 
     Class k has the landmarks members[starts[k]:starts[k + 1]].
     """
-    capacity = 4 * len(views.frames) + 64
-    boxes, landmarks = np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64)
-    ious = np.empty(capacity)
-    count = 0
+    boxes, landmarks, ious = [], [], []
     projected = np.empty((len(centers), 4))
     projected_in = np.full(len(centers), -1)
     visible = np.zeros(len(centers), dtype=np.bool_)
@@ -60,14 +51,10 @@ def _overlaps(views, centers, bases, members, starts, min_iou):
                 continue
             iou = box_iou(projected[landmark], views.edges[row], views.bounds[frame])
             if iou > min_iou:
-                if count == capacity:
-                    capacity *= 2
-                    boxes = np.append(boxes, np.empty_like(boxes))
-                    landmarks = np.append(landmarks, np.empty_like(landmarks))
-                    ious = np.append(ious, np.empty_like(ious))
-                boxes[count], landmarks[count], ious[count] = row, landmark, iou
-                count += 1
-    return boxes[:count].copy(), landmarks[:count].copy(), ious[:count].copy()
+                boxes.append(row)
+                landmarks.append(landmark)
+                ious.append(iou)
+    return np.array(boxes), np.array(landmarks), np.array(ious)
 
 
 def associate(views: Views, landmarks: Landmarks, min_iou: float = ASSOCIATION_IOU,

@@ -50,12 +50,10 @@ def close_pairs(landmarks: Landmarks) -> list[tuple[int, int, float]]:
         return []
     reach = np.linalg.norm(landmarks.bases, axis=(1, 2))
     # the smaller of two touching landmarks lies within the reach of the larger one
-    tree = cKDTree(landmarks.centers)
+    near = cKDTree(landmarks.centers).query_ball_point(landmarks.centers, 2.0 * STANDS_IN * reach)
     pairs = np.array(sorted({
-        (min(first, second), max(first, second)) for first in range(len(reach))
-        for second in tree.query_ball_point(landmarks.centers[first],
-                                            2.0 * STANDS_IN * reach[first])
-        if second != first}), dtype=np.int64).reshape(-1, 2)
+        (min(first, second), max(first, second)) for first, others in enumerate(near)
+        for second in others if second != first}), dtype=np.int64).reshape(-1, 2)
     shapes = landmarks.bases @ landmarks.bases.transpose(0, 2, 1)
     distances = normalized_lengths(np.diff(landmarks.centers[pairs], axis=1)[:, 0],
                                    shapes[pairs].sum(axis=1))

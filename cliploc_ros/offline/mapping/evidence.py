@@ -92,9 +92,9 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
 
 def best_ious(views: Views, landmarks: Landmarks) -> NDArray[np.float64]:
     """Return the greatest IoU (n,) of each box with any landmark of its class, 0 for none."""
-    overlaps = find_overlaps(views, landmarks, 0.0)
+    boxes, _, ious = find_overlaps(views, landmarks, 0.0)
     best = np.zeros(len(views.frames))
-    np.maximum.at(best, overlaps.boxes, overlaps.ious)
+    np.maximum.at(best, boxes, ious)
     return best
 
 
@@ -110,10 +110,7 @@ def is_expected(views, cameras, center, basis, reach):
     """Return a mask of the frames (F,) in which an ellipsoid is visible within reach [m]."""
     expected, box = np.zeros(len(cameras), dtype=np.bool_), np.empty(4)
     for frame in range(len(cameras)):
-        distance_2 = 0.0
-        for i in range(3):
-            distance_2 += (center[i] - cameras[frame, i]) ** 2
-        if distance_2 > reach * reach:
+        if np.square(center - cameras[frame]).sum() > reach * reach:
             continue
         expected[frame] = project_box(
             views.rotations[frame], views.translations[frame], center, basis, box
@@ -264,9 +261,8 @@ def _count_views(views, centers, bases, radii, reaches, least, is_solid, shown):
                 near[in_front] = place
                 in_front += 1
         was_seen = np.zeros(count, dtype=np.bool_)
-        for row in range(first, last):
-            if shown[row] >= 0:
-                was_seen[shown[row]] = True
+        numbers = shown[first:last]
+        was_seen[numbers[numbers >= 0]] = True
         in_view = was_seen.copy()
         for i in range(in_front):
             place = near[i]
@@ -311,20 +307,17 @@ def _hidden(place, near, boxes, distances, radii, is_solid, shown, edges, first,
     count = 0
     for k in range(len(_GRID)):
         x, y = x0 + a * _GRID[k, 0], y0 + b * _GRID[k, 1]
-        is_hidden = False
         for other in near:
             if (is_solid[other] and other != place
                     and distances[other] + radii[other] < distances[place]
                     and _covers(boxes[other], x, y)):
-                is_hidden = True
+                count += 1
                 break
-        if not is_hidden:
+        else:
             for row in range(first, last):
                 if shown[row] < 0 and _covers(edges[row], x, y):
-                    is_hidden = True
+                    count += 1
                     break
-        if is_hidden:
-            count += 1
     return count / len(_GRID)
 
 

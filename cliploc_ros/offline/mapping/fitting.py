@@ -26,7 +26,7 @@ from cliploc_ros.offline.mapping.landmarks import (
     linearize_box,
     move_ellipsoid,
 )
-from cliploc_ros.offline.mapping.views import Views
+from cliploc_ros.offline.mapping.views import NO_SIZE, Views
 
 #: Scale of the Cauchy loss, in standard deviations of an edge.
 LOSS_SCALE = 1.5
@@ -86,7 +86,8 @@ def centre_covariance(views: Views, rows: NDArray[np.int64], center: NDArray[np.
     centre, the covariance is a large multiple of the identity. The size of the class is ignored.
     """
     information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-    accumulate(views.without_sizes, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
+    without_sizes = views._replace(sizes=np.full_like(views.sizes, NO_SIZE))
+    accumulate(without_sizes, rows, center, basis, information, np.zeros(LANDMARK_SIZE))
     alike = 1.0 + _ALIKE * len(np.unique(views.viewpoints[views.frames[rows]]))
     try:
         covariance = alike * np.linalg.inv(information)[:3, :3]
@@ -101,15 +102,12 @@ def centre_covariance(views: Views, rows: NDArray[np.int64], center: NDArray[np.
 def descend(views, rows, center, basis, iterations):
     """Improve center and basis in place, and return the cost."""
     information, gradient = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE)), np.zeros(LANDMARK_SIZE)
-    trial_information = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
-    trial_gradient = np.zeros(LANDMARK_SIZE)
-    trial_center, trial_basis = np.zeros(3), np.zeros((3, 3))
+    trial_information, trial_gradient = information.copy(), gradient.copy()
+    trial_center, trial_basis = center.copy(), basis.copy()
     cost = accumulate(views, rows, center, basis, information, gradient)
     damping = 1e-3
     for _ in range(iterations):
-        damped = information.copy()
-        for i in range(LANDMARK_SIZE):
-            damped[i, i] += damping * information[i, i] + 1e-9
+        damped = information + np.diag(damping * np.diag(information) + 1e-9)
         step = np.linalg.solve(damped, -gradient)
         limit_step(step, basis)
         move_ellipsoid(center, basis, step, trial_center, trial_basis)
@@ -134,9 +132,8 @@ def descend(views, rows, center, basis, iterations):
 def limit_step(step, basis):
     """Shorten a step (9,) that exceeds the range of its linearization."""
     size = sqrt((basis * basis).sum())
-    largest = sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2]) / size
-    for i in range(3, LANDMARK_SIZE):
-        largest = max(largest, abs(step[i]))
+    length = sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    largest = max(length / size, np.abs(step[3:]).max())
     if largest > _MAX_STEP:
         step *= _MAX_STEP / largest
 
@@ -171,9 +168,7 @@ def accumulate(views, rows, center, basis, information, gradient):
         cost += share * add_depth(views, row, center, share, information, gradient)
     size = _largest(views.sizes[rows], np.zeros_like(rows), 1)[0]
     cost += add_axis_prior(basis, size, information, gradient)
-    for i in range(LANDMARK_SIZE):
-        for j in range(i):
-            information[j, i] = information[i, j]
+    information += np.tril(information, -1).T
     return cost
 
 
@@ -253,12 +248,11 @@ def add_axis_prior(basis, size, information, gradient):
             weight = robust_weight(excess)
             gradient[diagonal[k]] += 0.5 * weight * size[1] * excess
             information[diagonal[k], diagonal[k]] += 0.25 * weight * size[1] * size[1]
+        slopes = (0.5 * (np.arange(3) == k) - 1.0 / 6.0) / _AXIS_SPREAD
         for i in range(3):
-            slope = ((0.5 if i == k else 0.0) - 1.0 / 6.0) / _AXIS_SPREAD
-            gradient[diagonal[i]] += slope * residual
+            gradient[diagonal[i]] += slopes[i] * residual
             for j in range(i + 1):
-                other = ((0.5 if j == k else 0.0) - 1.0 / 6.0) / _AXIS_SPREAD
-                information[diagonal[i], diagonal[j]] += slope * other
+                information[diagonal[i], diagonal[j]] += slopes[i] * slopes[j]
     # The off-diagonal numbers rotate the axes, which boxes of a sphere do not constrain: weak
     # damping without a target keeps the equations regular.
     for off in (4, 5, 7):
@@ -335,12 +329,7 @@ def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_pose
         # a pose error in the map's axes moves the map the opposite way in the camera's axes
         by_pose = np.concatenate((-by_motion[:, :3] @ rotation, -by_motion[:, 3:] @ rotation),
                                  axis=1)
-        x, y, z = views.levers[frame]
-        for edge in range(4):
-            across = by_pose[edge, :3]
-            by_pose[edge, 3] += y * across[2] - z * across[1]
-            by_pose[edge, 4] += z * across[0] - x * across[2]
-            by_pose[edge, 5] += x * across[1] - y * across[0]
+        by_pose[:, 3:] += np.cross(views.levers[frame], by_pose[:, :3])
         for edge in range(4):
             residual = edge_residual(views, row, edge, box)
             if residual == 0.0:
@@ -364,9 +353,5 @@ def accumulate_all(views, rows, landmarks, centers, bases, of_landmarks, of_pose
         lower = np.zeros((LANDMARK_SIZE, LANDMARK_SIZE))
         cost += add_axis_prior(bases[landmark], sizes[landmark], lower,
                                landmark_gradient[landmark])
-        for i in range(LANDMARK_SIZE):
-            for j in range(i + 1):
-                of_landmarks[landmark, i, j] += lower[i, j]
-                if i != j:
-                    of_landmarks[landmark, j, i] += lower[i, j]
+        of_landmarks[landmark] += lower + np.tril(lower, -1).T
     return cost

@@ -170,10 +170,8 @@ def move_ellipsoid(center, basis, step, new_center, new_basis):
     root = np.eye(3) + half + 0.5 * (half @ half)
     stretched = basis @ root
     squares, directions = np.linalg.eigh(stretched @ stretched.T)
-    for i in range(3):
-        new_center[i] = center[i] + step[i]
-        for k in range(3):
-            new_basis[i, k] = directions[i, k] * sqrt(max(squares[k], 1e-8))
+    new_center[:] = center + step[:3]
+    new_basis[:] = directions * np.sqrt(np.maximum(squares, 1e-8))
 
 
 _NO_NAMES = np.empty((0, 2), dtype=np.int64)

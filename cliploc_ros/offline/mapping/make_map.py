@@ -269,8 +269,7 @@ def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording
         lines += [removed_layer(path)] * layer_path(path).exists()
         besides[layer_path(path)] = None
     besides[removed_path(path)] = partial(write_landmarks, landmark_map=replace(
-        made.removed, map_set=landmark_map.map_set)) if made.removed is not None and len(
-            made.removed) else None
+        made.removed, map_set=landmark_map.map_set)) if made.removed else None
     write_map(path, landmark_map, comments, made.embeddings, besides)
     if layer is None:
         return lines

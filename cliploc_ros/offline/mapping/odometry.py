@@ -111,17 +111,13 @@ def link_frames(given: Views, odom_from_camera: NDArray[np.float64], errors: Pos
     if not kept.all():
         first_s = given.stamps_s[frames[before[~kept][0]]]
         note += f'; jumps left out: {np.count_nonzero(~kept)}, the first at {first_s:.2f} s'
-    return Steps(frames[before[kept]], pairs.shifts[kept], pairs.turns[kept],
-                 1.0 / pairs.sigmas[kept]), note
+    return Steps._make(column[kept] for column in pairs.steps), note
 
 
 class _Compared(NamedTuple):
     """Comparison of odometry with poses for m pairs of frames."""
 
-    #: (m, 3), (m, 3, 3), (m, 2): of odometry, as in Steps; standard deviations [m] [rad]
-    shifts: NDArray[np.float64]
-    turns: NDArray[np.float64]
-    sigmas: NDArray[np.float64]
+    steps: Steps  #: By odometry
     excess: NDArray[np.float64]  #: (m,): how far the two differ, in standard deviations of both
     #: (m, 2): the camera shifts, or turns, by more than these deviations explain
     is_motion: NDArray[np.bool_]
@@ -201,9 +197,9 @@ class _Known:
         motions_m = np.stack([far_m, np.linalg.norm(by_poses, axis=1)])
         lengths = np.linalg.norm(residuals, axis=2).T
         motions = np.column_stack([motions_m.max(axis=0), Rotation.from_matrix(turns).magnitude()])
-        return _Compared(shifts, turns, sigmas, (lengths / of_both).max(axis=1),
-                         motions > _CONTRADICTION * of_both, motions_m,
-                         ahead / np.maximum(far_m, 1e-9))
+        return _Compared(Steps(frames[firsts], shifts, turns, 1.0 / sigmas),
+                         (lengths / of_both).max(axis=1), motions > _CONTRADICTION * of_both,
+                         motions_m, ahead / np.maximum(far_m, 1e-9))
 
 
 def _residuals(views: Views, firsts: NDArray[np.int64], seconds: NDArray[np.int64],

@@ -103,8 +103,7 @@ class PosedDetections:
         """Return the detections of some frames, in the order given."""
         frames = np.asarray(frames, dtype=np.int64)
         starts, ends = self.frame_offsets[frames], self.frame_offsets[frames + 1]
-        rows = [np.arange(start, end) for start, end in zip(starts, ends, strict=True)]
-        boxes = np.concatenate([np.empty(0, dtype=np.int64), *rows])
+        boxes = np.concatenate([np.arange(0), *map(np.arange, starts, ends)])
         return replace(
             self, frame_offsets=np.cumsum(np.concatenate([[0], ends - starts])),
             **self._rows(_PER_BOX, boxes), **self._rows(_PER_FRAME, frames))
@@ -141,10 +140,9 @@ def group_cameras(cameras: Sequence[Camera]
     rows = {}
     for camera in dict.fromkeys(cameras):
         for row, other in enumerate(found):
-            differences = np.array([camera.fx - other.fx, camera.fy - other.fy,
-                                    camera.cx - other.cx, camera.cy - other.cy]) / other.fx
-            if ((camera.width, camera.height) == (other.width, other.height)
-                    and np.abs(differences).max() < _SAME_CAMERA):
+            change = np.abs(camera.matrix - other.matrix).max() / other.fx
+            if (camera.width, camera.height) == (other.width, other.height) and (
+                    change < _SAME_CAMERA):
                 rows[camera] = row
                 break
         else:

@@ -99,9 +99,8 @@ def find_sightings(detections: PosedDetections, rows: NDArray[np.int64],
 def _projection(detections: PosedDetections, view: int, center: NDArray[np.float64],
                 shape: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the box (4,) around an ellipsoid in a view [px]; NaN behind the camera."""
-    box: NDArray[np.float64] = ellipsoid.ellipse_bboxes(
-        outlines_in_view(detections, view, center[None], shape[None]))[0]
-    return box
+    return np.asarray(ellipsoid.ellipse_bboxes(
+        outlines_in_view(detections, view, center[None], shape[None]))[0])
 
 
 def _inset(camera: Camera, box: NDArray[np.float64]) -> float:

@@ -79,11 +79,6 @@ class Views(NamedTuple):
         poses[:, :3, 3] = self.centers
         return poses
 
-    @property
-    def without_sizes(self) -> 'Views':
-        """Return the same views without the sizes of classes."""
-        return self._replace(sizes=np.tile(NO_SIZE, (len(self.frames), 1)))
-
     def with_poses(self, map_from_camera: NDArray[np.float64]) -> 'Views':
         """Return the same views with other poses (F, 4, 4)."""
         rotations, translations = _inverses(map_from_camera)

@@ -6,6 +6,7 @@ import io
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -70,61 +71,53 @@ class SeenFrame:
                                 for name, array in arrays.items()})
 
 
-@dataclass(frozen=True)
-class LoadNetworks:
-    """Loads detector and CLIP in the process that uses them."""
+def load_networks(detector: DetectorOptions, clip: ClipOptions | None, threads: int = 0
+                  ) -> Callable[[RawFrame], SeenFrame | str]:
+    """Load the networks; return the function that runs them on a frame.
 
-    detector: DetectorOptions
-    clip: ClipOptions | None  #: None: classes and boxes only
-    threads: int = 0  #: Threads of a network; 0: the default of the network
+    ModelError or OptionsError: the networks cannot be loaded.
 
-    def __call__(self) -> Callable[[RawFrame], SeenFrame | str]:
-        """Load the networks; return the function that runs them on a frame.
+    Parameters
+    ----------
+    clip : ClipOptions or None
+        None: classes and boxes only.
+    threads : int
+        Threads of a network; 0: the default of the network.
+    """
+    if threads:
+        os.environ['OMP_NUM_THREADS'] = str(threads)  # see OnnxNetwork
+    encoder = None if clip is None else ClipEncoder(resolve_clip_weights(clip), clip)
+    return partial(run_networks, load_detector(detector).detect, encoder)
 
-        ModelError or OptionsError: the networks cannot be loaded.
-        """
-        if self.threads:
-            os.environ['OMP_NUM_THREADS'] = str(self.threads)  # see OnnxNetwork
-        encoder = (None if self.clip is None
-                   else ClipEncoder(resolve_clip_weights(self.clip), self.clip))
-        return RunNetworks(load_detector(self.detector).detect, encoder)
 
+def run_networks(detect: Callable[[NDArray[np.uint8]], Detections],
+                 encoder: ImageTextEncoder | None, raw: RawFrame) -> SeenFrame | str:
+    """Run a detector and an encoder on a frame that has a pose.
 
-@dataclass(frozen=True)
-class RunNetworks:
-    """Runs detector and encoder on a raw frame."""
-
-    #: ObjectDetector.detect, or another function that returns the objects in an image
-    detect: Callable[[NDArray[np.uint8]], Detections]
-    encoder: ImageTextEncoder | None = None
-
-    def __call__(self, raw: RawFrame) -> SeenFrame | str:
-        """Run the networks on a frame that has a pose.
-
-        If the image or depth image cannot be used, return the reason.
-        """
-        try:
-            frame = raw.decode()
-        except DatasetError as error:
-            return str(error)
-        camera = frame.camera
-        assert frame.map_from_camera is not None
-        detections = self.detect(frame.image_rgb).usable(camera.width, camera.height,
-                                                         MAX_DETECTIONS)
-        bboxes, size = detections.bboxes_xyxy, [camera.width, camera.height]
-        open_edges = at_border(bboxes, np.array(size * 2))
-        if not camera.is_pinhole:
-            bboxes = camera.bboxes_in_pixels(camera.normalize_bboxes(bboxes))
-        rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # False for NaN
-        sound = detections.select(rows)
-        embeddings = (np.empty((len(rows), 0)) if self.encoder is None
-                      else self.encoder.encode_crops(frame.image_rgb, sound.bboxes_xyxy))
-        depths = spreads = np.full(len(rows), np.nan, dtype=np.float32)
-        if frame.depth is not None:
-            depths, spreads = depths_of_boxes(frame.depth, camera, sound.bboxes_xyxy)
-        return SeenFrame(
-            raw.place, raw.camera, raw.stamp_ns, frame.map_from_camera,
-            np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), sound.bboxes_xyxy,
-            bboxes[rows], open_edges[rows], not camera.is_pinhole,
-            np.array(sound.class_ids, dtype=np.str_), sound.scores,
-            embeddings.astype(np.float16), depths, spreads)
+    If the image or depth image cannot be used, return the reason. `detect` is
+    ObjectDetector.detect, or another function that returns the objects in an image.
+    """
+    try:
+        frame = raw.decode()
+    except DatasetError as error:
+        return str(error)
+    camera = frame.camera
+    assert frame.map_from_camera is not None
+    detections = detect(frame.image_rgb).usable(camera.width, camera.height, MAX_DETECTIONS)
+    bboxes, size = detections.bboxes_xyxy, [camera.width, camera.height]
+    open_edges = at_border(bboxes, np.array(size * 2))
+    if not camera.is_pinhole:
+        bboxes = camera.bboxes_in_pixels(camera.normalize_bboxes(bboxes))
+    rows = np.nonzero((bboxes[:, 2:] > bboxes[:, :2]).all(axis=1))[0]  # False for NaN
+    sound = detections.select(rows)
+    embeddings = (np.empty((len(rows), 0)) if encoder is None
+                  else encoder.encode_crops(frame.image_rgb, sound.bboxes_xyxy))
+    depths = spreads = np.full(len(rows), np.nan, dtype=np.float32)
+    if frame.depth is not None:
+        depths, spreads = depths_of_boxes(frame.depth, camera, sound.bboxes_xyxy)
+    return SeenFrame(
+        raw.place, raw.camera, raw.stamp_ns, frame.map_from_camera,
+        np.array([*size, camera.fx, camera.fy, camera.cx, camera.cy]), sound.bboxes_xyxy,
+        bboxes[rows], open_edges[rows], not camera.is_pinhole,
+        np.array(sound.class_ids, dtype=np.str_), sound.scores,
+        embeddings.astype(np.float16), depths, spreads)

@@ -15,6 +15,7 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ from cliploc_ros.offline.datasets.observations import load_observations, save_ob
 from cliploc_ros.offline.datasets.poses import Poses
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections, group_cameras
 from cliploc_ros.offline.mapping.views import KeyframeFilter, KeyframeOptions
-from cliploc_ros.offline.recording.networks import LoadNetworks, SeenFrame
+from cliploc_ros.offline.recording.networks import SeenFrame, load_networks
 from cliploc_ros.units import NS_PER_S
 
 logger = logging.getLogger(__name__)
@@ -70,16 +71,6 @@ class RecordingOptions:
     reading: str = ''
     workers: int = 1  #: Number of local processes; the result does not depend on it
     scheduler: str = ''  #: Address of a Dask scheduler; '' for none
-
-    @property
-    def networks(self) -> LoadNetworks:
-        """Return a function that loads the networks.
-
-        PyTorch's rounding depends on the number of threads. With one thread per worker, the result
-        is the same for any number of workers and on a cluster.
-        """
-        threads = 0 if self.workers == 1 and not self.scheduler else 1
-        return LoadNetworks(self.detector, self.clip, threads)
 
 
 def observation_file(frames: Frames, options: RecordingOptions) -> Path:
@@ -235,15 +226,13 @@ def _open_outputs(path: Path) -> Iterator[Log]:
 
 def _again(seen: SeenFrame, raw: RawFrame) -> SeenFrame:
     """Return an earlier output for an image with its present pose and depth."""
-    unknown = np.full(len(seen.scores), np.nan, dtype=np.float32)
-    depths = unknown, unknown
+    depths = spreads = np.full(len(seen.scores), np.nan, dtype=np.float32)
     if raw.depth is not None:
-        frame = raw.decode()
-        assert frame.depth is not None
-        depths = depths_of_boxes(frame.depth, frame.camera, seen.bboxes_in_image)
+        _, camera = raw.color()
+        depths, spreads = depths_of_boxes(raw.depth(), camera, seen.bboxes_in_image)
     assert raw.map_from_camera is not None
-    return replace(seen, map_from_camera=raw.map_from_camera, depths=depths[0],
-                   depth_spreads=depths[1])
+    return replace(seen, map_from_camera=raw.map_from_camera, depths=depths,
+                   depth_spreads=spreads)
 
 
 def _record(frames: Frames, options: RecordingOptions, described: str, outputs: Log,
@@ -257,6 +246,10 @@ def _record(frames: Frames, options: RecordingOptions, described: str, outputs: 
         logger.warning('using the boxes of %d images of earlier runs: %s', len(earlier),
                        outputs.path)
     seen, unusable, is_kept = list[SeenFrame](), list[str](), bool(earlier)
+    # PyTorch's rounding depends on the number of threads: with one thread per worker, the result
+    # is the same for any number of workers and on a cluster
+    networks = partial(load_networks, options.detector, options.clip,
+                       threads=0 if options.workers == 1 and not options.scheduler else 1)
 
     def unseen(raws: Iterator[RawFrame]) -> Iterator[RawFrame]:
         for raw in raws:
@@ -266,7 +259,7 @@ def _record(frames: Frames, options: RecordingOptions, described: str, outputs: 
                 seen.append(_again(found, raw))
     try:
         with _read_keyframes(frames, options.keyframes) as (raws, filters):
-            for _, result in run_tasks(options.networks, unseen(raws), workers=options.workers,
+            for _, result in run_tasks(networks, unseen(raws), workers=options.workers,
                                        scheduler=options.scheduler):
                 if isinstance(result, str):
                     unusable.append(result)

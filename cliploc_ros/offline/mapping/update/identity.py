@@ -165,10 +165,8 @@ def _identify(known: OldMap, objects: Shown, judged: Judgement, looks: Likeness 
     model = None if looks is None else _learn_looks(objects, looks, groups)
     doubtful = np.zeros(len(held), dtype=np.bool_)
     if looks is not None and model is not None:
-        pairs = looks.landmarks[owners], looks.objects[held]
-        cosines = np.einsum('ld,ld->l', *pairs).astype(np.float64)
-        doubtful = (pairs[0].any(axis=1) & pairs[1].any(axis=1)
-                    & (cosines < model.own - _DOUBT * model.sigma))
+        cosines = looks.similarities(owners, held).diagonal()  # NaN is not doubtful
+        doubtful = cosines < model.own - _DOUBT * model.sigma
     own = judged.sight.select(slice(len(known.sigmas)))
     searched = (judged.is_gone | judged.is_doubtful) & (
         own.seen <= _MOST_SEEN_IF_MOVED * own.expected)

@@ -221,15 +221,15 @@ def _free(views: Views, known: alignment.OldMap) -> NDArray[np.bool_]:
     classes: they may be another name for it.
     """
     own = associate(views, known.landmarks, MIN_MEDIAN_IOU)
-    nameless = find_overlaps(
+    boxes, landmarks, _ = find_overlaps(
         views._replace(classes=np.zeros_like(views.classes)),
         Landmarks(known.landmarks.centers, known.landmarks.bases,
                   np.zeros_like(known.landmarks.classes)), MIN_MEDIAN_IOU)
-    others = own[nameless.boxes] < 0
-    on, count = nameless.landmarks[others], len(known.sigmas)
+    others = own[boxes] < 0
+    on, count = landmarks[others], len(known.sigmas)
     is_named = np.bincount(own[own >= 0], minlength=count) >= np.bincount(on, minlength=count)
     free = own < 0
-    free[nameless.boxes[others][is_named[on]]] = False
+    free[boxes[others][is_named[on]]] = False
     return free
 
 
