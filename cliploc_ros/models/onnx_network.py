@@ -19,7 +19,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -110,13 +109,10 @@ class OnnxNetwork:
     def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
         check_weights_file(file)
         self.file = file
-        # A compiled network is named by a hash of all that it depends on. The import takes as long
-        # as the digest of 500 MB.
-        with ThreadPoolExecutor(1) as pool:
-            content = pool.submit(digest_network, file)
-            openvino = import_openvino()
-            depends = [_FORMAT, openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME'),
-                       openvino.get_version(), precision, content.result()]
+        # A compiled network is named by a hash of all that it depends on.
+        openvino, content = import_openvino(), digest_network(file, cache_dir)
+        depends = [_FORMAT, openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME'),
+                   openvino.get_version(), precision, content]
         digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
         stored = resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}.blob'
         try:
@@ -125,6 +121,9 @@ class OnnxNetwork:
             if stored.exists():
                 logger.warning('%s cannot be used (%s): compiling %s again', stored,
                                first_line(error), file.name)
+            if digest_network(file) != content:
+                raise ModelError(f'{file} is damaged: its content differs from that of earlier '
+                                 'starts; copy it again') from error
             compiled, self.metadata = _compile(file, stored, precision)
         self._network = CompiledNetwork(compiled)
         self.inputs = tuple(Input(
