@@ -286,7 +286,9 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
         import huggingface_hub as hub
 
         info = hub.HfApi().model_info(repository, revision=revision, timeout=_PATIENCE_S)
-        commit, files = info.sha, [sibling.rfilename for sibling in info.siblings or ()]
+        commit, files = info.sha, [sibling.rfilename for sibling in info.siblings or ()
+                                   if '..' not in Path(sibling.rfilename).parts
+                                   and not sibling.rfilename.startswith('/')]
         chosen = choose(files)
         for part in chosen:
             # before the download, which uses both as names of files

@@ -315,7 +315,12 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
         raise ModelError(f'{folder / TOKENIZER} is missing; it splits labels into tokens: put the '
                          'file of the published network there')
     try:
-        tokenizer = tokenizers.Tokenizer.from_str(read_file(files[0]).decode())
+        text = read_file(files[0]).decode()
+        about = parse_json(text)
+        # on a prefix that its merges lack, the library ends the process
+        if 'merges' in about['model'] and about['model'].get('continuing_subword_prefix'):
+            raise ValueError('its words are continued with a prefix')
+        tokenizer = tokenizers.Tokenizer.from_str(text)
         if len(tokenizer.encode('a cup').ids) < 3:
             raise ValueError('it does not mark the end of a text')
         known, size = _of_text(folder, 'vocab_size'), tokenizer.get_vocab_size()
@@ -325,8 +330,7 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
         raise ModelError(f'{files[0]} is not a tokenizer of a CLIP: {first_line(error)}'
                          ) from error
     padding = 0
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        stored = parse_json(read_file(files[0]))['padding']
-        padding = int(stored['pad_id'])
+    with contextlib.suppress(ValueError, LookupError, TypeError):
+        padding = int(about['padding']['pad_id'])
     tokenizer.no_padding()
     return tokenizer, padding

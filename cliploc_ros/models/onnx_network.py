@@ -92,7 +92,7 @@ class OnnxNetwork:
     Compiling takes seconds. The compiled network is therefore kept in the folder ``openvino`` of
     the cache, keyed by the content of the file, the processor and the version of OpenVINO.
     OpenVINO runs a damaged network without an error (measured: boxes off by 20 px), so its SHA-256
-    is stored and checked.
+    is stored and checked, and that of the ONNX file if sha256sum has written it to NAME.sha256.
 
     It has as many threads as OMP_NUM_THREADS says when it is loaded, by default one for each core
     that the process may use.
@@ -111,6 +111,11 @@ class OnnxNetwork:
         self.file = file
         # A compiled network is named by a hash of all that it depends on.
         openvino, content = import_openvino(), digest_network(file, cache_dir)
+        with contextlib.suppress(FileNotFoundError):
+            if read_file(file.with_name(f'{file.name}.sha256')).split()[:1] != [
+                    content.partition(':')[0].encode()]:
+                raise ModelError(f'{file} differs from the digest in {file.name}.sha256: copy '
+                                 'both again')
         depends = [_FORMAT, openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME'),
                    openvino.get_version(), precision, content]
         digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
@@ -141,8 +146,10 @@ class OnnxNetwork:
         images = [port for port in self.inputs if len(port.shape) == 4]
         if len(images) != 1 or images[0].shape[0] not in (1, ANY) or (
                 images[0].shape[1] not in (3, ANY)):
+            remedy = ': its channels are last, export it with channels first (tf2onnx: ' \
+                '--inputs-as-nchw)' if images and images[0].shape[3] == 3 else ''
             raise ModelError(f'{self.file} takes no single colour image: its inputs are '
-                             f'{self.described_inputs()}, expected (1, 3, height, width)')
+                             f'{self.described_inputs()}, expected (1, 3, height, width){remedy}')
         if images[0].type not in (np.float32, np.float16):
             raise ModelError(f'{self.file} takes images of integers, whose scale is unknown '
                              f'({self.described_inputs()}): export it with inputs in fp32')
