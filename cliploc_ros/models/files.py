@@ -105,13 +105,13 @@ def _content(path: Path, cache_dir: str | None) -> tuple[str, list[str]]:
             digest, names = parse_json(text)
             return digest, names
     found = _read(path, *state)
+    text = json.dumps(found)
     with suppress(OSError):  # a read-only cache works too
         if time.time_ns() - status.st_ctime_ns > _SETTLED_NS:
             kept.parent.mkdir(parents=True, exist_ok=True)
             check_owners(kept.parent)
             remove_unused(kept.parent, _MOST_DIGESTS - 1)
             with replace_file(kept) as partial:
-                text = json.dumps(found)
                 partial.write_text(f'{hashlib.sha256(text.encode()).hexdigest()} {text}')
     return found
 

@@ -146,10 +146,9 @@ class OnnxNetwork:
         images = [port for port in self.inputs if len(port.shape) == 4]
         if len(images) != 1 or images[0].shape[0] not in (1, ANY) or (
                 images[0].shape[1] not in (3, ANY)):
-            remedy = ': its channels are last, export it with channels first (tf2onnx: ' \
-                '--inputs-as-nchw)' if images and images[0].shape[3] == 3 else ''
             raise ModelError(f'{self.file} takes no single colour image: its inputs are '
-                             f'{self.described_inputs()}, expected (1, 3, height, width){remedy}')
+                             f'{self.described_inputs()}, expected (1, 3, height, width), '
+                             'channels first: export it so (tf2onnx: --inputs-as-nchw)')
         if images[0].type not in (np.float32, np.float16):
             raise ModelError(f'{self.file} takes images of integers, whose scale is unknown '
                              f'({self.described_inputs()}): export it with inputs in fp32')

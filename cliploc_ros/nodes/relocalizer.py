@@ -217,11 +217,11 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         """Read the map again in the worker's thread, and so never during a search."""
         try:
             with self._map_lock:
-                read = self._read_map()
+                read = self.worker.run(self._pipeline.reload_map)
             response.message = f'loaded: {read.description}; map {read.map_hash}'
             response.success = True
-        except CliplocError as error:
-            response.message = f'not loaded: {error}'
+        except Exception as error:  # otherwise rclpy would never answer
+            response.message = f'not loaded: {str(error) or repr(error)}'
         self.get_logger().info(f'map {response.message}')
         return response
 
@@ -232,27 +232,17 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             before = {'map_file': values.map_file, 'map_files': values.map_files}
             try:
                 self._set(map_file=request.map_url, map_files=[''])
-                read = self._read_map()
+                read = self.worker.run(self._pipeline.reload_map)
                 self.get_logger().info(f'map loaded: {read.description}')
                 response.result = response.RESULT_SUCCESS
-            except CliplocError as error:
+            except Exception as error:  # as above
                 self._set(**before)
-                self.get_logger().error(f'map not loaded: {error}')
+                self.get_logger().error(f'map not loaded: {str(error) or repr(error)}')
                 response.result = response.RESULT_MAP_DOES_NOT_EXIST
                 with suppress(MapError):
                     if os.path.exists(path_of(request.map_url)):  # noqa: PTH110 - never raises
                         response.result = response.RESULT_INVALID_MAP_DATA
         return response
-
-    def _read_map(self) -> FrameLocalizer:
-        """Read the map in the worker's thread; CliplocError: any error, as rclpy gives none."""
-        try:
-            return self.worker.run(self._pipeline.reload_map)
-        except CliplocError:
-            raise
-        except Exception as error:
-            self.get_logger().error(traceback.format_exc())
-            raise MapError(f'internal error: {error}') from error
 
     def _set(self, **values: Any) -> None:
         self.set_parameters_atomically(

@@ -193,7 +193,7 @@ def refusal(load, model) -> str:
     ({'output0': np.zeros((1, 9, 84), np.float32)}, TWO, {}, r'of 2 classes: .*\(9, 84\)'),
     (YOLO, TWO, {'kind': TensorProto.UINT8}, 'images of integers'),
     (YOLO, TWO, {'shape': (1, 1, 64, 64)}, 'takes no single colour image'),
-    (YOLO, TWO, {'shape': (1, 64, 64, 3)}, 'its channels are last'),
+    (YOLO, TWO, {'shape': (1, 64, 64, 3)}, 'channels first: export it so'),
     (DETR, {}, {}, 'config.json is missing')])
 def test_files_that_are_no_detector(load, tmp_path, outputs, metadata, changes, message):
     file = write_network(tmp_path / 'model.onnx', outputs, metadata, **changes)
