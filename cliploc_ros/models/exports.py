@@ -22,13 +22,7 @@ from cliploc_ros.files.storage import (
     resolve_cache_dir,
     unfinished,
 )
-from cliploc_ros.models.files import (
-    digest_file,
-    digest_files,
-    fingerprint_file,
-    first_line,
-    remove_unused,
-)
+from cliploc_ros.models.files import digest_file, fingerprint_file, first_line, remove_unused
 from cliploc_ros.models.onnx_network import free_memory
 
 # Version of these folders and of the export; a change makes new folders.
@@ -78,7 +72,7 @@ def describe_export(folder: Path, key: str) -> None:
         str(file.relative_to(folder)): digest_file(file) for file in files}}))
 
 
-def export_key(folder: Path) -> str:
+def export_key(folder: Path, cache_dir: str) -> str:
     """Return the key of the weights in an export; '' for other folders and changed exports.
 
     A changed export causes a warning. Exports of older versions have fingerprints.
@@ -86,9 +80,9 @@ def export_key(folder: Path) -> str:
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError,
                              RecursionError, ModelError):
         about: dict[str, Any] = parse_json(read_file(folder / _ABOUT))
-        digest_files([folder / name for name in about['files']])
         changed = [name for name, digest in about['files'].items()
-                   if digest not in (digest_file(folder / name), fingerprint_file(folder / name))]
+                   if digest != digest_file(folder / name, cache_dir)
+                   and digest != fingerprint_file(folder / name)]
         if not changed:
             return str(about['key'])
         logger.warning('%s differs from its digest in %s: it is damaged or was edited; export the '
@@ -109,7 +103,7 @@ def exported(cache_dir: str, kind: str, name: str, identity: Sequence[str],
     digest = hashlib.sha256(json.dumps([_FORMAT, *identity]).encode()).hexdigest()
     cache = resolve_cache_dir(cache_dir) / 'onnx'
     folder, started = cache / f'{kind}-{digest[:32]}', time.monotonic()
-    if export_key(folder):
+    if export_key(folder, cache_dir):
         with contextlib.suppress(OSError):  # a read-only cache works too
             os.utime(folder)
         return folder

@@ -9,16 +9,23 @@ import logging
 import os
 import re
 import shutil
+import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
 from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
 from cliploc_ros.errors import ModelError
-from cliploc_ros.files.storage import open_file, read_file, replace_file, resolve_cache_dir
+from cliploc_ros.files.storage import (
+    check_owners,
+    open_file,
+    parse_json,
+    read_file,
+    replace_file,
+    resolve_cache_dir,
+)
 
 _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
@@ -33,6 +40,9 @@ _LOCAL = ('.onnx', '.pt', '.pth', '.ts', '.safetensors', '.bin', '.json')
 _DIGEST = re.compile('[0-9a-f]{40}|[0-9a-f]{64}')
 # A file of weights as named in an ONNX file: the key of an entry, and the size of the name.
 _LOCATION, _MOST_NAME = re.compile(rb'\n\x08location\x12([\x80-\xff]?[\0-\x7f])'), 4096
+# Size of a file whose digest is kept [bytes], the greatest number of these, and the least age of
+# a change [ns]: a file system may give two changes at once the same time.
+_LARGE, _MOST_DIGESTS, _SETTLED_NS = 2**24, 32, 3 * 10**9
 # Time-out of the first request, in case a firewall drops its packets [s].
 _PATIENCE_S = 10.0
 
@@ -57,38 +67,57 @@ def fingerprint_file(path: Path) -> str:
     return digest.hexdigest()
 
 
-def digest_file(path: Path) -> str:
-    """Return the SHA-256 of a file, computed once; ModelError: the file cannot be read."""
-    return _content(path)[0]
+def digest_file(path: Path, cache_dir: str | None = None) -> str:
+    """Return the SHA-256 of a file, see _content; ModelError: the file cannot be read."""
+    return _content(path, cache_dir)[0]
 
 
-def digest_files(files: Sequence[Path]) -> None:
-    """Compute the SHA-256 of files side by side; ModelError: a file cannot be read."""
-    with ThreadPoolExecutor() as pool:
-        list(pool.map(digest_file, files))
-
-
-def digest_network(file: Path) -> str:
+def digest_network(file: Path, cache_dir: str | None = None) -> str:
     """Return the digests of an ONNX file and of all files of weights that it names."""
-    return ':'.join(digest_file(path) if path.is_file() else ''
-                    for path in (file, *weights_beside(file)))
+    return ':'.join(digest_file(path, cache_dir) if path.is_file() else ''
+                    for path in (file, *weights_beside(file, cache_dir)))
 
 
-def weights_beside(file: Path) -> list[Path]:
+def weights_beside(file: Path, cache_dir: str | None = None) -> list[Path]:
     """Return the files of weights that an ONNX file names; ModelError: it cannot be read."""
-    return [file.parent / name for name in _content(file)[1]]
+    return [file.parent / name for name in _content(file, cache_dir)[1]]
 
 
-def _content(path: Path) -> tuple[str, list[str]]:
+def _content(path: Path, cache_dir: str | None) -> tuple[str, list[str]]:
+    """Return the SHA-256 of a file, and the names of the files of weights in an ONNX file.
+
+    With a cache_dir, those of a large file are kept there until the file is written, moved or
+    copied: each of these changes the time of its last change (ctime), which programs cannot set. A
+    fault of the disk does not, but OpenVINO then runs the compiled network, with a digest of its
+    own, and the file is read in full before it is compiled.
+    """
     with _opened(path) as file:
         status = os.fstat(file.fileno())
-    return _read(path, status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns,
-                 status.st_ctime_ns)
+    state = (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+    if cache_dir is None or status.st_size < _LARGE:
+        return _read(path, *state)
+    name = hashlib.sha256(json.dumps([str(path.absolute()), *state]).encode()).hexdigest()
+    kept = resolve_cache_dir(cache_dir) / 'digests' / f'{path.stem}-{name[:32]}.json'
+    with suppress(OSError, ValueError):
+        check_owners(kept.parent)
+        check, _, text = read_file(kept).decode().partition(' ')
+        if hashlib.sha256(text.encode()).hexdigest() == check:
+            digest, names = parse_json(text)
+            return digest, names
+    found = _read(path, *state)
+    text = json.dumps(found)
+    with suppress(OSError):  # a read-only cache works too
+        if time.time_ns() - status.st_ctime_ns > _SETTLED_NS:
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            check_owners(kept.parent)
+            remove_unused(kept.parent, _MOST_DIGESTS - 1)
+            with replace_file(kept) as partial:
+                partial.write_text(f'{hashlib.sha256(text.encode()).hexdigest()} {text}')
+    return found
 
 
 @lru_cache(64)
 def _read(path: Path, *_unchanged: int) -> tuple[str, list[str]]:
-    """Return the SHA-256 of a file, and the names of the files of weights in an ONNX file."""
     digest, names, end = hashlib.sha256(), set[str](), b''
     with _opened(path) as file:
         while block := file.read(2**20):
@@ -144,7 +173,7 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = Path(fetch())
-        _check_content(file, _blob(file))
+        _check_content(file, _blob(file), None)
         return file
     except ModelError:
         raise
@@ -244,9 +273,9 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
         found = own / place
         parts = [found / part for part in choose(
             [str(path.relative_to(found)) for path in found.rglob('*')])]
-        digest_files(parts)
-        for path in [*parts, *(path for part in parts for path in weights_beside(part))]:
-            _check_content(path, _blob(path))
+        for path in [*parts, *(path for part in parts
+                               for path in weights_beside(part, cache_dir))]:
+            _check_content(path, _blob(path), cache_dir)
         return found
     except (OSError, ValueError, RecursionError, ModelError) as error:
         if marker.exists():
@@ -257,7 +286,9 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
         import huggingface_hub as hub
 
         info = hub.HfApi().model_info(repository, revision=revision, timeout=_PATIENCE_S)
-        commit, files = info.sha, [sibling.rfilename for sibling in info.siblings or ()]
+        commit, files = info.sha, [sibling.rfilename for sibling in info.siblings or ()
+                                   if '..' not in Path(sibling.rfilename).parts
+                                   and not sibling.rfilename.startswith('/')]
         chosen = choose(files)
         for part in chosen:
             # before the download, which uses both as names of files
@@ -267,7 +298,7 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
                 raise ValueError(f'the hub states no digest of {part}, but {stated.etag!r:.80} '
                                  f'and the commit {commit!r:.80}')
             path = Path(hub.hf_hub_download(repository, part, revision=commit, cache_dir=own))
-            _check_content(path, str(stated.etag))
+            _check_content(path, str(stated.etag), None)
             snapshot = Path(str(path)[:-len(part)])
             chosen += [file for file in files if file not in chosen
                        and snapshot / file in weights_beside(path)]
@@ -290,12 +321,12 @@ def find_network(folder: Path, name: str, networks: Sequence[str]) -> Path:
     raise ModelError(f'{folder} has none of {", ".join(networks)}: put an ONNX file there')
 
 
-def _check_content(file: Path, stated: str) -> None:
+def _check_content(file: Path, stated: str, cache_dir: str | None) -> None:
     """Compare a file with its digest on the hub; ValueError: it differs, and was removed."""
     if not stated:
         return
     content = b'' if len(stated) == 64 else read_file(file)
-    if stated != (digest_file(file) if len(stated) == 64 else hashlib.sha1(
+    if stated != (digest_file(file, cache_dir) if len(stated) == 64 else hashlib.sha1(
             b'blob %d\0' % len(content) + content, usedforsecurity=False).hexdigest()):
         file.resolve().unlink()
         raise ValueError(f'the digest of {file.name} differs from that on the hub')

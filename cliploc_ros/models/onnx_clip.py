@@ -69,11 +69,7 @@ class ClipWeights:
     text_tower: Path
     embed_dim: int  #: Length of an embedding
     key: str  #: Identifies model and weights, in maps
-
-    @property
-    def text_key(self) -> str:
-        """Identify each byte of the text tower, for the cache of label embeddings."""
-        return f'{self.key}:{digest_network(self.text_tower)}'
+    text_key: str  #: Identifies each byte of the text tower, for the cache of label embeddings
 
 
 def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
@@ -96,7 +92,8 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
 
         from cliploc_ros.models.export import export_clip
         folder = exported(options.cache_dir, name, f'CLIP {name}', (
-            'CLIP', name, config, tag, digest_file(given) if given.is_file() else ''),
+            'CLIP', name, config, tag,
+            digest_file(given, options.cache_dir) if given.is_file() else ''),
             partial(export_clip, options), WITHOUT_CLIP)
     image_tower = find_network(folder, named, IMAGE_TOWERS)
     text_tower = find_network(folder, '', TEXT_TOWERS)
@@ -107,9 +104,10 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     if type(embed_dim) is not int or not 0 < embed_dim < 2**16:  # a boolean is an int, too
         raise ModelError(f"{folder / CONFIG} has the length of an embedding neither in "
                          "'projection_dim' nor in 'embed_dim': add it")
-    key = export_key(folder) or (
+    key = export_key(folder, options.cache_dir) or (
         f'onnx:{fingerprint_file(image_tower)}:{fingerprint_file(text_tower)}')
-    return ClipWeights(name, folder, image_tower, text_tower, embed_dim, key)
+    return ClipWeights(name, folder, image_tower, text_tower, embed_dim, key,
+                       f'{key}:{digest_network(text_tower, options.cache_dir)}')
 
 
 def names_onnx(options: ClipOptions) -> bool:
@@ -317,7 +315,12 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
         raise ModelError(f'{folder / TOKENIZER} is missing; it splits labels into tokens: put the '
                          'file of the published network there')
     try:
-        tokenizer = tokenizers.Tokenizer.from_str(read_file(files[0]).decode())
+        text = read_file(files[0]).decode()
+        about = parse_json(text)
+        # on a prefix that its merges lack, the library ends the process
+        if 'merges' in about['model'] and about['model'].get('continuing_subword_prefix'):
+            raise ValueError('its words are continued with a prefix')
+        tokenizer = tokenizers.Tokenizer.from_str(text)
         if len(tokenizer.encode('a cup').ids) < 3:
             raise ValueError('it does not mark the end of a text')
         known, size = _of_text(folder, 'vocab_size'), tokenizer.get_vocab_size()
@@ -327,8 +330,7 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
         raise ModelError(f'{files[0]} is not a tokenizer of a CLIP: {first_line(error)}'
                          ) from error
     padding = 0
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        stored = parse_json(read_file(files[0]))['padding']
-        padding = int(stored['pad_id'])
+    with contextlib.suppress(ValueError, LookupError, TypeError):
+        padding = int(about['padding']['pad_id'])
     tokenizer.no_padding()
     return tokenizer, padding

@@ -73,7 +73,7 @@ class OnnxDetector:
         if is_hub_name(options.model) or file.is_dir():
             file = find_network(resolve_folder(options.model, [NETWORKS], BESIDE,
                                                options.cache_dir), options.model, NETWORKS)
-        export_key(file.parent)  # warns about a changed export
+        export_key(file.parent, options.cache_dir)  # warns about a changed export
         network = OnnxNetwork(file, options.cache_dir)
         self._head = (DetrHead if {_LOGITS, _BOXES} <= set(network.outputs) else YoloHead)(network)
         #: All classes of the network
@@ -149,11 +149,11 @@ def load_detector(options: DetectorOptions) -> OnnxDetector:
     from cliploc_ros.models.yolo_weights import export_detector, resolve_published
 
     file = resolve_published(options.model, options.cache_dir, 'model')
-    identity = [digest_file(file)]
+    identity = [digest_file(file, options.cache_dir)]
     if options.prompts:
         tower = Path(options.text_model).expanduser()
-        identity += [digest_file(tower) if tower.is_file() else options.text_model,
-                     json.dumps(options.prompts)]
+        identity += [digest_file(tower, options.cache_dir) if tower.is_file()
+                     else options.text_model, json.dumps(options.prompts)]
     folder = exported(options.cache_dir, 'YOLO', str(file), identity,
                       partial(export_detector, file, options))
     return OnnxDetector(replace(options, model=str(folder / DETECTOR), prompts=()))

@@ -19,7 +19,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,7 +92,7 @@ class OnnxNetwork:
     Compiling takes seconds. The compiled network is therefore kept in the folder ``openvino`` of
     the cache, keyed by the content of the file, the processor and the version of OpenVINO.
     OpenVINO runs a damaged network without an error (measured: boxes off by 20 px), so its SHA-256
-    is stored and checked.
+    is stored and checked, and that of the ONNX file if sha256sum has written it to NAME.sha256.
 
     It has as many threads as OMP_NUM_THREADS says when it is loaded, by default one for each core
     that the process may use.
@@ -110,13 +109,15 @@ class OnnxNetwork:
     def __init__(self, file: Path, cache_dir: str, precision: str | None = 'f32') -> None:
         check_weights_file(file)
         self.file = file
-        # A compiled network is named by a hash of all that it depends on. The import takes as long
-        # as the digest of 500 MB.
-        with ThreadPoolExecutor(1) as pool:
-            content = pool.submit(digest_network, file)
-            openvino = import_openvino()
-            depends = [_FORMAT, openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME'),
-                       openvino.get_version(), precision, content.result()]
+        # A compiled network is named by a hash of all that it depends on.
+        openvino, content = import_openvino(), digest_network(file, cache_dir)
+        with contextlib.suppress(FileNotFoundError):
+            if read_file(file.with_name(f'{file.name}.sha256')).split()[:1] != [
+                    content.partition(':')[0].encode()]:
+                raise ModelError(f'{file} differs from the digest in {file.name}.sha256: copy '
+                                 'both again')
+        depends = [_FORMAT, openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME'),
+                   openvino.get_version(), precision, content]
         digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
         stored = resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}.blob'
         try:
@@ -125,6 +126,9 @@ class OnnxNetwork:
             if stored.exists():
                 logger.warning('%s cannot be used (%s): compiling %s again', stored,
                                first_line(error), file.name)
+            if digest_network(file) != content:
+                raise ModelError(f'{file} is damaged: its content differs from that of earlier '
+                                 'starts; copy it again') from error
             compiled, self.metadata = _compile(file, stored, precision)
         self._network = CompiledNetwork(compiled)
         self.inputs = tuple(Input(
@@ -143,7 +147,8 @@ class OnnxNetwork:
         if len(images) != 1 or images[0].shape[0] not in (1, ANY) or (
                 images[0].shape[1] not in (3, ANY)):
             raise ModelError(f'{self.file} takes no single colour image: its inputs are '
-                             f'{self.described_inputs()}, expected (1, 3, height, width)')
+                             f'{self.described_inputs()}, expected (1, 3, height, width), '
+                             'channels first: export it so (tf2onnx: --inputs-as-nchw)')
         if images[0].type not in (np.float32, np.float16):
             raise ModelError(f'{self.file} takes images of integers, whose scale is unknown '
                              f'({self.described_inputs()}): export it with inputs in fp32')

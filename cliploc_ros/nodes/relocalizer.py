@@ -220,8 +220,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                 read = self.worker.run(self._pipeline.reload_map)
             response.message = f'loaded: {read.description}; map {read.map_hash}'
             response.success = True
-        except CliplocError as error:
-            response.message = f'not loaded: {error}'
+        except Exception as error:  # otherwise rclpy would never answer
+            response.message = f'not loaded: {str(error) or repr(error)}'
         self.get_logger().info(f'map {response.message}')
         return response
 
@@ -235,9 +235,9 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                 read = self.worker.run(self._pipeline.reload_map)
                 self.get_logger().info(f'map loaded: {read.description}')
                 response.result = response.RESULT_SUCCESS
-            except CliplocError as error:
+            except Exception as error:  # as above
                 self._set(**before)
-                self.get_logger().error(f'map not loaded: {error}')
+                self.get_logger().error(f'map not loaded: {str(error) or repr(error)}')
                 response.result = response.RESULT_MAP_DOES_NOT_EXIST
                 with suppress(MapError):
                     if os.path.exists(path_of(request.map_url)):  # noqa: PTH110 - never raises

@@ -185,7 +185,7 @@ def test_a_damaged_export_is_made_again(small_clip, tmp_path, image_rgb, caplog,
     damage(folder)
     caplog.clear()
     assert np.array_equal(load(small_clip, tmp_path).encode_crops(image_rgb, BBOXES), before)
-    warning, = (record for record in caplog.records if record.levelno >= logging.WARNING)
+    *_, warning = (record for record in caplog.records if record.levelno >= logging.WARNING)
     assert f'{folder} is damaged' in warning.getMessage()
     assert [*(tmp_path / 'onnx').iterdir()] == [folder]
 

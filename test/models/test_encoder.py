@@ -2,8 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Label embeddings and their cache; images of landmarks; crops that are encoded once."""
 
+import hashlib
+import json
+import os
 import stat
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -187,6 +191,32 @@ def test_fingerprint(tmp_path):
         file.write_bytes(content[:70_000] + byte + content[70_001:])
         digests.add((fingerprint_file(file), digest_file(file)))
     assert len({found for found, _ in digests}) == 1 and len(digests) == 2
+
+
+
+def test_digests_of_large_files_are_kept_until_they_change(tmp_path):
+    file, cache = tmp_path / 'model.onnx', str(tmp_path)
+    file.write_bytes(bytes(2**24))
+    assert digest_file(file, cache) == digest_file(file)
+    assert not (tmp_path / 'digests').exists(), 'a change at once could have the same time'
+    old = max(Path(np.__file__).parents[1].rglob('*.so*'), key=lambda path: path.stat().st_size)
+    link = tmp_path / 'link'
+    link.symlink_to(old)
+    digest = digest_file(link, cache)
+    kept, = (tmp_path / 'digests').iterdir()
+    forged = json.dumps(['1' * 64, []])
+    for text, expected in ((f'{hashlib.sha256(forged.encode()).hexdigest()} {forged}', '1' * 64),
+                           (f'0 {forged}', digest), ('', digest), ('\0', digest)):
+        kept.write_text(text)
+        assert digest_file(link, cache) == expected
+    assert digest_file(link) == digest
+    kept.parent.chmod(0o777)  # others could have written it
+    kept.write_text(f'{hashlib.sha256(forged.encode()).hexdigest()} {forged}')
+    assert digest_file(link, cache) == digest
+    before = file.stat()
+    file.write_bytes(bytes(2**24 - 1) + b'1')
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert digest_file(file, cache) == hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 # ---- crops

@@ -169,6 +169,13 @@ def test_a_hub_without_digests(hub, tmp_path, etag):
     assert not any(path.is_file() for path in tmp_path.rglob('*'))
 
 
+def test_a_hub_that_names_files_elsewhere(hub, tmp_path):
+    hub.files |= {'onnx/model.onnx/../../../../../../evil': b'evil', '../../../config.json': b'e'}
+    assert 'network' in resolve(tmp_path / 'a/b/cache')
+    assert not [*tmp_path.rglob('evil')] and not any(path.read_bytes() == b'e'
+                                                     for path in tmp_path.rglob('config.json'))
+
+
 def test_damaged_files_of_the_cache_are_downloaded_again(hub, tmp_path):
     found = Path(resolve(tmp_path)['network'])
     for name in ('model.onnx', 'model.onnx_data', '../config.json'):

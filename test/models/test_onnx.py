@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detectors and CLIPs in ONNX files: small ones with known outputs, invalid and damaged files."""
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -192,6 +193,7 @@ def refusal(load, model) -> str:
     ({'output0': np.zeros((1, 9, 84), np.float32)}, TWO, {}, r'of 2 classes: .*\(9, 84\)'),
     (YOLO, TWO, {'kind': TensorProto.UINT8}, 'images of integers'),
     (YOLO, TWO, {'shape': (1, 1, 64, 64)}, 'takes no single colour image'),
+    (YOLO, TWO, {'shape': (1, 64, 64, 3)}, 'channels first: export it so'),
     (DETR, {}, {}, 'config.json is missing')])
 def test_files_that_are_no_detector(load, tmp_path, outputs, metadata, changes, message):
     file = write_network(tmp_path / 'model.onnx', outputs, metadata, **changes)
@@ -271,6 +273,12 @@ def test_each_byte_of_a_network_counts(load, tmp_path, place):
         found.append(load(file).detect(image).bboxes_xyxy)
     expected = load(YOLO_FILE).detect(image).bboxes_xyxy
     assert not np.array_equal(found[0], expected) and np.array_equal(found[1], expected)
+    named = file.with_name('apart.onnx.sha256')
+    named.write_text(f'{hashlib.sha256(file.read_bytes()).hexdigest()}  apart.onnx')
+    assert np.array_equal(load(file).detect(image).bboxes_xyxy, expected)
+    named.write_text('0' * 64)
+    assert 'apart.onnx.sha256' in refusal(load, file)
+    named.unlink()
     changed.unlink()
     assert place in refusal(load, file)
 
@@ -449,6 +457,9 @@ def other_words(file: Path) -> None:
            {'image_std': [0, 1, 1]}, {'resample': [3]}, {'rescale_factor': 300})),
     (lambda folder: (folder / 'tokenizer.json').unlink(), 'tokenizer.json is missing'),
     (lambda folder: (folder / 'tokenizer.json').write_text('{}'), 'not a tokenizer of a CLIP'),
+    (lambda folder: text_of(folder / 'tokenizer.json', model=json.loads(  # it ended the process
+        (folder / 'tokenizer.json').read_text())['model'] | {'continuing_subword_prefix': 'a'}),
+     'not a tokenizer of a CLIP'),
     (lambda folder: other_words(folder / 'tokenizer.json'), 'it has 30 tokens, but the text'),
     (lambda folder: shutil.copy(ASSETS / 'yolo.onnx', folder / 'onnx/text_model.onnx'),
      'takes no tokens'),
