@@ -203,7 +203,7 @@ def _check_steps(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.flo
         _, after, size_m = max(jumps)
         raise DatasetError(
             f'{where}: the poses jump by {size_m:.2f} m at '
-            f'{keyframes[-after].stamp_ns / NS_PER_S:.2f} s, against the images: use the recording '
+            f'{keyframes[-after].stamp_ns / NS_PER_S:.2f} s, unlike the images: use the recording '
             'before or after it alone, or give corrected poses as `trajectory`')
 
 
