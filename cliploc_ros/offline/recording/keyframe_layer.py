@@ -188,8 +188,9 @@ def _check_steps(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.flo
              for second in range(first + 1, min(first + 1 + _ACROSS, len(keyframes)))
              for shift in _shifts(keyframes, points, first, second, kind)]
     of_pair = np.array([pair for *pair, _ in found], dtype=np.int64).reshape(-1, 2)
-    shifts, jumps = np.array([shift for *_, shift in found]).reshape(-1, 3), []
-    least_m = max(_JUMP_M, _UNUSUAL * np.median([0.0, *np.linalg.norm(shifts, axis=1)]))
+    shifts = np.array([shift for *_, shift in found]).reshape(-1, 3)
+    median_m = float(np.median([0.0, *np.linalg.norm(shifts, axis=1)]))
+    least_m, jumps = max(_JUMP_M, _UNUSUAL * median_m), list[tuple[int, int, float]]()
     for after in np.unique(of_pair[:, 1]).tolist():
         across = (of_pair[:, 0] < after) & (after <= of_pair[:, 1])
         jump = np.median(shifts[across], axis=0)
