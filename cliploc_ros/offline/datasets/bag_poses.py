@@ -344,14 +344,12 @@ def _after_jumps(reader: BagReader, links: dict[str, TimedPoses], up: Sequence[s
             sizes[row] = pose_error(before, after)
     jumps = np.nonzero((sizes > np.maximum(_JUMP, _UNUSUAL * np.median(sizes, axis=0))
                         ).any(axis=1))[0].tolist()
-    if not jumps:
-        return chain()
-    far_m, far_deg = sizes[jumps[-1]]
-    reader.notes.append(
-        f"tf of '{child}' jumps {len(jumps)} times, the last time by {far_m:.2f} m and "
-        f'{far_deg:.1f} degrees at {link.stamps_ns[jumps[-1]] / NS_PER_S:.2f} s: only the poses '
-        'after it are used; record again with a localizer that has found its pose')
-    return chain(**{child: link.part(jumps[-1], len(link))})
+    for row in jumps[-1:]:
+        reader.notes.append(
+            f"tf of '{child}' jumps by {sizes[row, 0]:.2f} m and {sizes[row, 1]:.1f} degrees at "
+            f'{link.stamps_ns[row] / NS_PER_S:.2f} s: only the poses after it are used; record '
+            'again with a localizer that has found its pose')
+    return chain(**{child: link.part([0, *jumps][-1], len(link))})
 
 
 def plain_name(frame_id: str) -> str:

@@ -53,21 +53,23 @@ def rotation_to_z(up: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     return Rotation.from_rotvec(np.radians(angle) * axis).as_matrix(), angle
 
 
-def find_tilt(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], float] | None:
+def find_tilt(poses: NDArray[np.float64], of_tf: bool = False
+              ) -> tuple[NDArray[np.float64], float] | None:
     """Return the rotation (3, 3) that turns z up, and its angle [deg].
 
-    None if the vertical of the poses (n, 4, 4) is unknown, see find_vertical.
+    The z axis of tf points up (REP 103), so there cameras may be mounted upside down. None if the
+    vertical of the poses (n, 4, 4) is unknown, see find_vertical.
     """
     up = find_vertical(poses) if len(poses) else None
-    return None if up is None else rotation_to_z(up)
+    return None if up is None else rotation_to_z(-up if of_tf and up[2] < 0.0 else up)
 
 
 def tilt_note(poses: NDArray[np.float64], of_tf: bool = False) -> str:
     """Return a note if z is off the vertical of the cameras, '' otherwise.
 
-    The z axis of tf points up (REP 103), so there the mount of the camera explains the tilt.
+    In tf the mount of the camera explains the tilt, see find_tilt.
     """
-    found = find_tilt(poses)
+    found = find_tilt(poses, of_tf)
     if found is None or found[1] < _MOST_TILT_DEG:
         return ''
     if of_tf or found[1] > _UPSIDE_DOWN_DEG:
@@ -86,7 +88,7 @@ def find_levelling(poses: NDArray[np.float64], is_wanted: bool, of_tf: bool = Fa
     """
     if not is_wanted:
         return np.eye(3), tilt_note(poses, of_tf)
-    found = find_tilt(poses)
+    found = find_tilt(poses, of_tf)
     if found is None:
         raise DatasetError('the vertical is unknown: the cameras turn too little, or were held on '
                            'their side; leave out `level`')

@@ -3,6 +3,7 @@
 """Build a layer of keyframes: choose images, extract features, and place them in the map."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import NamedTuple
@@ -42,9 +43,10 @@ _LEAST_M, _MOST_M, _MOST_COS = 0.05, 2.0, np.cos(np.radians(40.0))
 _DEPTHS_M = (0.2, 40.0)
 # Greatest number of keyframes in whose images depth is compared with triangulated points.
 _COMPARED = 6
-# Poses jump by more than this against the images [m] and this many times the median, and pairs of
-# images across it agree up to this share. Chosen: the kitchen's poses differ by up to 0.04 m.
-_JUMP_M, _UNUSUAL, _JUMP_SPREAD = 0.12, 8.0, 0.3
+# Poses jump by more than this against the images [m] and this many times the median. Chosen: the
+# kitchen's poses differ by up to 0.04 m. An image is compared with this number of later images;
+# this share of the measurements across a jump agrees with their median up to this share of it.
+_JUMP_M, _UNUSUAL, _ACROSS, _AGREE, _JUMP_SPREAD = 0.12, 8.0, 3, 0.6, 0.3
 # Least number of points that locate an image.
 _LEAST_SEEN = 12
 # Number of words. 1,024 words find the keyframes of the kitchen as well as comparing all
@@ -110,33 +112,30 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         The images show that depth has another unit, or that the poses jump.
     """
     parts = [[_look(frame, options) for frame in _chosen(part, options)] for part in frames.each]
-    for part, own in zip(frames.each, parts, strict=True):
-        _check_depth(own, options.kind, f' of {part.camera}' if part.camera else '')
     seen = list(chain.from_iterable(parts))
-    images, has_depth = [keyframe.posed for keyframe in seen], False
+    images, kind = [keyframe.posed for keyframe in seen], options.kind
     of_images = list[NDArray[np.float64]]()
     chosen = []  # keyframes, the points of their features, and the rows of these features
     for number, keyframe in enumerate(seen):
         # points (n, 3) in the camera's coordinate frame; NaN where unknown
         if np.isfinite(keyframe.depths).any():
-            has_depth = True
             points = np.column_stack([keyframe.posed.bearings, np.ones(len(keyframe.depths))]
                                      ) * keyframe.depths[:, None]
         else:
-            points = triangulate(images, number, options.kind)
+            points = triangulate(images, number, kind)
         of_images.append(points)
         # the strongest features that have a point
         rows = np.nonzero(np.isfinite(points).all(axis=1))[0][:options.most_points]
         if len(rows) >= _LEAST_POINTS:
             chosen.append((keyframe, points[rows], rows))
-    for own in parts:
-        _check_steps(own, of_images[:len(own)], options.kind, frames.source)
-        of_images = of_images[len(own):]
+    for part, own in zip(frames.each, parts, strict=True):
+        _check_depth(own, kind, f' of {part.camera}' if part.camera else '')
+        _check_steps(own, [of_images.pop(0) for _ in own], kind, frames.source)
     if not chosen:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
                            f'{_LEAST_POINTS} points; record depth, or overlapping '
                            'images 5 cm apart')
-    cameras, kind = [keyframe.camera for keyframe, _, _ in chosen], options.kind
+    cameras = [keyframe.camera for keyframe, _, _ in chosen]
     descriptors = np.concatenate([keyframe.posed.descriptors[rows]
                                   for keyframe, _, rows in chosen])
     pixels = np.concatenate([
@@ -153,7 +152,8 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         np.concatenate([points for _, points, _ in chosen]).astype(np.float32),
         descriptors, layer.nearest_words(kind.units(descriptors), kind.units(vocabulary)
                                          ).astype(np.uint16), vocabulary,
-        layer.FROM_DEPTH if has_depth else layer.TRIANGULATED,
+        layer.FROM_DEPTH if any(np.isfinite(keyframe.depths).any() for keyframe in seen)
+        else layer.TRIANGULATED,
         camera_rows=None if len(different) == 1 else np.array(
             [different.index(own) for own in cameras]), kind=kind)
     if not options.images:
@@ -182,45 +182,54 @@ def _check_steps(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.flo
     """Refuse poses that jump against the images, which are in order, with the points of each.
 
     DatasetError: images after a step are located elsewhere than their poses say, by the points of
-    images before it, and all pairs across the step agree by how far.
+    images before it, and the reverse, and most pairs across the step agree by how far.
     """
-    seen = [keyframe.posed for keyframe in keyframes]
-    steps = [_shift(seen[row], points[row], seen[row + 1], kind) for row in range(len(seen) - 1)]
-    sizes_m = [float(np.linalg.norm(step)) for step in steps if len(step)]
-    least_m = max(_JUMP_M, _UNUSUAL * float(np.median(sizes_m or [0.0])))
-    for after, step in enumerate(steps, 1):
-        if not len(step) or np.linalg.norm(step) < least_m:
+    found = [(first, second, shift) for first in range(len(keyframes))
+             for second in range(first + 1, min(first + 1 + _ACROSS, len(keyframes)))
+             for shift in _shifts(keyframes, points, first, second, kind)]
+    of_pair = np.array([pair for *pair, _ in found], dtype=np.int64).reshape(-1, 2)
+    shifts = np.array([shift for *_, shift in found]).reshape(-1, 3)
+    median_m = float(np.median([0.0, *np.linalg.norm(shifts, axis=1)]))
+    least_m, jumps = max(_JUMP_M, _UNUSUAL * median_m), list[tuple[int, int, float]]()
+    for after in np.unique(of_pair[:, 1]).tolist():
+        across = (of_pair[:, 0] < after) & (after <= of_pair[:, 1])
+        jump = np.median(shifts[across], axis=0)
+        size_m = float(np.linalg.norm(jump))
+        agree = across & (np.linalg.norm(shifts - jump, axis=1) < _JUMP_SPREAD * size_m)
+        # a false match or pose displaces one image, a jump displaces all of them
+        if (size_m > least_m and agree.sum() >= _AGREE * across.sum()
+                and np.ptp(of_pair[agree], axis=0).all()):
+            jumps.append((int(agree.sum()), -after, size_m))
+    if jumps:
+        _, after, size_m = max(jumps)
+        raise DatasetError(
+            f'{where}: the poses jump by {size_m:.2f} m at '
+            f'{keyframes[-after].stamp_ns / NS_PER_S:.2f} s, unlike the images: use the recording '
+            'before or after it alone, or give corrected poses as `trajectory`')
+
+
+def _shifts(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.float64]], first: int,
+            second: int, kind: FeatureKind) -> Iterator[NDArray[np.float64]]:
+    """Yield how far (3,) the second image is displaced against the first one, in map axes [m].
+
+    There are two measurements, by the points of each image, or fewer if these do not locate the
+    other one.
+    """
+    rows, _ = kind.match(*(kind.units(keyframes[row].posed.descriptors)
+                           for row in (first, second)))
+    for source, target, pairs, sign in ((first, second, rows, 1.0),
+                                        (second, first, rows[:, ::-1], -1.0)):
+        pairs = pairs[np.isfinite(points[source][pairs[:, 0]]).all(axis=1)]
+        if len(pairs) < _LEAST_SEEN:
             continue
-        # a false match locates one image, a jump displaces all of them
-        jumps = np.concatenate([_shift(seen[first], points[first], second, kind)
-                                for first in range(max(0, after - 2), after)
-                                for second in seen[after:after + 2]])
-        size_m = float(np.linalg.norm(jumps.sum(axis=0))) / max(1, len(jumps))
-        if len(jumps) > 1 and size_m > least_m and np.linalg.norm(
-                jumps - jumps.mean(axis=0), axis=1).max() < _JUMP_SPREAD * size_m:
-            raise DatasetError(
-                f'{where}: the poses jump by {size_m:.2f} m against the images at '
-                f'{keyframes[after].stamp_ns / NS_PER_S:.2f} s: use the recording before or after '
-                'it alone, or give corrected poses as `trajectory`')
-
-
-def _shift(ours: PosedFeatures, points: NDArray[np.float64], theirs: PosedFeatures,
-           kind: FeatureKind) -> NDArray[np.float64]:
-    """Return how far (1, 3) the pose of an image is from where our points (n, 3) locate it [m].
-
-    The axes are those of the map. Empty: too few points locate it.
-    """
-    pairs, _ = kind.match(kind.units(ours.descriptors), kind.units(theirs.descriptors))
-    pairs = pairs[np.isfinite(points[pairs[:, 0]]).all(axis=1)]
-    if len(pairs) >= _LEAST_SEEN:
+        ours, theirs = (keyframes[row].posed for row in (source, target))
         _, turn, shift, kept = cv2.solvePnPRansac(
-            points[pairs[:, 0]], theirs.bearings[pairs[:, 1]], np.eye(3), None,
-            reprojectionError=_MOST_ERROR, iterationsCount=200)
-        if kept is not None and len(kept) >= max(_LEAST_SEEN, 0.4 * len(pairs)):
+            points[source][pairs[:, 0]], theirs.bearings[pairs[:, 1]], np.eye(3), None,
+            reprojectionError=2.0 * _MOST_ERROR, iterationsCount=200)
+        if kept is not None and len(kept) >= max(_LEAST_SEEN, 0.3 * len(pairs)):
             place = -Rotation.from_rotvec(turn[:, 0]).inv().apply(shift[:, 0])
-            return np.asarray(theirs.map_from_camera[:3, 3] - ours.map_from_camera[:3, 3]
-                              - ours.map_from_camera[:3, :3] @ place)[None]
-    return np.empty((0, 3))
+            yield sign * (theirs.map_from_camera[:3, 3] - ours.map_from_camera[:3, 3]
+                          - ours.map_from_camera[:3, :3] @ place)
 
 
 def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
@@ -240,11 +249,8 @@ def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
         chosen = np.concatenate([chosen, pose[None]])
         return True
     for raw in frames.read_raw(is_new):
-        try:
-            frame = raw.decode()
-        except DatasetError:  # the recorder reports unusable images
-            continue
-        yield frame
+        with suppress(DatasetError):  # the recorder reports unusable images
+            yield raw.decode()
 
 
 def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
@@ -321,9 +327,9 @@ def _crossings(ours: NDArray[np.float64], theirs: NDArray[np.float64],
                ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the midpoints (n, 3) between pairs of rays, in our frame, and their angles [rad]."""
     back = invert_transform(theirs_from_ours)
-    first = _unit(np.column_stack([ours, np.ones(len(ours))]))
-    second = _unit(np.column_stack([theirs, np.ones(len(theirs))])) @ back[:3, :3].T
-    place = back[:3, 3]
+    first, second = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (
+        np.column_stack([bearings, np.ones(len(bearings))]) for bearings in (ours, theirs)))
+    second, place = second @ back[:3, :3].T, back[:3, 3]
     cosines = np.sum(first * second, axis=1)
     along, other = first @ place, second @ place
     with np.errstate(divide='ignore', invalid='ignore'):
@@ -340,10 +346,6 @@ def _agrees(points: NDArray[np.float64], bearings: NDArray[np.float64],
     with np.errstate(divide='ignore', invalid='ignore'):
         errors = np.linalg.norm(inside[:, :2] / inside[:, 2:] - bearings, axis=1)
         return np.asarray((inside[:, 2] > 0.0) & (errors < _MOST_ERROR))
-
-
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float64]
