@@ -192,6 +192,9 @@ class KeyframeOptions:
     angle_deg: float = 5.0
 
 
+_VIEWPOINT = KeyframeOptions()
+
+
 class KeyframeFilter:
     """Chooses keyframes among the frames of a camera, which are passed in order.
 
@@ -217,14 +220,15 @@ class KeyframeFilter:
         return True
 
 
-def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:
+def number_viewpoints(detections: PosedDetections, spacing: KeyframeOptions = _VIEWPOINT
+                      ) -> NDArray[np.int64]:
     """Return the number of the viewpoint (F,) of each frame, ascending from 0, camera by camera.
 
-    A new viewpoint begins where a keyframe with the default spacing would: as soon as a frame
-    differs from the first frame of the current one by 10 cm or 5 degrees.
+    A new viewpoint begins where a keyframe would, by default as soon as a frame differs from the
+    first frame of the current one by 10 cm or 5 degrees.
     """
     poses, order = detections.map_from_camera, detections.by_camera
-    filters = [KeyframeFilter(KeyframeOptions()) for _ in detections.cameras]
+    filters = [KeyframeFilter(spacing) for _ in detections.cameras]
     is_new = [filters[detections.frame_cameras[frame]](0, 0, poses[frame]) for frame in order]
     viewpoints = np.zeros(len(poses), dtype=np.int64)
     viewpoints[order] = np.cumsum(is_new) - 1
