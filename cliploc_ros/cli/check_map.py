@@ -28,7 +28,7 @@ examples:
   check_map office.yaml --observations office.npz --gravity --out office_check
   check_map hand_written.yaml --out check --min-localized 0.2
 
-exit code: 0 the map reaches all thresholds, 1 it misses one or the input is invalid
+exit code: 0 the verdict is "passed", 1 it is not or the input is invalid
 """
 
 
@@ -53,7 +53,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--every N', 'use only every N-th frame of the observations (%(default)s)',
            command.positive_int, 1)
     option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
-    add_use_option(parser, 'report what the keyframes next to the map reach')
+    add_use_option(parser, 'use the keyframes next to the map')
     group = parser.add_argument_group('expected relocalization')
     option(group, '--frames N', 'greatest number of recorded frames to relocalize (%(default)s)',
            command.within(1, 10**6), CheckOptions.frames)
@@ -70,11 +70,10 @@ def make_parser() -> argparse.ArgumentParser:
     option(group, '--gravity', 'the robot knows the vertical')
     option(group, '--min-confidence', 'min_confidence of the relocalizer (%(default)s)',
            command.within(0.0, 1.0), RelocalizerOptions().min_confidence)
-    group = parser.add_argument_group('thresholds; if the map misses one, the exit code is 1')
+    group = parser.add_argument_group('thresholds: shares that determine the verdict')
     for name, hint in get_type_hints(Thresholds, include_extras=True).items():
         option(group, f'--{name.replace("_", "-")} N', f'{hint.__metadata__[0]} (%(default)s)',
-               command.within(0.0, 1.0) if hint.__origin__ is float else command.within(0, 10**9),
-               getattr(Thresholds, name))
+               command.within(0.0, 1.0), getattr(Thresholds, name))
     add_topic_options(parser.add_argument_group('images of a bag'))
     return parser
 

@@ -46,7 +46,7 @@ _MOST_LANDMARKS = 300
 _FIRST_ADVICE = 3
 _DPI = 120
 _INK = '#222222'
-_HEAT = LinearSegmentedColormap.from_list('accepted', ['#FBE9C6', '#56B4E9', '#003E6B']
+_HEAT = LinearSegmentedColormap.from_list('accepted', ['#D3EBFA', '#56B4E9', '#003E6B']
                                           ).with_extremes(bad='#DDDDDD')
 _MARKERS = {'accepted': (html.ACCEPTED, 'o'), 'refused': (html.REFUSED, 's'),
             'misled': (html.MISLED, 'X')}

@@ -128,13 +128,10 @@ class CheckOptions:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds that a map has to reach: guesses from maps of six rooms, see doc/trust.md.
+    """Thresholds of shares, which determine the verdict on a map, see doc/trust.md. Chosen."""
 
-    The texts are the help of check_map.
-    """
-
-    min_localized: Annotated[float, 'share of recorded views that are localized'] = 0.4
-    min_by_objects: Annotated[float, 'the same by objects alone'] = 0.25
-    min_by_keyframes: Annotated[float, 'the same by keyframes alone, for "keyframes only"'] = 0.4
-    max_misled: Annotated[float, 'share of views in which a wrong pose is accepted'] = 0.01
-    max_faulty: Annotated[float, 'share of sightings of landmarks with a serious fault'] = 0.15
+    min_localized: Annotated[float, 'views that are localized'] = 0.4
+    min_by_objects: Annotated[float, 'views that objects alone localize'] = 0.25
+    min_by_keyframes: Annotated[float, 'views that keyframes alone localize'] = 0.4
+    max_misled: Annotated[float, 'views in which a wrong pose is accepted'] = 0.01
+    max_faulty: Annotated[float, 'sightings of landmarks with a serious fault'] = 0.15

@@ -216,12 +216,18 @@ def give_advice(report: CheckReport, of_folder: bool = False) -> list[Advice]:
             f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
             f'{"large" if report.scale > 1.0 else "small"} by the sizes of its objects: '
             'check the unit of the poses, then the intrinsics'))
+    advice += [Advice(
+        f'objects alone localize {measure.part:.0f} of {measure.total:.0f} views: record more '
+        'objects, each from several sides, for other light and moved furniture')
+        for measure in report.measures
+        if measure.key == 'min_by_objects' and measure.is_missed and report.keyframes]
     advice += _some([_on_look_alike(pair, misled) for pair in report.look_alikes],
                     'pairs of places that look alike')
     advice += [*_on_misled(report, misled), *_on_landmarks(report),
                *_on_corrections(report, of_folder), *_on_spans(report, recorded),
                *_on_grid(report)]
-    return advice or [Advice('nothing to do: the map reaches all thresholds')]
+    return advice or [Advice('nothing to do: the map reaches all thresholds' if report.passed else
+                             'record the place again, with more views of its objects')]
 
 
 def _some(advice: Sequence[Advice], what: str, most: int = _MOST_OF_A_KIND) -> list[Advice]:
@@ -312,12 +318,8 @@ def _on_spans(report: CheckReport, trials: Sequence[relocalization.Trial]) -> It
 
 
 def _on_grid(report: CheckReport) -> Iterator[Advice]:
-    """Yield advice on objects that localize too few views, and on areas without any heading."""
+    """Yield advice on areas without a heading that localizes a robot."""
     grid = report.grid
-    if report.keyframes and 'min_by_objects' in {
-            measure.key for measure in report.measures if measure.is_missed}:
-        yield Advice('objects alone localize too few views, so a robot is lost when the light '
-                     'changes: record more objects, each from several sides')
     is_dead = grid.is_near & (grid.localized == 0)
     for rows in _areas(grid, np.nonzero(is_dead)[0])[:_MOST_OF_A_KIND]:
         if np.mean([_sees_double(position, report.look_alikes)

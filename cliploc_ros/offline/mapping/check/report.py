@@ -3,7 +3,7 @@
 """The result of a check: figures, verdict and advice."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,8 @@ from cliploc_ros.offline.mapping.systematic import Correction
 #: A landmark of this severity has a serious fault.
 SERIOUS = 1.0
 #: The measures, by the names of their thresholds.
-MEASURES = {
-    'min_localized': 'localized', 'min_by_objects': 'localized by objects alone',
-    'min_by_keyframes': 'localized by keyframes alone', 'max_misled': 'misled',
-    'max_faulty': 'sightings of landmarks with a serious fault'}
+MEASURES = {name: hint.__metadata__[0]
+            for name, hint in get_type_hints(Thresholds, include_extras=True).items()}
 #: The thresholds that each verdict needs, and what a robot gets; the first reached one counts.
 VERDICTS = {
     'passed': (('min_localized', 'min_by_objects', 'max_misled', 'max_faulty'),
@@ -150,7 +148,7 @@ class CheckReport:
                 f'{counts["misled"]} misled')
         of_objects, of_keyframes = (np.count_nonzero(headings.any(axis=1)[near]) for headings in (
             self.grid.by_objects, self.grid.by_keyframes))
-        where = '' if self.recording is None else ' near the recording'
+        where = '' if near.all() else ' near the recorded views'
         found.append(
             f'{counted(np.count_nonzero(near), "position")}{where}: '
             f'{np.count_nonzero(self.grid.localized[near])} with a heading that localizes '
