@@ -219,7 +219,7 @@ def test_stretches_without_landmarks_become_advice(detections):
     gap = detections.select_boxes(~np.isin(detections.frames, np.arange(20, 41)))
     report = check_map(TABLE, gap, options=QUICK)
     (text,) = [text for text in report.advice if text.startswith('record this side')]
-    assert re.search(r': \d frames at [456] s', text), text
+    assert re.search(r': \d views at [456] s', text), text
 
 
 def test_too_few_views_are_named_as_the_cause(detections):
@@ -314,9 +314,8 @@ def test_a_place_is_localized_by_objects_or_by_a_keyframe_within_reach():
                             for place in grid.positions for angle in range(0, 360, 30)))
     full = check_map(ROOM, options=few, layer=everywhere)
     assert full.grid.by_keyframes.all() and (full.grid.localized == full.grid.headings).all()
-    nowhere = check_map(ROOM.select(range(1)), options=few, layer=layer_at(level(2.0)))
-    is_dead = nowhere.grid.localized == 0
-    assert is_dead.any() and not is_dead.all()
+    nowhere = check_map(ROOM.select(range(1)), options=few)
+    assert not nowhere.grid.localized.any()
     text = 'no heading localizes'
     assert any(text in hint for hint in nowhere.advice)
     assert not any(text in hint for hint in full.advice)

@@ -257,7 +257,7 @@ def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
              for overlap in report.overlaps if overlap.is_duplicate]
     yield from _some([Advice(f'{" and ".join(pair)} are the same object: delete one of them', pair)
                       for pair in pairs], 'pairs of duplicates')
-    if report.recording is not None:
+    if report.recording is not None and report.landmarks:
         frames = float(np.median([landmark.support or 0 for landmark in report.landmarks]))
         unexplained = 1.0 - report.recording.held_out.explained
         if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
