@@ -325,7 +325,7 @@ def test_a_map_without_landmarks_is_judged_by_its_keyframes(tmp_path, detections
     empty, layer = LandmarkMap.empty('map'), layer_at(level())
     report = check_map(empty, options=QUICK, layer=layer)
     assert report.verdict == 'keyframes only' and report.localized[0].endswith(
-        '(0 by objects, simulated; 1 within reach of a keyframe)')
+        '(0 by simulated objects, 1 within reach of a keyframe)')
     write_check(tmp_path, 'map', empty, report)
     # boxes without images cannot try keyframes
     report = check_map(empty, detections, options=QUICK, layer=layer)

@@ -91,8 +91,9 @@ def rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:
 def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
     """Describe the landmarks that are left out, by reason: one line, or none."""
     kinds = Counter(landmark.reason.partition(':')[0] for landmark in left_out)
-    counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
-    return [f'left out: {len(left_out)} ({counts}); --report names each'] if left_out else []
+    counts = ', '.join(f'{kind} ({count})' for kind, count in kinds.most_common())
+    return [f'{counted(len(left_out), "landmark")} left out: {counts}; --report names each'
+            ] if left_out else []
 
 
 @dataclass(frozen=True)

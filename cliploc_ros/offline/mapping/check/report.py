@@ -138,13 +138,14 @@ class CheckReport:
         if self.recording is not None:
             trials = self.recording.trials
             counts = relocalization.count_verdicts(trials)
-            by_keyframes = f'{sum(trial.by_keyframes for trial in trials)} by keyframes alone'
-            if self.keyframes and not self.recording.has_images:
-                by_keyframes = 'keyframes not tried without images'
+            alone = f'{sum(trial.by_objects for trial in trials)} by objects alone'
+            if self.keyframes:
+                alone += (f', {sum(trial.by_keyframes for trial in trials)} by keyframes alone'
+                          if self.recording.has_images else
+                          ', keyframes not tried without images')
             found.append(
                 f'{counted(len(trials), "recorded view")}, each in a map of the other views: '
-                f'{counts["accepted"]} localized ({sum(trial.by_objects for trial in trials)} by '
-                f'objects alone, {by_keyframes}), {counts["refused"]} refused, '
+                f'{counts["accepted"]} localized ({alone}), {counts["refused"]} refused, '
                 f'{counts["misled"]} misled')
         of_objects, of_keyframes = (np.count_nonzero(headings.any(axis=1)[near]) for headings in (
             self.grid.by_objects, self.grid.by_keyframes))
@@ -152,7 +153,8 @@ class CheckReport:
         found.append(
             f'{counted(np.count_nonzero(near), "position")}{where}: '
             f'{np.count_nonzero(self.grid.localized[near])} with a heading that localizes '
-            f'({of_objects} by objects, simulated; {of_keyframes} within reach of a keyframe)')
+            f'({of_objects} by simulated objects'
+            + (f', {of_keyframes} within reach of a keyframe)' if self.keyframes else ')'))
         return tuple(found)
 
     @property
