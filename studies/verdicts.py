@@ -8,12 +8,14 @@ accepted and false accepts by objects and keyframes, by objects alone, and by ke
 """
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.options import RelocalizerOptions
@@ -23,7 +25,15 @@ from cliploc_ros.offline.mapping.check.relocalization import count_verdicts, try
 from cliploc_ros.offline.mapping.make_map import Labeller, MadeMap, make_map
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
-from studies.rooms.rooms import RoomOptions, frames_of_raws, known_of, read_room, without_boxes
+from studies.rooms.rooms import (
+    Image,
+    Room,
+    RoomOptions,
+    frames_of_raws,
+    known_of,
+    read_room,
+    without_boxes,
+)
 
 _QUICK = CheckOptions(max_positions=25, headings=6, frames=30)
 _ASKED = 24
@@ -36,6 +46,7 @@ _CASES = {'good': (2, 1.0), 'half moved': (2, 1.0), 'keyframes off': (2, 1.0),
 def spoiled(made: MadeMap, case: str) -> MadeMap:
     """Return a map with every second landmark, or all keyframes, off by 1.5 m; or without some."""
     landmarks, layer = made.landmark_map, made.layer
+    assert layer is not None
     centers, poses = landmarks.centers.copy(), layer.map_from_camera.copy()
     centers[::2, 0] += 1.5 * (case == 'half moved')
     poses[:, 0, 3] += 1.5 * (case == 'keyframes off')
@@ -51,10 +62,11 @@ def main(model: str, out: str, *folders: str) -> None:
                                          for folder in folders for case in _CASES.items()):
         mapped, asked = np.arange(0, len(room), step), np.arange(1, len(room), 2)
 
-        def longer(camera, factor=factor):
+        def longer(camera: Camera, factor: float = factor) -> Camera:
             return replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
 
-        def color(row, room=room, longer=longer):
+        def color(row: int, room: Room = room, longer: Callable[[Camera], Camera] = longer
+                  ) -> tuple[Image, Camera]:
             image, camera = room.raws[row].color()
             return image, longer(camera)
 
@@ -76,7 +88,7 @@ def main(model: str, out: str, *folders: str) -> None:
                 query = room.queries[row]
                 plain = known_of(query.observation, '-')
                 trials.append(try_view(localizer, replace(
-                    query, image=lambda row=row: color(row, longer=lambda camera: camera)[0],
+                    query, image=partial(lambda row: color(row)[0], row),
                     observation=without_boxes(plain) if way == 'keyframes' else plain), 0, _QUICK))
             print(f'  {way}: {count_verdicts(trials)}', flush=True)
 

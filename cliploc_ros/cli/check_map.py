@@ -116,8 +116,7 @@ def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
     print('\n'.join([f'verdict: {report.summary[0]}', *report.localized, *(
         f'{number}. {command.printable(line)}'
         for number, line in enumerate(report.advice[:most], start=1))]))
-    print(f'wrote {out / CHECK}: open it for pictures and all {len(report.advice)} '
-          'pieces of advice')
+    print(f'wrote {out / CHECK}: open it for pictures, all advice and the faults of landmarks')
     return 0 if report.passed else 1
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.errors import MappingError
+from cliploc_ros.errors import MappingError, counted
 from cliploc_ros.offline.mapping.landmarks import group_boxes
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -246,8 +246,9 @@ def check_input(detections: PosedDetections, views: Views,
                            'its classes and its confidence threshold')
     viewpoints = int(views.viewpoints.max()) + 1
     if viewpoints < min_viewpoints:
-        raise MappingError(f'the camera took {viewpoints} viewpoints, at least {min_viewpoints} '
-                           'are needed; move it around the objects, and check the poses')
+        raise MappingError(f'the camera took {counted(viewpoints, "viewpoint")}, at least '
+                           f'{min_viewpoints} are needed; move it around the objects, and check '
+                           'the poses')
     jumps = np.sort(np.concatenate([
         _jumps(detections.map_from_camera[own], detections.stamps_s[own])
         for own in (views.cameras == number for number in range(len(detections.cameras)))]))

@@ -282,7 +282,7 @@ def _on_corrections(report: CheckReport, of_folder: bool) -> Iterator[Advice]:
         f'{result.name} by {result.value:+.2f} {result.unit} (± {result.deviation:.2f})'
         for result in sorted(found, key=lambda result: -result.effect_px)
         if (result.cause, result.explained) == (best.cause, best.explained))
-    others = sorted({result.cause for result in found} - {best.cause})
+    others = sorted({result.cause for result in found} - {best.cause, 'mount' * of_folder})
     then = f'; check again before you change the {" or the ".join(others)}' if others else ''
     yield Advice(f'{_REMEDIES[best.cause]}: the boxes fit better if you change {changes}{then}')
 
@@ -311,10 +311,12 @@ def _on_spans(report: CheckReport, trials: Sequence[relocalization.Trial]) -> It
         if seen <= _FEW_LANDMARKS or not _sees_double(middle.position, report.look_alikes):
             what = 'record this side' if seen <= _FEW_LANDMARKS else (
                 'describe these objects better in their labels, or record this side again')
+            kind = middle.result and middle.result.refusal_kind
+            why = f' ({kind.value.replace("_", " ")})' if kind else ''
             yield Advice(
                 f'{what}: {len(run)} views at {middle.stamp_s - (trials[0].stamp_s or 0.0):.0f} '
                 f's, around {_place(middle.position)} looking {_heading(middle)}, show '
-                f'{counted(seen, "landmark")} and none is accepted', view=middle)
+                f'{counted(seen, "landmark")} and none is accepted{why}', view=middle)
 
 
 def _on_grid(report: CheckReport) -> Iterator[Advice]:

@@ -189,8 +189,8 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
     grid, recording = report.grid, report.recording
     if recording is None or (report.keyframes and not recording.has_images):
         columns = (grid.localized, grid.by_objects.any(axis=1), grid.by_keyframes.any(axis=1))
-        total, counts = np.count_nonzero(grid.is_near), [
-            np.count_nonzero(column[grid.is_near]) for column in columns]
+        total, counts = int(grid.is_near.sum()), [
+            int((column[grid.is_near] > 0).sum()) for column in columns]
     else:
         total, counts = len(recording.trials), [
             sum(trial.verdict == 'accepted' for trial in recording.trials),
