@@ -291,7 +291,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     assert kinds.keys() == {'data:image/png;', 'data:image/jpeg'}
     assert kinds['data:image/png;'] == 2
     assert kinds['data:image/jpeg'] >= 5, 'five duplicates are shown'
-    assert page.count('<u style') == len(report.measures) == 5, 'each threshold has a bar'
+    assert page.count('<u style') == len(report.measures) == 6, 'each threshold has a bar'
     assert json.loads((tmp_path / CHECK_DATA).read_text())['landmarks'][0]['faults']
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([CHECK, CHECK_DATA])
 
@@ -414,6 +414,7 @@ def test_a_landmark_that_is_too_large_has_a_serious_fault(office):
 @pytest.mark.parametrize(('missed', 'verdict'), [
     ((), 'passed'), (('min_by_keyframes',), 'passed'), (('min_by_objects',), 'keyframes only'),
     (('max_faulty', 'min_localized'), 'keyframes only'), (('max_misled',), 'failed'),
+    (('max_systematic',), 'failed'),
     (('min_by_objects', 'min_by_keyframes'), 'failed')])
 def test_one_table_gives_the_verdict(office_report, missed, verdict):
     measures = tuple(Measure(key, 4 + 3 * ((key in missed) == key.startswith('max')), 11, 0.5)
@@ -439,6 +440,7 @@ def test_the_page_has_this_table():
 
 def test_a_figure_is_told_apart_from_its_limit():
     assert str(Measure('min_localized', 199, 500, 0.4)) == '199 of 500 (39.8%, at least 40.0%)'
+    assert str(Measure('max_systematic', 0.5, 1.0, 0.25)) == '50%, at most 25%'
     assert str(Measure('max_misled', 0, 0, 0.01)) == '0 of 0 (0%, at most 1%)'
 
 

@@ -216,16 +216,15 @@ def give_advice(report: CheckReport, of_folder: bool = False) -> list[Advice]:
             f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
             f'{"large" if report.scale > 1.0 else "small"} by the sizes of its objects: '
             'check the unit of the poses, then the intrinsics'))
-    advice += [Advice(
+    advice += [*_on_corrections(report, of_folder), *(Advice(
         f'objects alone localize {measure.part:.0f} of {measure.total:.0f} views: record more '
         'objects, each from several sides, for other light and moved furniture')
         for measure in report.measures
-        if measure.key == 'min_by_objects' and measure.is_missed and report.keyframes]
+        if measure.key == 'min_by_objects' and measure.is_missed and report.keyframes)]
     advice += _some([_on_look_alike(pair, misled) for pair in report.look_alikes],
                     'pairs of places that look alike')
     advice += [*_on_misled(report, misled), *_on_landmarks(report),
-               *_on_corrections(report, of_folder), *_on_spans(report, recorded),
-               *_on_grid(report)]
+               *_on_spans(report, recorded), *_on_grid(report)]
     return advice or [Advice('nothing to do: the map reaches all thresholds' if report.passed else
                              'record the place again, with more views of its objects')]
 

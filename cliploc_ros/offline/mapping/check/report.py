@@ -24,9 +24,9 @@ MEASURES = {name: hint.__metadata__[0]
             for name, hint in get_type_hints(Thresholds, include_extras=True).items()}
 #: The thresholds that each verdict needs, and what a robot gets; the first reached one counts.
 VERDICTS = {
-    'passed': (('min_localized', 'min_by_objects', 'max_misled', 'max_faulty'),
+    'passed': (('min_localized', 'min_by_objects', 'max_misled', 'max_systematic', 'max_faulty'),
                'a robot is localized, by objects also in other light or among moved furniture'),
-    'keyframes only': (('min_by_keyframes', 'max_misled'),
+    'keyframes only': (('min_by_keyframes', 'max_misled', 'max_systematic'),
                        'a robot is localized while light and furniture are as recorded'),
     'failed': ((), 'a robot is mostly refused, or misled')}
 
@@ -61,8 +61,8 @@ class Measure(NamedTuple):
         """Describe the figure and its threshold, with the digits that tell them apart."""
         word = 'at most' if self.key.startswith('max') else 'at least'
         digits = int(self.is_missed and f'{self.share:.0%}' == f'{self.limit:.0%}')
-        return (f'{self.part:.0f} of {self.total:.0f} ({self.share:.{digits}%}, {word} '
-                f'{self.limit:.{digits}%})')
+        text = f'{self.share:.{digits}%}, {word} {self.limit:.{digits}%}'
+        return text if self.total == 1.0 else f'{self.part:.0f} of {self.total:.0f} ({text})'
 
 
 @dataclass(frozen=True)
@@ -197,11 +197,13 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
             sum(trial.by_objects for trial in recording.trials),
             sum(trial.by_keyframes for trial in recording.trials)]
     views = [*grid.trials, *(recording.trials if recording else ())]
+    systematic = max((result.explained for result in (recording.corrections if recording else ())
+                      if result.is_significant), default=0.0)
     weights = np.array([landmark.weight for landmark in report.landmarks])
     is_faulty = np.array([landmark.severity >= SERIOUS for landmark in report.landmarks], np.bool_)
     parts = [*((float(count), float(total)) for count in counts),
              (float(sum(trial.verdict == 'misled' for trial in views)), float(len(views))),
-             (float(weights[is_faulty].sum()), float(weights.sum()))]
+             (systematic, 1.0), (float(weights[is_faulty].sum()), float(weights.sum()))]
     return [Measure(key, part, whole, getattr(limits, key))
             for key, (part, whole) in zip(MEASURES, parts, strict=True)]
 
