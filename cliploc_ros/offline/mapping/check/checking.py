@@ -216,15 +216,15 @@ def give_advice(report: CheckReport, of_folder: bool = False) -> list[Advice]:
             f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
             f'{"large" if report.scale > 1.0 else "small"} by the sizes of its objects: '
             'check the unit of the poses, then the intrinsics'))
-    advice += [*_on_corrections(report, of_folder), *(Advice(
+    advice += [*_on_corrections(report, of_folder),
+               *_some([_on_look_alike(pair, misled) for pair in report.look_alikes],
+                      'pairs of places that look alike'), *_on_misled(report, misled)]
+    advice += [Advice(
         f'objects alone localize {measure.part:.0f} of {measure.total:.0f} views: record more '
         'objects, each from several sides, for other light and moved furniture')
         for measure in report.measures
-        if measure.key == 'min_by_objects' and measure.is_missed and report.keyframes)]
-    advice += _some([_on_look_alike(pair, misled) for pair in report.look_alikes],
-                    'pairs of places that look alike')
-    advice += [*_on_misled(report, misled), *_on_landmarks(report),
-               *_on_spans(report, recorded), *_on_grid(report)]
+        if measure.key == 'min_by_objects' and measure.is_missed and report.keyframes]
+    advice += [*_on_landmarks(report), *_on_spans(report, recorded), *_on_grid(report)]
     return advice or [Advice('nothing to do: the map reaches all thresholds' if report.passed else
                              'record the place again, with more views of its objects')]
 
@@ -287,12 +287,19 @@ def _on_corrections(report: CheckReport, of_folder: bool) -> Iterator[Advice]:
 
 
 def _on_misled(report: CheckReport, misled: Sequence[relocalization.Trial]) -> list[Advice]:
-    wrong = [trial for trial in misled if not _sees_double(trial.position, report.look_alikes)]
-    return _some([Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be '
-                         f'misled by {trial.error_m:.1f} m: map more distinct objects there, or '
-                         'raise min_confidence', view=trial)
-                  for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))],
-                 'views that mislead a robot', most=_MOST_MISLED)
+    sources = ['objects' if trial.result is None else trial.result.source for trial in misled]
+    by_keyframes = [trial for trial, source in zip(misled, sources, strict=True)
+                    if source != 'objects']
+    wrong = [trial for trial, source in zip(misled, sources, strict=True)
+             if source == 'objects' and not _sees_double(trial.position, report.look_alikes)]
+    advice = [Advice(f'keyframes mislead a robot in {counted(len(by_keyframes), "view")}: they '
+                     'contradict the poses of the recording; build the map again',
+                     view=by_keyframes[0])] if by_keyframes else []
+    return advice + _some([
+        Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be misled by '
+               f'{trial.error_m:.1f} m: map more distinct objects there, or raise min_confidence',
+               view=trial) for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))],
+        'views that mislead a robot', most=_MOST_MISLED)
 
 
 def _on_spans(report: CheckReport, trials: Sequence[relocalization.Trial]) -> Iterator[Advice]:
