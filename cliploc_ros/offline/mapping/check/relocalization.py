@@ -187,21 +187,26 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     taken_at = None if keyframes is None else _frames_of(keyframes.layer, detections)
     trials: list[Trial] = []
     for fold in folds:
-        semi_axes, quats_xyzw = fold.landmarks.axes_and_quats()
-        relocalizer = make_relocalizer(replace(
-            landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
-            semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
-        of_objects, of_both = Localizer(relocalizer), None
+        columns = {name: getattr(landmark_map, name).copy()
+                   for name in ('centers', 'semi_axes', 'quats_xyzw')}
+        for column, fitted in zip(columns.values(), (
+                fold.landmarks.centers, *fold.landmarks.axes_and_quats()), strict=True):
+            column[fold.rows] = fitted
+        whole = replace(landmark_map, **columns)
+        of_objects, of_both = Localizer(make_relocalizer(
+            whole.select(fold.rows.tolist()), options)), None
         if keyframes is not None and fold.training[taken_at].any():
-            of_both = Localizer(relocalizer, KeyframeLocalizer(
+            # with all landmarks, since those of places that look alike refuse keyframes, too
+            of_both = Localizer(make_relocalizer(whole, options), KeyframeLocalizer(
                 keyframes.layer.select(fold.training[taken_at])))
         for frame in sorted(chosen.intersection(fold.frames.tolist())):
             tell((len(trials) + 1) / len(chosen))
             seen = shown[slice(*detections.frame_offsets[frame:frame + 2])]
             query = simulated(detections, frame, shown, labels, options.random_seed)
-            query = replace(query, observation=replace(query.observation, similarities=np.asarray(
-                query.observation.similarities)[:, fold.rows]))
-            trial = alone = try_view(of_objects, query, int((seen >= 0).sum()), options)
+            trial = alone = try_view(of_objects, replace(query, observation=replace(
+                query.observation, similarities=np.asarray(
+                    query.observation.similarities)[:, fold.rows])), int((seen >= 0).sum()),
+                options)
             if of_both is not None and keyframes is not None:
                 trial = try_view(of_both, keyframes.with_image(query), alone.landmarks, options)
             trials.append(replace(trial, by_objects=alone.verdict == 'accepted'))
