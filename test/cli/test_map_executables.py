@@ -108,7 +108,6 @@ def test_the_office_passes_but_for_its_doubles(run_here, shared_data, tmp_path):
     office = shared_data / 'tum_fr3_office'
     done = run_here(check_map.main, office / 'map.yaml', '--observations',
                     office / 'observations.npz', '--every', 20, '--frames', 10,
-                    '--max-faulty', 0.25,
                     '--out', tmp_path, *FAST)
     assert done.returncode == 0, done.stdout + done.stderr
     checked = json.loads((tmp_path / 'check.json').read_text())

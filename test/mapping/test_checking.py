@@ -88,23 +88,13 @@ def test_equal_seed_and_input_give_an_equal_report(report, detections, tmp_path)
     assert written[0] == written[1]
 
 
-def faulty(report):
-    return next(measure.share for measure in report.measures if measure.key == 'max_faulty')
-
-
-def test_a_moved_landmark_is_the_worst_and_counts_by_its_frames(detections):
+def test_a_moved_landmark_is_the_worst(detections):
     higher = moved(TABLE, {4: TABLE.centers[4] + (0.0, 0.0, 0.45)})
     report = check_map(higher, detections, options=QUICK)
     worst, second, *_ = report.landmarks
     assert (worst.landmark_id, worst.support, second.severity) == ('thing_4', 0, 0.0)
     assert worst.expected > 50 and 'never detected' in worst.faults[0]
     assert any(text.startswith('thing_4 ') for text in report.advice)
-    assert faulty(report) == pytest.approx(1 / len(TABLE))
-    rare = replace(higher, details=tuple(LandmarkDetails(support=3 if row == 4 else 50)
-                                         for row in range(len(TABLE))))
-    report = check_map(rare, detections, options=QUICK)
-    assert report.landmarks[0].landmark_id == 'thing_4'
-    assert faulty(report) == pytest.approx(3 / (3 + 50 * (len(TABLE) - 1)))
 
 
 @pytest.mark.parametrize('is_recorded', [False, True])
@@ -169,7 +159,7 @@ def test_identical_rooms_fail_the_check(rooms_report):
 @pytest.mark.parametrize('least', [0.0, 1.0])
 def test_limits_decide(least):
     report = check_map(TABLE, options=QUICK, thresholds=Thresholds(
-        min_localized=least, min_by_objects=0.0, max_faulty=0.0))
+        min_localized=least, min_by_objects=0.0))
     assert [text.partition(':')[0] for text in report.failures] == [
         'views that are localized'] * (least > 0.0)
     assert report.passed == (least == 0.0)
@@ -211,7 +201,9 @@ def test_a_walk_that_passes_each_object_once_is_judged(detections):
     assert len(report.recording.trials) == QUICK.frames and report.recording.held_out.boxes > 30
     # a landmark at a wrong place explains none of its boxes, and is reported
     moved = replace(TABLE, centers=TABLE.centers + np.array([0.4, 0.0, 0.0]))
-    assert check_map(moved, detections, options=QUICK).verdict == 'failed'
+    report = check_map(moved, detections, options=QUICK)
+    assert sum(landmark.severity >= 1.0 for landmark in report.landmarks) > 4
+    assert any('cm away' in text or 'never' in text for text in report.advice)
 
 
 def test_stretches_without_landmarks_become_advice(detections):
@@ -291,7 +283,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     assert kinds.keys() == {'data:image/png;', 'data:image/jpeg'}
     assert kinds['data:image/png;'] == 2
     assert kinds['data:image/jpeg'] >= 5, 'five duplicates are shown'
-    assert page.count('<u style') == len(report.measures) == 6, 'each threshold has a bar'
+    assert page.count('<u style') == len(report.measures) == 5, 'each threshold has a bar'
     assert json.loads((tmp_path / CHECK_DATA).read_text())['landmarks'][0]['faults']
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([CHECK, CHECK_DATA])
 
@@ -413,7 +405,7 @@ def test_a_landmark_that_is_too_large_has_a_serious_fault(office):
 
 @pytest.mark.parametrize(('missed', 'verdict'), [
     ((), 'passed'), (('min_by_keyframes',), 'passed'), (('min_by_objects',), 'keyframes only'),
-    (('max_faulty', 'min_localized'), 'keyframes only'), (('max_misled',), 'failed'),
+    (('min_localized',), 'keyframes only'), (('max_misled',), 'failed'),
     (('max_systematic',), 'failed'),
     (('min_by_objects', 'min_by_keyframes'), 'failed')])
 def test_one_table_gives_the_verdict(office_report, missed, verdict):

@@ -136,4 +136,3 @@ class Thresholds:
     max_misled: Annotated[float, 'views in which a wrong pose is accepted'] = 0.01
     max_systematic: Annotated[
         float, 'errors of boxes that a wrong camera, mount or clock explains'] = 0.25
-    max_faulty: Annotated[float, 'sightings of landmarks with a serious fault'] = 0.15

@@ -81,7 +81,6 @@ class LandmarkCheck:
     overlaps: tuple[tuple[str, float], ...]
     faults: tuple[str, ...] = ()  #: The faults and what to do, the worst first
     severity: float = 0.0  #: 0: nothing; 1 and more: a serious fault
-    weight: float = 1.0  #: Number of frames it was mapped from; 1 for all if unknown
 
 
 class Witness(NamedTuple):
@@ -136,10 +135,8 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
     for overlap in overlaps:
         partners[overlap.first].append((overlap.second, overlap))
         partners[overlap.second].append((overlap.first, overlap))
-    supports = [detail.support for detail in landmark_map.details]
     misspelt = (misspelt_classes(classes, shipped_classes()) if witness is None
                 else misspelt_classes(classes, witness.class_names, all_known=True))
-    weights = np.array(supports if all(supports) else [], dtype=np.float64)
     checks = []
     for row, others in enumerate(partners):
         semi_axes = landmark_map.semi_axes[row]
@@ -174,8 +171,7 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         faults.sort(key=lambda fault: -fault[0])
         checks.append(replace(
             check, faults=tuple(text for _, text in faults),
-            severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0,
-            weight=float(weights[row]) if len(weights) else 1.0))
+            severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0))
     return sorted(checks, key=lambda check: (
         -check.severity, 1.0 if check.seen_ratio is None else check.seen_ratio))
 

@@ -24,7 +24,7 @@ MEASURES = {name: hint.__metadata__[0]
             for name, hint in get_type_hints(Thresholds, include_extras=True).items()}
 #: The thresholds that each verdict needs, and what a robot gets; the first reached one counts.
 VERDICTS = {
-    'passed': (('min_localized', 'min_by_objects', 'max_misled', 'max_systematic', 'max_faulty'),
+    'passed': (('min_localized', 'min_by_objects', 'max_misled', 'max_systematic'),
                'a robot is localized, by objects also in other light or among moved furniture'),
     'keyframes only': (('min_by_keyframes', 'max_misled', 'max_systematic'),
                        'a robot is localized while light and furniture are as recorded'),
@@ -40,7 +40,7 @@ class Advice(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """A part of the views or sightings, and the threshold of its share."""
+    """A part of the views, and the threshold of its share."""
 
     key: str  #: Of MEASURES
     part: float
@@ -183,8 +183,7 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
     """Return the figures of a report that have a threshold.
 
     Without a recording, or with keyframes but without its images, the positions near the recording
-    are counted in place of recorded views. Landmarks count as often as they were seen: a landmark
-    of few frames will rarely be seen again.
+    are counted in place of recorded views.
     """
     grid, recording = report.grid, report.recording
     if recording is None or (report.keyframes and not recording.has_images):
@@ -199,11 +198,9 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
     views = [*grid.trials, *(recording.trials if recording else ())]
     systematic = max((result.explained for result in (recording.corrections if recording else ())
                       if result.is_significant), default=0.0)
-    weights = np.array([landmark.weight for landmark in report.landmarks])
-    is_faulty = np.array([landmark.severity >= SERIOUS for landmark in report.landmarks], np.bool_)
     parts = [*((float(count), float(total)) for count in counts),
              (float(sum(trial.verdict == 'misled' for trial in views)), float(len(views))),
-             (systematic, 1.0), (float(weights[is_faulty].sum()), float(weights.sum()))]
+             (systematic, 1.0)]
     return [Measure(key, part, whole, getattr(limits, key))
             for key, (part, whole) in zip(MEASURES, parts, strict=True)]
 
