@@ -45,15 +45,14 @@ _CASES = {'good': (2, 1.0), 'half moved': (2, 1.0), 'keyframes off': (2, 1.0),
 
 def spoiled(made: MadeMap, case: str) -> MadeMap:
     """Return a map with every second landmark, or all keyframes, off by 1.5 m; or without some."""
-    landmarks, layer = made.landmark_map, made.layer
-    assert layer is not None
-    centers, poses = landmarks.centers.copy(), layer.map_from_camera.copy()
+    landmarks, layer = made.landmark_map, None if case == 'no keyframes' else made.layer
+    offset, centers = np.zeros((4, 4)), landmarks.centers.copy()
     centers[::2, 0] += 1.5 * (case == 'half moved')
-    poses[:, 0, 3] += 1.5 * (case == 'keyframes off')
+    offset[0, 3] = 1.5 * (case == 'keyframes off')
     landmarks = replace(landmarks, centers=centers)
     return replace(
         made, landmark_map=landmarks.select(range(1)) if case == 'one landmark' else landmarks,
-        layer=None if case == 'no keyframes' else replace(layer, map_from_camera=poses))
+        layer=layer and replace(layer, map_from_camera=layer.map_from_camera + offset))
 
 
 def main(model: str, out: str, *folders: str) -> None:
@@ -70,6 +69,9 @@ def main(model: str, out: str, *folders: str) -> None:
             image, camera = room.raws[row].color()
             return image, longer(camera)
 
+        def image_of(row: int, room: Room = room) -> Image:
+            return room.raws[row].color()[0]
+
         raws = tuple(replace(raw, color=partial(color, row)) for row, raw in enumerate(room.raws))
         seen = replace(room.detections, cameras=tuple(map(longer, room.detections.cameras))
                        ).select_frames(mapped)
@@ -77,7 +79,7 @@ def main(model: str, out: str, *folders: str) -> None:
         made = spoiled(make_map(seen, Labeller({}), MappingOptions(estimate_pose_errors=True),
                                 frames, LayerOptions()), case)
         report = check_map(made.landmark_map, seen, _QUICK, layer=made.layer,
-                           image_of=lambda frame, rows=mapped: color(rows[frame])[0])
+                           image_of=partial(lambda rows, frame: image_of(rows[frame]), mapped))
         print(f'{room.name}, {case}: {report.verdict}; {report.localized[0]}', flush=True)
         for way in ('both', 'objects', 'keyframes'):
             relocalizer = Relocalizer(made.landmark_map, RelocalizerOptions(matching='class'))
@@ -88,7 +90,7 @@ def main(model: str, out: str, *folders: str) -> None:
                 query = room.queries[row]
                 plain = known_of(query.observation, '-')
                 trials.append(try_view(localizer, replace(
-                    query, image=partial(lambda row: color(row)[0], row),
+                    query, image=partial(image_of, row),
                     observation=without_boxes(plain) if way == 'keyframes' else plain), 0, _QUICK))
             print(f'  {way}: {count_verdicts(trials)}', flush=True)
 

@@ -147,12 +147,12 @@ class CheckReport:
                 f'{counted(len(trials), "recorded view")}, each in a map of the other views: '
                 f'{counts["accepted"]} localized ({alone}), {counts["refused"]} refused, '
                 f'{counts["misled"]} misled')
-        of_objects, of_keyframes = (np.count_nonzero(headings.any(axis=1)[near]) for headings in (
+        of_objects, of_keyframes = (int(headings.any(axis=1)[near].sum()) for headings in (
             self.grid.by_objects, self.grid.by_keyframes))
         where = '' if near.all() else ' near the recorded views'
         found.append(
-            f'{counted(np.count_nonzero(near), "position")}{where}: '
-            f'{np.count_nonzero(self.grid.localized[near])} with a heading that localizes '
+            f'{counted(int(near.sum()), "position")}{where}: '
+            f'{int((self.grid.localized[near] > 0).sum())} with a heading that localizes '
             f'({of_objects} by simulated objects'
             + (f', {of_keyframes} within reach of a keyframe)' if self.keyframes else ')'))
         return tuple(found)
