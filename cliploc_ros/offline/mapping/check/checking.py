@@ -232,7 +232,7 @@ def give_advice(report: CheckReport, of_folder: bool = False) -> list[Advice]:
 def _some(advice: Sequence[Advice], what: str, most: int = _MOST_OF_A_KIND) -> list[Advice]:
     """Return the first pieces of advice, and how many more there are."""
     more = len(advice) - most
-    return [*advice[:most], *[Advice(f'and {more} more {what}')] * (more > 0)]
+    return [*advice[:most], *[Advice(f'and {more} more of these: {what}')] * (more > 0)]
 
 
 def _on_look_alike(pair: findings.LookAlike, misled: Sequence[relocalization.Trial]) -> Advice:
