@@ -176,7 +176,7 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
     path = options.out.with_stem(f'{options.out.stem}.refused') if is_poor else options.out
     written = write_made_map(path, made, head, recording, options.update)
     print('\n'.join([*lines, *(f'note: {text}' for text in notes if text),
-                     f'wrote {path} in {time.monotonic() - begin:.0f} s, {"; ".join(written)}']),
+                     '; '.join([f'wrote {path} in {time.monotonic() - begin:.0f} s', *written])]),
           flush=True)
     return path, is_poor
 
