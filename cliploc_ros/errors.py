@@ -41,6 +41,12 @@ def did_you_mean(name: str, known: Iterable[str], most: int = 1, alike: float = 
     return f' (did you mean {names}?)' if near else ''
 
 
+def counted(number: int, what: str) -> str:
+    """Return a number of things in words, as '1 box' or '2 boxes'."""
+    plural = 'es' if what.endswith('x') else 's'
+    return f'{number} {what}{plural if number != 1 else ""}'
+
+
 def misspelt_classes(class_ids: Iterable[str], known: Iterable[str], all_known: bool = False
                      ) -> dict[str, str]:
     """Return the classes of a map that look misspelt, each with a hint of the right spelling.

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.mapping.options import MappingOptions
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
-# Options of the check after a build: with fewer views, it takes seconds instead of a minute.
-_QUICK = ('--positions', '25', '--headings', '6', '--frames', '30')
+# Options of the check after a build: with fewer views, it takes seconds instead of a minute. The
+# number of pieces of advice after it.
+_QUICK, _ADVICE_SHOWN = ('--positions', '25', '--headings', '6', '--frames', '30'), 2
 EPILOG = """\
 examples:
   build_map --bag drive --out office.yaml
@@ -136,24 +137,22 @@ def build(options: argparse.Namespace) -> int:
         raise
     _write_report(options.report, asdict(made.report))
     recording = sources.recording_of(options, file, scale, rotation)
-    path, is_poor = _write(options, made, name, recording, [labeller.note, note])
-    print(f'wrote {path} in {time.monotonic() - begin:.1f} s', flush=True)
+    path, is_poor = _write(options, made, name, recording, [labeller.note, note], begin)
     try:
         if options.check:
-            check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]))
+            check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]),
+                            _ADVICE_SHOWN)
     except CliplocError as error:  # the map is kept
         print(f'note: not checked: {error}')
-    print(f'to correct it: studio {path}')
-    if is_poor:
-        print(f'refused: the map explains too few of the boxes of its classes: {options.out} is '
-              f'not written; look at {path.name}; check the camera first, then stamps, then '
-              'poses, then the objects')
+    print(f'refused: the map explains too few of the boxes of its classes: {options.out} is not '
+          f'written; look at {path.name}; check the camera first, then stamps, then poses, then '
+          'the objects' if is_poor else f'to correct it: studio {path}')
     return int(is_poor)
 
 
 def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: 'MapRecording',
-           notes: Sequence[str]) -> tuple[Path, bool]:
-    """Write a map, and print its report.
+           notes: Sequence[str], begin: float) -> tuple[Path, bool]:
+    """Write a map, and print its report, and how long the run took since its begin.
 
     Return its path, which is another one if the map is poor, and whether it is.
     """
@@ -175,8 +174,10 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
     is_poor = isinstance(made.report, MappingReport) and made.report.landmarks > 0 and (
         made.report.explained_of_classes < LEAST_EXPLAINED)
     path = options.out.with_stem(f'{options.out.stem}.refused') if is_poor else options.out
-    lines += write_made_map(path, made, head, recording, options.update)
-    print('\n'.join([*lines, *(f'note: {text}' for text in notes if text)]))
+    written = write_made_map(path, made, head, recording, options.update)
+    print('\n'.join([*lines, *(f'note: {text}' for text in notes if text),
+                     '; '.join([f'wrote {path} in {time.monotonic() - begin:.0f} s', *written])]),
+          flush=True)
     return path, is_poor
 
 

@@ -3,9 +3,7 @@
 """The executable ``check_map``: judge a map, and advise what to improve."""
 
 import argparse
-import os
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
@@ -19,7 +17,6 @@ from cliploc_ros.errors import CliplocError, OptionsError
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 
 if TYPE_CHECKING:
-    from cliploc_ros.core.keyframes.layer import KeyframeLayer
     from cliploc_ros.offline.datasets.images import Images
     from cliploc_ros.offline.datasets.map_recording import MapRecording
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -29,9 +26,9 @@ EPILOG = """\
 examples:
   check_map office.yaml --observations office.npz --out office_check
   check_map office.yaml --observations office.npz --gravity --out office_check
-  check_map hand_written.yaml --out check --max-look-alikes 2
+  check_map hand_written.yaml --out check --min-localized 0.2
 
-exit code: 0 the map reaches all thresholds, 1 it misses one or the input is invalid
+exit code: 0 the verdict is "passed", 1 it is not or the input is invalid
 """
 
 
@@ -56,7 +53,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--every N', 'use only every N-th frame of the observations (%(default)s)',
            command.positive_int, 1)
     option(parser, '--seed', '(%(default)s)', command.within(*command.SEEDS), 0)
-    add_use_option(parser, 'report what the keyframes next to the map reach')
+    add_use_option(parser, 'use the keyframes next to the map')
     group = parser.add_argument_group('expected relocalization')
     option(group, '--frames N', 'greatest number of recorded frames to relocalize (%(default)s)',
            command.within(1, 10**6), CheckOptions.frames)
@@ -73,79 +70,54 @@ def make_parser() -> argparse.ArgumentParser:
     option(group, '--gravity', 'the robot knows the vertical')
     option(group, '--min-confidence', 'min_confidence of the relocalizer (%(default)s)',
            command.within(0.0, 1.0), RelocalizerOptions().min_confidence)
-    group = parser.add_argument_group('thresholds; if the map misses one, the exit code is 1')
+    group = parser.add_argument_group('thresholds: shares that determine the verdict')
     for name, hint in get_type_hints(Thresholds, include_extras=True).items():
         option(group, f'--{name.replace("_", "-")} N', f'{hint.__metadata__[0]} (%(default)s)',
-               command.within(0.0, 1.0) if hint.__origin__ is float else command.within(0, 10**9),
-               getattr(Thresholds, name))
+               command.within(0.0, 1.0), getattr(Thresholds, name))
     add_topic_options(parser.add_argument_group('images of a bag'))
     return parser
 
 
-def check(options: argparse.Namespace) -> int:
-    """Check the map that the command line names; return the exit code."""
+def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
+    """Check the map that the command line names; return the exit code.
+
+    The output has the verdict, at most this number of pieces of advice, and the page.
+    """
     # Imported late, so that --help is fast.
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.datasets.map_recording import load_recording
-    from cliploc_ros.offline.evaluation.check_page import CHECK, figures_of, write_check
+    from cliploc_ros.offline.evaluation.check_page import CHECK, write_check
     from cliploc_ros.offline.mapping.check.checking import check_map
-    from cliploc_ros.offline.mapping.tilt import tilt_note
 
-    begin = time.monotonic()
     landmark_map = LandmarkMap.from_file(options.map)
     recording = load_recording(options.map) if options.observations is None else None
+    detections, images = _read_recording(options, recording) or (None, None)
     check_options = CheckOptions(
         relocalizer=RelocalizerOptions(min_confidence=options.min_confidence),
         folds=options.folds, frames=options.frames, spacing_m=options.grid,
         max_positions=options.positions, headings=options.headings,
         camera_height_m=options.camera_height, use_vertical=options.gravity,
+        of_folder=images is not None and images.of_folder,
         is_size_given=recording is not None and recording.scale != 1.0,
         random_seed=options.seed)
     thresholds = Thresholds(**{field.name: getattr(options, field.name)
                                for field in fields(Thresholds)})
-    detections, images = _read_recording(options, recording) or (None, None)
     image_of = None
     if detections is not None and images is not None:
         image_of = partial(images.of, detections)
-    if detections is not None and (note := tilt_note(detections.map_from_camera)):
-        print(f'note: {note}', flush=True)
     layer = read_layer(options.map, landmark_map, options.keyframes)
-    if not len(landmark_map):
-        return _check_keyframes(layer, detections)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)
     with command.StageBar() as bar:
         report = check_map(landmark_map, detections, check_options, thresholds, bar.show, layer,
-                           None if options.observations else image_of)
+                           image_of)
         write_check(out, options.map.name, landmark_map, report, detections, image_of)
-    print('\n'.join([f'verdict: {report.verdict}', *report.localized,
-                     *(f'{name}: {value}' for name, value in figures_of(report))]))
-    print('what to do:')
-    print('\n'.join(f'  {command.printable(line)}' for line in report.advice[:_ADVICE_SHOWN]))
-    for failure in report.failures:
-        print(f'fails: {failure}')
-    print(f'wrote {out / CHECK} in {time.monotonic() - begin:.1f} s: '
-          f'{report.verdict}')
+    print('\n'.join([f'verdict: {report.summary[0]}', *report.localized, *(
+        f'{number}. {command.printable(line)}'
+        for number, line in enumerate(report.advice[:most], start=1))]))
+    print(f'wrote {out / CHECK}: open it for pictures, all advice and the faults of landmarks')
     return 0 if report.passed else 1
-
-
-def _check_keyframes(layer: 'KeyframeLayer | None', detections: 'PosedDetections | None') -> int:
-    """Report on a map without landmarks; return the exit code of a map that did not pass."""
-    from cliploc_ros.offline.mapping.check.report import in_reach
-
-    if layer is None:
-        print('fails: the map has neither landmarks nor keyframes')
-        return 1
-    print(f'keyframes only: no landmark; {len(layer)} keyframes with {int(layer.offsets[-1])} '
-          'points localize a robot near their views')
-    if detections is not None:
-        reached = in_reach(layer, detections.map_from_camera)
-        print(f'recorded frames within reach of a keyframe: {reached.mean():.0%} of '
-              f'{len(reached)}')
-    print('what to do:\n  record objects from several sides: they also localize a robot away from '
-          'the recorded views, and after the place has changed')
-    return 1
 
 
 def _read_recording(options: argparse.Namespace, recording: 'MapRecording | None'
@@ -160,7 +132,6 @@ def _read_recording(options: argparse.Namespace, recording: 'MapRecording | None
         detections, source = load_observations(options.observations), source_of(
             options.observations)
     elif recording is not None:
-        print(f'observations: {os.path.relpath(recording.observations)}', flush=True)
         detections, source = recording.load(), None
     elif options.images is not None:
         raise OptionsError('--images needs --observations: no recording of this map is known')

@@ -79,7 +79,8 @@ def serve(options: argparse.Namespace) -> int:
             print(f'{studio.document.path}: {len(studio.document.landmarks)} landmarks, '
                   f'{studio.views} views')
             tilt = '' if studio.recording is None else tilt_note(
-                studio.recording.detections.map_from_camera)
+                studio.recording.detections.map_from_camera,
+                studio.recording.images is None or not studio.recording.images.of_folder)
             for note in filter(None, (*studio.document.notes, tilt)):
                 print(f'note: {note}')
             print(f'studio: {url}', flush=True)

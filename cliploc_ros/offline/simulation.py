@@ -82,11 +82,6 @@ class DetectorModel:
         rows = np.nonzero(found.is_shown & (distances <= self.reach_m))[0]
         return rows, found.shown[rows]
 
-    def expected_detections(self, map_from_camera: NDArray[np.float64]) -> float:
-        """Return the expected number of detected landmarks."""
-        rows, _ = self.in_view(map_from_camera)
-        return sum(self._chance(row, map_from_camera) for row in rows)
-
     def detect(self, map_from_camera: NDArray[np.float64], rng: np.random.Generator
                ) -> tuple[Detections, NDArray[np.int64]]:
         """Simulate n detections; also return the landmark (n,) of each box, -1 for none."""

@@ -93,7 +93,7 @@ def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, c
     errors = errors_of(tmp_path / 'out')
     assert len(errors) >= 3 and max(errors) < 0.25
     assert check_map([str(built), '--positions', '4', '--headings', '2', '--frames', '4']) < 2
-    assert 'observations: ' in capsys.readouterr().out
+    assert 'verdict: ' in capsys.readouterr().out
     detections = load_recording(built).load()
     up = LandmarkMap.from_file(built)
     assert explained_boxes(make_views(detections), landmarks_of_map(
@@ -102,6 +102,7 @@ def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, c
     try:
         assert np.allclose(studio.recording.detections.map_from_camera,
                            detections.map_from_camera)
+        assert studio.recording.images.of_folder
         assert studio.recording.images.of(detections, 3).shape == (480, 640, 3)
     finally:
         studio.document.close()

@@ -228,8 +228,8 @@ def test_an_upside_down_camera_is_no_reason_to_turn_the_map_over():
     assert tilt_note(poses) == ''
     poses[:, :3, :3] = turns.as_matrix() @ np.diag([-1.0, -1.0, 1.0])
     assert 'mounted so' in tilt_note(poses) and 'corrects' not in tilt_note(poses)
-    assert tilt_note(poses, of_tf=True) == ''
-    np.testing.assert_allclose(find_levelling(poses, True, of_tf=True)[0], np.eye(3), atol=1e-9)
+    assert tilt_note(poses, of_robot=True) == ''
+    np.testing.assert_allclose(find_levelling(poses, True, of_robot=True)[0], np.eye(3), atol=1e-9)
 
 
 @pytest.mark.parametrize('angles_deg', [(120.0, 0.0, 30.0), (1.0, -1.0, 100.0)])

@@ -95,7 +95,7 @@ def test_joint_refinement_corrects_poses_and_landmarks():
 
 
 @pytest.mark.parametrize(('change', 'message'), [
-    (lambda one: one.select_frames([3]), 'took 1 viewpoints'),
+    (lambda one: one.select_frames([3]), 'took 1 viewpoint,'),
     (lambda one: one.select_boxes(np.zeros(len(one.classes), dtype=np.bool_)),
      'have no detections'),
     # a base whose x axis points forward like the camera's z axis

@@ -29,8 +29,8 @@ _NO_OPTIONS = FolderOptions()
 class Images:
     """The images of a folder or a recording, found by stamp, and by camera in a recording."""
 
-    def __init__(self, frames: Sequence[RawFrame]):
-        self._frames = frames
+    def __init__(self, frames: Sequence[RawFrame], of_folder: bool = False):
+        self._frames, self.of_folder = frames, of_folder
         self._stamps_ns = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
         self._cameras = np.array([frame.camera for frame in frames], dtype=np.str_)
         self._lock = threading.Lock()  # readers of recordings are not thread-safe
@@ -93,7 +93,7 @@ def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),
     if (layout := find_layout(path, folder.layout)) is not None:
         capture = layout.read(path, folder)
         return Images(list(folder_frames(path, capture.files, capture.depth).read_raw(
-            lambda place, stamp_ns, pose: True)))
+            lambda place, stamp_ns, pose: True)), of_folder=True)
     return Images([frame for name in cameras
                    for frame in bag_images(path, topics.of_camera(name), name)])
 

@@ -10,7 +10,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import is_dataclass, replace
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, outline_points
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.errors import counted
 from cliploc_ros.files.storage import write_text
 from cliploc_ros.offline import page as html
 from cliploc_ros.offline.evaluation import figures
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.check.findings import RADIUS_M, LandmarkCheck
 from cliploc_ros.offline.mapping.check.relocalization import ImageOf, Trial, count_verdicts
-from cliploc_ros.offline.mapping.check.report import SERIOUS, Advice, CheckReport, Measure, share
+from cliploc_ros.offline.mapping.check.report import MEASURES, SERIOUS, Advice, CheckReport
 from cliploc_ros.offline.mapping.landmarks import group_boxes, landmarks_of_map
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.sightings import crop_around, find_sightings, outlines_in_view
@@ -45,7 +46,7 @@ _MOST_LANDMARKS = 300
 _FIRST_ADVICE = 3
 _DPI = 120
 _INK = '#222222'
-_HEAT = LinearSegmentedColormap.from_list('accepted', ['#FBE9C6', '#56B4E9', '#003E6B']
+_HEAT = LinearSegmentedColormap.from_list('accepted', ['#D3EBFA', '#56B4E9', '#003E6B']
                                           ).with_extremes(bad='#DDDDDD')
 _MARKERS = {'accepted': (html.ACCEPTED, 'o'), 'refused': (html.REFUSED, 's'),
             'misled': (html.MISLED, 'X')}
@@ -73,34 +74,20 @@ def write_check(folder: Path, name: str, landmark_map: LandmarkMap, report: Chec
 
 def _data(report: CheckReport) -> dict[str, Any]:
     """Return the content of the JSON file."""
-    grid, recording, layer = report.grid, report.recording, report.keyframes
-    data = {
-        'passed': report.passed, 'verdict': report.verdict, 'localized': report.localized,
-        'scale_by_sizes': report.scale, 'failures': report.failures, 'advice': report.advice,
-        'notes': report.notes, 'faulty_landmarks': report.faulty, 'duplicates': report.duplicates,
-        'landmarks': report.landmarks, 'look_alikes': report.look_alikes,
+    grid, recording = report.grid, report.recording
+    return {
+        **{name: getattr(report, name) for name in (
+            'passed', 'verdict', 'summary', 'advice', 'notes', 'duplicates', 'landmarks',
+            'look_alikes', 'keyframes')},
+        'measures': {measure.key: measure._asdict() for measure in report.measures},
+        'scale_by_sizes': report.scale,
         'overlaps': [{'first': report.map_ids[overlap.first],
                       'second': report.map_ids[overlap.second], 'distance': overlap.distance,
                       'is_duplicate': overlap.is_duplicate} for overlap in report.overlaps],
-        'recording': None, 'keyframes': None,
-        'grid': {**vars(grid), 'headings': grid.headings, 'poses': None,
-                 'accepted_positions_near_recording': grid.accepted_positions,
-                 'verdicts': count_verdicts(grid.trials),
+        'recording': None if recording is None else {
+            **vars(recording), 'verdicts': count_verdicts(recording.trials)},
+        'grid': {**vars(grid), 'poses': None, 'verdicts': count_verdicts(grid.trials),
                  'trials': [trial for trial in grid.trials if trial.verdict == 'misled']}}
-    if recording is not None:
-        data['recording'] = {
-            **vars(recording), 'judged_frames': len(recording.judged),
-            'verdicts': count_verdicts(recording.trials),
-            'verdicts_by_objects': count_verdicts([
-                replace(trial, verdict=trial.by_objects or trial.verdict)
-                for trial in recording.trials])}
-    if layer is not None:
-        data['keyframes'] = {
-            'keyframes': layer.keyframes, 'points': layer.points,
-            'recorded_frames_in_reach': layer.recorded.mean() if len(layer.recorded) else None,
-            'positions_in_reach_near_recording': layer.reached_positions,
-            'positions_without': grid.positions[layer.without]}
-    return data
 
 
 def _plain(value: Any) -> Any:
@@ -133,19 +120,15 @@ def check_page(name: str, landmark_map: LandmarkMap, report: CheckReport,
             landmark_map, detections.class_names)), len(landmark_map))
         views = [_view_of(advice, landmark_map, detections, shown, image_of)
                  for advice in report.to_do]
-    missed = len(report.failures)
-    said = html.verdict('The map reaches all thresholds.' if report.passed else
-                        'Keyframes only: the map misses the threshold for objects alone.'
-                        if report.verdict == 'keyframes only' else
-                        f'The map misses {missed} of {len(report.measures)} thresholds.',
-                        report.passed)
-    said += html.items(report.localized)
+    verdict, *localized = report.summary
+    said = html.verdict(verdict, report.passed) + html.items(localized)
     first, *others = (html.figure(png, caption, picture)
                       for picture, caption, png in draw_pictures(landmark_map, report))
     cards = [html.card(f'{number}. {text}', *(view or ()))
              for number, (text, view) in enumerate(zip(report.advice, views, strict=True), 1)]
     parts = [html.first_screen(
-        [said, html.bars(_bar(measure) for measure in report.measures),
+        [said, html.bars((MEASURES[measure.key], str(measure), measure.share, measure.limit,
+                          not measure.is_missed) for measure in report.measures),
          '<h2>What to do first</h2>', *cards[:_FIRST_ADVICE]], [first])]
     if later := cards[_FIRST_ADVICE:]:
         parts.append(html.fold(f'{len(later)} more recommendations', *later))
@@ -158,44 +141,21 @@ def check_page(name: str, landmark_map: LandmarkMap, report: CheckReport,
                      html.fold('How these figures were computed', html.items(report.notes)))
 
 
-def _bar(measure: Measure) -> tuple[str, str, float, float, bool]:
-    """Return the bar of a figure. That of a count ends at its limit plus one, or at its value."""
-    scale = max(measure.limit + 1.0, measure.value) if measure.unit == 'count' else 1.0
-    word = 'at most' if measure.is_most else 'at least'
-    return (measure.name, f'{measure.show(measure.value)} ({word} {measure.show(measure.limit)})',
-            measure.value / scale, measure.limit / scale, not measure.is_missed)
-
-
 def figures_of(report: CheckReport) -> list[tuple[str, str]]:
-    """Return the names and values of the figures of a check."""
-    rows = [('landmarks', str(len(report.landmarks))),
-            *((measure.name, measure.show(measure.value)) for measure in report.measures)]
+    """Return the names and values of the figures of a check that have no threshold."""
+    counts = count_verdicts(report.grid.trials)
+    rows = [('landmarks', str(len(report.landmarks))), ('keyframes', str(report.keyframes)),
+            ('duplicates', counted(report.duplicates, 'pair')),
+            ('places that look alike', counted(len(report.look_alikes), 'pair')),
+            (f'simulated views of objects alone, {len(report.grid.trials)} on the grid',
+             ', '.join(f'{count} {verdict}' for verdict, count in counts.items()))]
     if (recording := report.recording) is not None:
-        rows += [
-            ('recording', f'{recording.frames} frames, {recording.boxes} boxes, '
-             f'{recording.duration_s:.0f} s'),
-            ('explained boxes, median IoU; map as given',
-             f'{recording.as_given.explained:.1%}, {recording.as_given.median_iou:.3f} '
-             '(optimistic if the map was built from this recording)'),
-            (f'recorded frames, cross-validated, {report.evidence}', _verdicts(recording.judged))]
-        if len(recording.judged) < len(recording.trials):
-            rows.append(('also frames whose objects are in no other part of the recording',
-                         _verdicts(recording.trials)))
-    rows.append(('grid views, by objects alone', _verdicts(report.grid.trials)))
-    if (layer := report.keyframes) is not None:
-        rows.append(('keyframes', f'{layer.keyframes} with {layer.points} points'))
-        if len(layer.recorded):
-            rows.append(('recorded frames within reach of a keyframe',
-                         f'{layer.recorded.mean():.0%} of {len(layer.recorded)}'))
-        rows.append(('grid positions within reach of a keyframe',
-                     f'{layer.reached_positions:.0%} of {int(report.grid.is_near.sum())}'))
+        rows += [('recording', f'{counted(recording.frames, "frame")}, '
+                  f'{counted(recording.boxes, "box")}, {recording.duration_s:.0f} s'),
+                 ('boxes that landmarks of the other views explain',
+                  f'{recording.held_out.explained:.0%}, median IoU '
+                  f'{recording.held_out.median_iou:.2f}')]
     return rows
-
-
-def _verdicts(trials: Sequence[Trial]) -> str:
-    counts = count_verdicts(trials)
-    return (f'{counts["accepted"]} of {len(trials)} accepted ({share(trials, "accepted"):.0%}), '
-            f'{counts["refused"]} refused, {counts["misled"]} misled')
 
 
 def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
@@ -219,16 +179,16 @@ def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
 def draw_pictures(landmark_map: LandmarkMap, report: CheckReport
                   ) -> Iterator[tuple[str, str, bytes]]:
     """Yield the name, the caption and the PNG of each picture."""
-    yield ('grid', 'Expected relocalization, top view. Outlines are landmarks, a cell is a camera '
-           'position. Its shade shows the share of headings with a correct, accepted pose, among '
-           'the headings with three or more detectable landmarks; it is grey if no heading shows '
-           'three. Ticks show the headings at which a wrong pose was accepted. Positions inside '
-           'landmarks are omitted. Numbers refer to the advice.',
+    yield ('grid', 'Where a robot is localized, top view. Outlines are landmarks, a cell is a '
+           'camera position. Its shade shows the share of headings that localize: with a correct, '
+           'accepted pose by simulated objects, or within reach of a keyframe; it is grey without '
+           'such a heading. Ticks show the headings at which a wrong pose was accepted. Positions '
+           'inside landmarks are omitted.' + (
+               ' Numbers are those of the advice.' if _places(landmark_map, report) else ''),
            _drawn(_draw_grid, landmark_map, report))
     yield ('landmarks', f'Top view of the landmarks. The {_MOST_NAMES} worst with a fault are '
-           'named. Arrows are recorded frames, each '
-           'relocalized in a map that was fitted without the frames of that time; a line leads to '
-           'a wrong pose. Circles of one number are places that look alike.',
+           'named. Arrows are recorded views, each relocalized in a map of the other views; a '
+           'line leads to a wrong pose. Circles of one number are places that look alike.',
            _drawn(_draw_landmarks, landmark_map, report))
 
 
@@ -253,16 +213,14 @@ def _drawn(draw: Callable[[Axes, LandmarkMap, CheckReport], None], landmark_map:
 def _draw_grid(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) -> None:
     grid, side = report.grid, report.grid.spacing_m
     height = grid.positions[0, 2] if len(grid.positions) else 0.0
-    axes.set_title(f'Expected accepted poses, camera {height:.2f} m high', fontsize=12)
+    axes.set_title(f'Where a robot is localized, camera {height:.2f} m high', fontsize=12)
     cells = PatchCollection(
         [Rectangle(position[:2] - 0.48 * side, 0.96 * side, 0.96 * side)
          for position in grid.positions], cmap=_HEAT, norm=Normalize(0, 100), zorder=1)
-    cells.set_array(np.ma.masked_where(
-        (grid.useful == 0) & (grid.accepted == 0),
-        100.0 * np.minimum(1.0, grid.accepted / np.maximum(1, grid.useful))))
+    cells.set_array(np.ma.masked_equal(100.0 * grid.localized / grid.headings, 0.0))
     axes.add_collection(cells)
     axes.figure.colorbar(cells, ax=axes, shrink=0.7, pad=0.02).set_label(
-        'correct pose accepted\n[% of headings that show 3 landmarks]', fontsize=9)
+        'localized by objects or keyframes\n[% of headings]', fontsize=9)
     for center, shape in zip(landmark_map.centers, landmark_map.shapes, strict=True):
         figures.draw_outline(axes, center, shape, facecolor='none', edgecolor=_INK, linewidth=0.7,
                              zorder=3, path_effects=figures.EDGED)
@@ -270,15 +228,20 @@ def _draw_grid(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) -> No
              for trial in grid.trials if trial.verdict == 'misled']
     axes.plot(*np.reshape(ticks, (-1, 3)).T[:2], 'X-', color=html.MISLED, markevery=3, zorder=7,
               markersize=9, markeredgecolor='white', linewidth=2.5,
-              label=f'misled ({len(ticks)} of {len(grid.trials)} views)')
+              label=f'misled ({len(ticks)} of {len(grid.trials)} simulated views)')
+    for number, place in _places(landmark_map, report).items():
+        axes.text(place[0], place[1], str(number), fontsize=10, fontweight='bold', zorder=10,
+                  color='white', ha='center', va='center', bbox={
+                      'boxstyle': 'circle,pad=0.25', 'facecolor': _INK, 'edgecolor': 'white'})
+
+
+def _places(landmark_map: LandmarkMap, report: CheckReport) -> dict[int, NDArray[np.float64]]:
+    """Return the places (3,) [m] of the first pieces of advice that have one, by their numbers."""
     centers = dict(zip(landmark_map.landmark_ids, landmark_map.centers, strict=True))
-    for number, advice in enumerate(report.to_do[:_FIRST_ADVICE], start=1):
-        place = (centers[advice.landmarks[0]] if advice.landmarks
-                 else None if advice.view is None else advice.view.position)
-        if place is not None:
-            axes.text(place[0], place[1], str(number), fontsize=10, fontweight='bold', zorder=10,
-                      color='white', ha='center', va='center', bbox={
-                          'boxstyle': 'circle,pad=0.25', 'facecolor': _INK, 'edgecolor': 'white'})
+    places = {number: centers[advice.landmarks[0]] if advice.landmarks
+              else None if advice.view is None else advice.view.position
+              for number, advice in enumerate(report.to_do[:_FIRST_ADVICE], start=1)}
+    return {number: place for number, place in places.items() if place is not None}
 
 
 def _draw_landmarks(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) -> None:
@@ -294,13 +257,13 @@ def _draw_landmarks(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) 
     for check in [check for check in report.landmarks if check.faults][:_MOST_NAMES]:
         figures.write_name(axes, check.center[:2], check.landmark_id)
     trials = report.recording.trials if report.recording is not None else ()
-    axes.set_title('Landmarks and recorded frames' if trials else 'Landmarks', fontsize=12)
+    axes.set_title('Landmarks and recorded views' if trials else 'Landmarks', fontsize=12)
     for verdict, (color, marker) in _MARKERS.items() if trials else ():
         chosen = [trial for trial in trials if trial.verdict == verdict]
         tips, forward = (np.reshape([getattr(trial, name)[:2] for trial in chosen], (-1, 2)).T
                          for name in ('position', 'forward'))
         axes.plot(*tips, marker, color=color, markersize=5, zorder=6, label=(
-            f'frame {verdict} ({len(chosen)})'))
+            f'view {verdict} ({len(chosen)})'))
         axes.quiver(*tips, *forward, color=color, angles='xy', scale=25.0, width=0.004, zorder=5)
         for trial in chosen if verdict == 'misled' else ():
             axes.plot(*np.array([trial.position, trial.estimate]).T[:2], color=color, zorder=7)

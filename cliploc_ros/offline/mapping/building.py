@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import MappingError
+from cliploc_ros.errors import MappingError, counted
 from cliploc_ros.offline.mapping import evidence, joint, triangulation
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
 from cliploc_ros.offline.mapping.doubles import close_pairs, merge_doubles, resolve_doubles
@@ -42,7 +42,6 @@ _SETTLING_ROUNDS = 3
 # landmarks before each rebuild, and after the last one.
 _REBUILDS = 1
 REFINEMENTS = 3
-_REASONS_SHOWN = 10
 #: A map that explains a smaller share of the boxes of its classes is refused. Chosen: valid
 #: recordings of a few frames reach .3, poses that are off by a metre .2.
 LEAST_EXPLAINED = 0.2
@@ -90,14 +89,11 @@ def rounded(center: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def left_out_lines(left_out: Sequence[LeftOut]) -> list[str]:
-    """Describe the landmarks that are left out, in lines."""
-    rows = [f'left out: {len(left_out)}'] if left_out else []
-    rows += [f'  {landmark.class_id} at {landmark.center[0]:.2f} {landmark.center[1]:.2f} '
-             f'{landmark.center[2]:.2f} with {landmark.support} frames: {landmark.reason}'
-             for landmark in left_out[:_REASONS_SHOWN]]
-    if len(left_out) > _REASONS_SHOWN:
-        rows.append(f'  and {len(left_out) - _REASONS_SHOWN} more')
-    return rows
+    """Describe the landmarks that are left out, by reason: one line, or none."""
+    kinds = Counter(landmark.reason.partition(':')[0] for landmark in left_out)
+    counts = ', '.join(f'{kind} ({count})' for kind, count in kinds.most_common())
+    return [f'{counted(len(left_out), "landmark")} left out: {counts}; --report names each'
+            ] if left_out else []
 
 
 @dataclass(frozen=True)
@@ -123,13 +119,13 @@ class MappingReport:
     def lines(self) -> list[str]:
         """Return the report as text."""
         if not self.landmarks:
-            return [f'keyframes only: no landmark from {self.frames} frames with {self.boxes} '
-                    'boxes; a robot is localized by keyframes alone, near the recorded views',
+            return [f'no landmark from {self.frames} frames with {counted(self.boxes, "box")}: '
+                    'the map consists of keyframes',
                     *(f'note: {note}' for note in self.notes), *left_out_lines(self.left_out)]
-        rows = [f'{self.landmarks} landmarks from {self.frames} frames of {self.viewpoints} '
-                f'viewpoints with {self.boxes} boxes',
-                f'explained boxes: {self.explained:.1%}, median IoU {self.median_iou:.3f} '
-                '(on the frames used for fitting)']
+        rows = [f'{counted(self.landmarks, "landmark")} from {self.frames} frames of '
+                f'{counted(self.viewpoints, "viewpoint")} with {counted(self.boxes, "box")}',
+                f'boxes that landmarks fitted to them explain: {self.explained:.0%}, median IoU '
+                f'{self.median_iou:.2f}']
         if self.pose_change_m > 0.0:
             rows.append(f'poses refined by {self.pose_change_m * 100:.1f} cm and '
                         f'{self.pose_change_deg:.2f} degrees (root mean square)')
@@ -193,16 +189,14 @@ def build_map(detections: PosedDetections, options: MappingOptions | None = None
     moving = Counter(name for name in np.array(detections.class_names)[detections.classes].tolist()
                      if options.moves(name))
     if moving:
-        notes.append(f'{moving.total()} boxes of {", ".join(sorted(moving))} are not landmarks, '
-                     'as these classes move')
+        notes.append(f'{counted(moving.total(), "box")} of {", ".join(sorted(moving))} left out: '
+                     'such objects move')
     if len(draft.landmarks.centers) == 0:
         why = ('boxes of one class do not meet in space; check that poses and stamps belong to '
                'these images, that the poses are of the camera (z forward), and the intrinsics')
         if draft.left_out:
-            kinds = Counter(landmark.reason.partition(':')[0] for landmark in draft.left_out)
-            counts = ', '.join(f'{count} {kind}' for kind, count in kinds.most_common())
-            why = (f'no landmark is good enough for a map; {len(left_out)} were left out '
-                   f'({counts}); move the camera past the objects, or map images with depth')
+            why = (f'no landmark is good enough for a map; {left_out_lines(left_out)[0]}; move '
+                   'the camera past the objects, or map images with depth')
         raise NothingFoundError(why, left_out)
     landmarks, shown = _one_of_each(views, draft.landmarks)
     quality = evidence.explained_boxes(views, landmarks, shown)

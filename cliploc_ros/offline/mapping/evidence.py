@@ -132,10 +132,10 @@ def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOpti
     viewpoints, ratio = evidence.viewpoints[number], evidence.seen_ratio[number]
     baseline, sigma = evidence.baseline_deg[number], evidence.position_sigma[number]
     if viewpoints < options.min_viewpoints:
-        return f'seen from {viewpoints} viewpoints, fewer than {options.min_viewpoints}'
+        return f'seen from too few viewpoints: {viewpoints}, fewer than {options.min_viewpoints}'
     if ratio < options.min_seen_ratio:
-        return f'seen in {_floor(100 * ratio)} % of the frames that show its place, less than ' \
-               f'{100 * options.min_seen_ratio:g} %: rarely detected, or moved'
+        return f'rarely detected, or moved: seen in {_floor(100 * ratio)} % of the frames that ' \
+               f'show its place, less than {100 * options.min_seen_ratio:g} %'
     if baseline < options.min_baseline_deg:
         return f'seen from one side only: {_floor(baseline)} degrees, less than ' \
                f'{options.min_baseline_deg:g}'

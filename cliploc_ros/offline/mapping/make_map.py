@@ -14,7 +14,7 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, removed_
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import load_removed, removed_path, write_landmarks, write_map
-from cliploc_ros.errors import MappingError, ModelError
+from cliploc_ros.errors import MappingError, ModelError, counted
 from cliploc_ros.files.storage import WriteOfSet
 from cliploc_ros.models.onnx_clip import ClipWeights, names_onnx, resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions
@@ -274,6 +274,4 @@ def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording
     if layer is None:
         return lines
     megabytes = layer_path(path).stat().st_size / 1e6
-    images = '' if layer.images is None else f' and images of {layer.images.size / 1e6:.1f} MB'
-    return [f'keyframes: {len(layer)} with {len(layer.points)} points{images}, {megabytes:.1f} MB '
-            f'({50 * megabytes / len(layer):.1f} MB per 50), in {layer_path(path)}']
+    return [f'{counted(len(layer), "keyframe")} of {megabytes:.1f} MB in {layer_path(path).name}']

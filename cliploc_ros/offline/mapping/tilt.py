@@ -53,42 +53,43 @@ def rotation_to_z(up: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     return Rotation.from_rotvec(np.radians(angle) * axis).as_matrix(), angle
 
 
-def find_tilt(poses: NDArray[np.float64], of_tf: bool = False
+def find_tilt(poses: NDArray[np.float64], of_robot: bool = False
               ) -> tuple[NDArray[np.float64], float] | None:
     """Return the rotation (3, 3) that turns z up, and its angle [deg].
 
-    The z axis of tf points up (REP 103), so there cameras may be mounted upside down. None if the
-    vertical of the poses (n, 4, 4) is unknown, see find_vertical.
+    The z axis of a robot's map points up (REP 103), and its cameras may be mounted upside down.
+    None if the vertical of the poses (n, 4, 4) is unknown, see find_vertical.
     """
     up = find_vertical(poses) if len(poses) else None
-    return None if up is None else rotation_to_z(-up if of_tf and up[2] < 0.0 else up)
+    return None if up is None else rotation_to_z(-up if of_robot and up[2] < 0.0 else up)
 
 
-def tilt_note(poses: NDArray[np.float64], of_tf: bool = False) -> str:
+def tilt_note(poses: NDArray[np.float64], of_robot: bool = False) -> str:
     """Return a note if z is off the vertical of the cameras, '' otherwise.
 
-    In tf the mount of the camera explains the tilt, see find_tilt.
+    The mount of a robot's camera explains the tilt, see find_tilt.
     """
-    found = find_tilt(poses, of_tf)
+    found = find_tilt(poses, of_robot)
     if found is None or found[1] < _MOST_TILT_DEG:
         return ''
-    if of_tf or found[1] > _UPSIDE_DOWN_DEG:
+    if of_robot or found[1] > _UPSIDE_DOWN_DEG:
         return (f'by the poses, the cameras are tilted by {found[1]:.0f} degrees: right if they '
                 'are mounted so, otherwise correct their mount') + (
-            '' if of_tf else '; if z of the poses points down, build_map --level turns it')
+            '' if of_robot else '; if z of the poses points down, build_map --level turns it')
     return (f'z is {found[1]:.0f} degrees off the vertical of the cameras: heights and views from '
-            'above are meaningless; build_map --level corrects it')
+            'above are meaningless; build_map --level corrects it, where the map need not fit '
+            "another one, such as AMCL's")
 
 
-def find_levelling(poses: NDArray[np.float64], is_wanted: bool, of_tf: bool = False
+def find_levelling(poses: NDArray[np.float64], is_wanted: bool, of_robot: bool = False
                    ) -> tuple[NDArray[np.float64], str]:
     """Return the rotation (3, 3) that turns z up, the identity unless it is wanted, and a note.
 
     DatasetError: it is wanted, but the vertical of the poses (n, 4, 4) is unknown.
     """
     if not is_wanted:
-        return np.eye(3), tilt_note(poses, of_tf)
-    found = find_tilt(poses, of_tf)
+        return np.eye(3), tilt_note(poses, of_robot)
+    found = find_tilt(poses, of_robot)
     if found is None:
         raise DatasetError('the vertical is unknown: the cameras turn too little, or were held on '
                            'their side; leave out `level`')

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.errors import MappingError
+from cliploc_ros.errors import MappingError, counted
 from cliploc_ros.offline.mapping.landmarks import group_boxes
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
@@ -187,6 +187,9 @@ class KeyframeOptions:
     angle_deg: float = 5.0
 
 
+_VIEWPOINT = KeyframeOptions()
+
+
 class KeyframeFilter:
     """Chooses keyframes among the frames of a camera, which are passed in order.
 
@@ -212,14 +215,15 @@ class KeyframeFilter:
         return True
 
 
-def number_viewpoints(detections: PosedDetections) -> NDArray[np.int64]:
+def number_viewpoints(detections: PosedDetections, spacing: KeyframeOptions = _VIEWPOINT
+                      ) -> NDArray[np.int64]:
     """Return the number of the viewpoint (F,) of each frame, ascending from 0, camera by camera.
 
-    A new viewpoint begins where a keyframe with the default spacing would: as soon as a frame
-    differs from the first frame of the current one by 10 cm or 5 degrees.
+    A new viewpoint begins where a keyframe would, by default as soon as a frame differs from the
+    first frame of the current one by 10 cm or 5 degrees.
     """
     poses, order = detections.map_from_camera, detections.by_camera
-    filters = [KeyframeFilter(KeyframeOptions()) for _ in detections.cameras]
+    filters = [KeyframeFilter(spacing) for _ in detections.cameras]
     is_new = [filters[detections.frame_cameras[frame]](0, 0, poses[frame]) for frame in order]
     viewpoints = np.zeros(len(poses), dtype=np.int64)
     viewpoints[order] = np.cumsum(is_new) - 1
@@ -237,8 +241,9 @@ def check_input(detections: PosedDetections, views: Views,
                            'its classes and its confidence threshold')
     viewpoints = int(views.viewpoints.max()) + 1
     if viewpoints < min_viewpoints:
-        raise MappingError(f'the camera took {viewpoints} viewpoints, at least {min_viewpoints} '
-                           'are needed; move it around the objects, and check the poses')
+        raise MappingError(f'the camera took {counted(viewpoints, "viewpoint")}, at least '
+                           f'{min_viewpoints} are needed; move it around the objects, and check '
+                           'the poses')
     jumps = np.sort(np.concatenate([
         _jumps(detections.map_from_camera[own], detections.stamps_s[own])
         for own in (views.cameras == number for number in range(len(detections.cameras)))]))

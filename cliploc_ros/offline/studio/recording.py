@@ -165,7 +165,7 @@ class Recording:
         """Return the relocalizer's answers in some views; MapError: there are no landmarks.
 
         Each view is an independent question to a new localizer, so that only edits change the
-        answers. Keyframes recorded at about the time of a view are not used for it.
+        answers. The keyframes of a view itself are not used for it.
         """
         keyframes = None
         if layer is not None and self.images is not None:
@@ -179,7 +179,7 @@ class Recording:
             localizer = Localizer(relocalizer)
             if keyframes is not None:
                 query = keyframes.with_image(query)
-                localizer = Localizer(relocalizer, keyframes.elsewhere(detections, view))
+                localizer = Localizer(relocalizer, keyframes.elsewhere(query.map_from_camera))
             answers[view] = relocalization.try_view(localizer, query, 0, options)
         return answers
 

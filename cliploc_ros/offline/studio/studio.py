@@ -226,7 +226,7 @@ class Studio:
                     'reload_robot')
 
     #: Options of the check, which then takes about a minute.
-    CHECK = CheckOptions(max_positions=100, headings=8, frames=60)
+    CHECK = CheckOptions(max_positions=100, headings=8, frames=30)
 
     def __init__(self, document: Document, recording: Recording | None = None,
                  layer: KeyframeLayer | None = None, walls: Walls | None = None):
@@ -458,16 +458,18 @@ class Studio:
         tell('', 0.0)
         with self.document.lock:
             landmarks, landmark_map = self.document.landmarks, self.document.to_map()
-        detections, image_of = None, None
+        detections, image_of, images = None, None, None
         if self.recording is not None and self.review.has_boxes:
             detections, image_of = self.recording.detections, self.recording.image
+            images = self.recording.images
         report = check_map(landmark_map, detections, options=replace(
-            self.CHECK, is_size_given=self.recording is not None and self.recording.is_size_given),
-            progress=tell, layer=self.layer)
+            self.CHECK, is_size_given=self.recording is not None and self.recording.is_size_given,
+            of_folder=images is not None and images.of_folder),
+            progress=tell, layer=self.layer, image_of=None if images is None else image_of)
         self.check_page = check_page(self.document.path.name, landmark_map, report, detections,
                                      image_of)
         self._checked = landmarks
-        return '; '.join([f'checked the map: {report.verdict}', *report.localized])
+        return '; '.join(['checked the map', *report.summary])
 
     def stop_check(self) -> None:
         """Stop the check of the map."""

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import MappingError
+from cliploc_ros.errors import MappingError, counted
 from cliploc_ros.offline.mapping.building import Progress
 from cliploc_ros.offline.mapping.check import findings, relocalization
 from cliploc_ros.offline.mapping.check.report import (
@@ -26,10 +26,10 @@ from cliploc_ros.offline.mapping.check.report import (
     CheckReport,
     GridCheck,
     RecordingCheck,
-    check_keyframes,
     find_measures,
+    in_reach,
 )
-from cliploc_ros.offline.mapping.evidence import BoxQuality, best_ious, explained_boxes
+from cliploc_ros.offline.mapping.evidence import BoxQuality, best_ious
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions, Thresholds
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import find_corrections
@@ -41,8 +41,8 @@ from cliploc_ros.offline.vocabulary.vocabulary import size_of_class
 _NOTES = (
     'similarities of crops and labels are simulated: labels of equal text look equal, and labels '
     'that share words look alike',
-    'the grid assumes that the map is correct and that walls hide only landmarks that were hidden '
-    'in the recording')
+    'the grid assumes that the map is correct, that walls hide only landmarks that were hidden in '
+    'the recording, and that keyframes localize where they are within reach')
 _NO_RECORDING = (
     'no recording: the detector is assumed to find 60 % of the objects in view within 5 m, in '
     'images of 640 x 480 px with a focal length of 525 px')
@@ -92,8 +92,10 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
     Raises
     ------
     MappingError
-        The recording does not fit this map; the message says what to correct.
+        The map is empty, or the recording does not fit it; the message says what to correct.
     """
+    if layer is None and not len(landmark_map):
+        raise MappingError('the map has neither landmarks nor keyframes: build it again')
     options, tell = options or CheckOptions(), progress or (lambda stage, share: None)
     notes, views, witness, recording = [*_NOTES], None, None, None
     recorded = None if detections is None else detections.map_from_camera
@@ -105,7 +107,7 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
         views = make_views(detections)
         notes += check_input(detections, views)
         witness = findings.hear_witness(views, landmark_map, detections.class_names)
-        if not (witness.shown >= 0).any():
+        if len(landmark_map) and not (witness.shown >= 0).any():
             raise MappingError(_unrelated(landmark_map, detections))
         model = relocalization.measure_detector(landmark_map, detections, views, witness)
         if len(detections.cameras) > 1:
@@ -115,30 +117,28 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
             landmark_map, detections, views, witness, options, tell,
             None if layer is None or image_of is None else relocalization.RecordedKeyframes(
                 layer, image_of))
-        notes += _notes_on(recording)
-    tilt = '' if detections is None else tilt_note(detections.map_from_camera)
-    notes.append(tilt or _where_cameras_can_be(recorded))  # a tilted map has no true heights
+    notes.append(_where_cameras_can_be(recorded))
     overlaps = findings.find_map_overlaps(landmark_map, witness, views)
-    places = findings.make_grid(landmark_map, None if detections is None else
+    path = None if layer is None else layer.map_from_camera
+    places = findings.make_grid(landmark_map, path if detections is None else
                                 detections.map_from_camera[detections.frame_cameras == 0], options)
     trials = relocalization.try_poses(model, landmark_map, places.poses, options,
                                       partial(tell, 'relocalizing on the grid'))
-    verdicts = np.array([trial.verdict for trial in trials], dtype=np.str_)
-    verdicts = verdicts.reshape(-1, options.headings)
-    grid = GridCheck(
-        **vars(places), accepted=(verdicts == 'accepted').sum(axis=1),
-        misled=(verdicts == 'misled').sum(axis=1), trials=tuple(trials), visible=np.array(
-            [model.expected_detections(pose) for pose in places.poses]).reshape(verdicts.shape))
+    of_headings = -1, options.headings
     report = CheckReport(
         landmarks=tuple(findings.check_landmarks(landmark_map, witness, overlaps)),
         overlaps=tuple(overlaps), look_alikes=tuple(findings.find_look_alikes(landmark_map)),
-        grid=grid, recording=recording,
-        notes=tuple(notes), map_ids=landmark_map.landmark_ids,
-        keyframes=None if layer is None else check_keyframes(layer, grid, recorded),
+        grid=GridCheck(**vars(places), trials=tuple(trials), by_objects=np.array(
+            [trial.verdict == 'accepted' for trial in trials], dtype=np.bool_
+        ).reshape(of_headings), by_keyframes=np.zeros(len(trials), dtype=np.bool_).reshape(
+            of_headings) if layer is None else in_reach(layer, places.poses).reshape(of_headings)),
+        recording=recording, notes=tuple(notes), map_ids=landmark_map.landmark_ids,
+        keyframes=0 if layer is None else len(layer),
+        tilt='' if recorded is None else tilt_note(recorded, not options.of_folder),
         scale=None if options.is_size_given else _scale_by_sizes(landmark_map))
     tell('done', 1.0)
-    return replace(report, to_do=tuple(give_advice(report)),
-                   measures=tuple(find_measures(report, thresholds or Thresholds())))
+    report = replace(report, measures=tuple(find_measures(report, thresholds or Thresholds())))
+    return replace(report, to_do=tuple(give_advice(report, options.of_folder)))
 
 
 def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
@@ -146,8 +146,8 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
                      keyframes: relocalization.RecordedKeyframes | None) -> RecordingCheck:
     tell('cross-validating', 0.0)
     folds, held_out = [], []
-    for fold in relocalization.make_folds(views, witness, options):
-        # a box whose landmark no other part of the recording shows does not test the map
+    for fold in relocalization.make_folds(detections, views, witness, options):
+        # a box whose landmark no other view shows does not test the map
         is_known = (witness.shown < 0) | np.isin(witness.shown, fold.rows)
         ious = best_ious(views, fold.landmarks)[np.isin(views.frames, fold.frames) & is_known]
         folds.append(fold)
@@ -160,10 +160,9 @@ def _check_recording(landmark_map: LandmarkMap, detections: PosedDetections, vie
         frames=len(detections), boxes=len(detections.classes),
         duration_s=float(detections.stamps_s[-1] - detections.stamps_s[0]),
         path_xyz=detections.map_from_camera[:, :3, 3],
-        as_given=explained_boxes(views, witness.landmarks),
-        held_out=BoxQuality.of(np.concatenate(held_out)),
-        trials=tuple(trials),
-        corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)))
+        held_out=BoxQuality.of(np.concatenate(held_out)), trials=tuple(trials),
+        corrections=tuple(find_corrections(detections, views, witness.fitted, witness.shown)),
+        has_images=keyframes is not None)
 
 
 def _where_cameras_can_be(recorded: NDArray[np.float64] | None) -> str:
@@ -174,18 +173,6 @@ def _where_cameras_can_be(recorded: NDArray[np.float64] | None) -> str:
     low, high = recorded[:, 2, 3].min(), recorded[:, 2, 3].max()
     return (f'{known}; recorded ones were {low:.2f} to {high:.2f} m high: set `height_range_m` to '
             f'[{low - _HEIGHT_MARGIN_M:.1f}, {high + _HEIGHT_MARGIN_M:.1f}] for their camera')
-
-
-def _notes_on(recording: RecordingCheck) -> list[str]:
-    """Return notes on the figures that cannot be judged by this recording."""
-    notes = []
-    if not recording.can_judge_boxes:
-        notes.append('cross-validation cannot judge boxes: other parts of the recording show the '
-                     f'objects of {recording.held_out.boxes} of {recording.as_given.boxes}')
-    if not recording.can_judge_frames:
-        notes.append(f'only {len(recording.judged)} of {len(recording.trials)} frames can be '
-                     'judged, so the verdict uses the grid alone; pass each place twice')
-    return notes
 
 
 def _scale_by_sizes(landmark_map: LandmarkMap) -> float | None:
@@ -218,26 +205,34 @@ def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:
             'have the same coordinate frame, and that the poses are of the camera (z forward)')
 
 
-def give_advice(report: CheckReport) -> list[Advice]:
-    """Return pieces of advice, each of one or two sentences."""
+def give_advice(report: CheckReport, of_folder: bool = False) -> list[Advice]:
+    """Return pieces of advice, each of one or two sentences; of_folder: see CheckOptions."""
     recorded = report.recording.trials if report.recording else ()
     misled = [trial for trial in (*recorded, *report.grid.trials)
               if trial.verdict == 'misled']
-    advice = [] if report.scale is None else [Advice(
-        f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
-        f'{"large" if report.scale > 1.0 else "small"} by the sizes of its objects: '
-        'check the unit of the poses, then the intrinsics')]
-    advice += _some([_on_look_alike(pair, misled) for pair in report.look_alikes],
-                    'pairs of places that look alike')
-    advice += [*_on_landmarks(report), *_on_corrections(report), *_on_misled(report, misled),
-               *_on_spans(report, recorded), *_on_grid(report)]
-    return advice or [Advice('nothing to do: the map reaches all thresholds that were checked')]
+    advice = [Advice(report.tilt)] * bool(report.tilt)
+    if report.scale is not None:
+        advice.append(Advice(
+            f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '
+            f'{"large" if report.scale > 1.0 else "small"} by the sizes of its objects: '
+            'check the unit of the poses, then the intrinsics'))
+    advice += [*_on_corrections(report, of_folder),
+               *_some([_on_look_alike(pair, misled) for pair in report.look_alikes],
+                      'pairs of places that look alike'), *_on_misled(report, misled)]
+    advice += [Advice(
+        f'objects alone localize {measure.part:.0f} of {measure.total:.0f} views: record more '
+        'objects, each from several sides, for other light and moved furniture')
+        for measure in report.measures
+        if measure.key == 'min_by_objects' and measure.is_missed and report.keyframes]
+    advice += [*_on_landmarks(report), *_on_spans(report, recorded), *_on_grid(report)]
+    return advice or [Advice('nothing to do: the map reaches all thresholds' if report.passed else
+                             'record the place again, with more views of its objects')]
 
 
 def _some(advice: Sequence[Advice], what: str, most: int = _MOST_OF_A_KIND) -> list[Advice]:
     """Return the first pieces of advice, and how many more there are."""
     more = len(advice) - most
-    return [*advice[:most], *[Advice(f'and {more} more {what}')] * (more > 0)]
+    return [*advice[:most], *[Advice(f'and {more} more of these: {what}')] * (more > 0)]
 
 
 def _on_look_alike(pair: findings.LookAlike, misled: Sequence[relocalization.Trial]) -> Advice:
@@ -250,8 +245,8 @@ def _on_look_alike(pair: findings.LookAlike, misled: Sequence[relocalization.Tri
              f'{abs(pair.turn_deg):.0f} degrees'
              if np.hypot(*np.subtract(pair.first, pair.second)[:2]) < _SAME_PLACE_M else
              f'the places around {_place(pair.first)} and {_place(pair.second)} look alike')
-    return Advice(f'{alike} ({matched} of {pair.landmarks} landmarks)'
-                  + (f', {mistaken} views near them are misled' if mistaken else '')
+    return Advice(f'{alike} ({matched} of {counted(pair.landmarks, "landmark")})'
+                  + (f', where {counted(mistaken, "view")} would mislead' if mistaken else '')
                   + f': {what_to_do}', pair.matched[0] if pair.matched else ())
 
 
@@ -261,9 +256,9 @@ def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
              for overlap in report.overlaps if overlap.is_duplicate]
     yield from _some([Advice(f'{" and ".join(pair)} are the same object: delete one of them', pair)
                       for pair in pairs], 'pairs of duplicates')
-    if report.recording is not None:
+    if report.recording is not None and report.landmarks:
         frames = float(np.median([landmark.support or 0 for landmark in report.landmarks]))
-        unexplained = 1.0 - report.recording.as_given.explained
+        unexplained = 1.0 - report.recording.held_out.explained
         if frames < _FEW_FRAMES and unexplained > _MANY_UNEXPLAINED:
             yield Advice(
                 f'record more views: {frames:.0f} frames show a landmark (median), {_FEW_FRAMES} '
@@ -275,29 +270,36 @@ def _on_landmarks(report: CheckReport) -> Iterator[Advice]:
         'landmarks with a serious fault: record the place again, and update the map')
 
 
-def _on_corrections(report: CheckReport) -> Iterator[Advice]:
+def _on_corrections(report: CheckReport, of_folder: bool) -> Iterator[Advice]:
     found = [result for result in (report.recording.corrections if report.recording else ())
              if result.is_significant]
-    if not found:
-        return
     # only one cause of one camera: its error makes other causes look wrong, too
-    best = max(found, key=lambda result: result.explained)
+    best = max(found, key=lambda result: result.explained, default=None)
+    if best is None or (best.cause == 'mount' and of_folder):
+        return
     changes = ', '.join(
         f'{result.name} by {result.value:+.2f} {result.unit} (± {result.deviation:.2f})'
         for result in sorted(found, key=lambda result: -result.effect_px)
         if (result.cause, result.explained) == (best.cause, best.explained))
-    others = sorted({result.cause for result in found} - {best.cause})
+    others = sorted({result.cause for result in found} - {best.cause, 'mount' * of_folder})
     then = f'; check again before you change the {" or the ".join(others)}' if others else ''
     yield Advice(f'{_REMEDIES[best.cause]}: the boxes fit better if you change {changes}{then}')
 
 
 def _on_misled(report: CheckReport, misled: Sequence[relocalization.Trial]) -> list[Advice]:
-    wrong = [trial for trial in misled if not _sees_double(trial.position, report.look_alikes)]
-    return _some([Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be '
-                         f'misled by {trial.error_m:.1f} m: map more distinct objects there, or '
-                         'raise min_confidence', view=trial)
-                  for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))],
-                 'views that mislead a robot', most=_MOST_MISLED)
+    sources = ['objects' if trial.result is None else trial.result.source for trial in misled]
+    by_keyframes = [trial for trial, source in zip(misled, sources, strict=True)
+                    if source != 'objects']
+    wrong = [trial for trial, source in zip(misled, sources, strict=True)
+             if source == 'objects' and not _sees_double(trial.position, report.look_alikes)]
+    advice = [Advice(f'keyframes mislead a robot in {counted(len(by_keyframes), "view")}: they '
+                     'contradict the poses of the recording; build the map again',
+                     view=by_keyframes[0])] if by_keyframes else []
+    return advice + _some([
+        Advice(f'a robot at {_place(trial.position)} looking {_heading(trial)} would be misled by '
+               f'{trial.error_m:.1f} m: map more distinct objects there, or raise min_confidence',
+               view=trial) for trial in sorted(wrong, key=lambda trial: -(trial.error_m or 0.0))],
+        'views that mislead a robot', most=_MOST_MISLED)
 
 
 def _on_spans(report: CheckReport, trials: Sequence[relocalization.Trial]) -> Iterator[Advice]:
@@ -315,29 +317,27 @@ def _on_spans(report: CheckReport, trials: Sequence[relocalization.Trial]) -> It
         if seen <= _FEW_LANDMARKS or not _sees_double(middle.position, report.look_alikes):
             what = 'record this side' if seen <= _FEW_LANDMARKS else (
                 'describe these objects better in their labels, or record this side again')
+            kind = middle.result and middle.result.refusal_kind
+            why = f' ({kind.value.replace("_", " ")})' if kind else ''
             yield Advice(
-                f'{what}: {len(run)} frames at {middle.stamp_s - (trials[0].stamp_s or 0.0):.0f} '
-                f's, around {_place(middle.position)} looking {_heading(middle)}, show {seen} '
-                'landmarks and none is accepted', view=middle)
+                f'{what}: {len(run)} views at {middle.stamp_s - (trials[0].stamp_s or 0.0):.0f} '
+                f's, around {_place(middle.position)} looking {_heading(middle)}, show '
+                f'{counted(seen, "landmark")} and none is accepted{why}', view=middle)
 
 
 def _on_grid(report: CheckReport) -> Iterator[Advice]:
-    """Yield advice on areas without an accepted heading, and on those without a keyframe."""
-    grid, keyframes = report.grid, report.keyframes
-    for rows in _areas(grid, np.nonzero(grid.is_near & (grid.accepted == 0))[0])[:_MOST_OF_A_KIND]:
+    """Yield advice on areas without a heading that localizes a robot."""
+    grid = report.grid
+    is_dead = grid.is_near & (grid.localized == 0)
+    for rows in _areas(grid, np.nonzero(is_dead)[0])[:_MOST_OF_A_KIND]:
         if np.mean([_sees_double(position, report.look_alikes)
                     for position in grid.positions[rows]]) <= 0.5:
-            reached = keyframes is not None and (keyframes.headings[rows] > 0).all()
-            yield Advice(
-                f'no heading is accepted by objects at {_area(grid, rows)}'
-                f'{", only keyframes reach them" if reached else ""}: a view from there shows '
-                f'{int(grid.visible[rows].max())} landmarks at most; map more objects there',
-                view=grid.trials[int(rows[0] * grid.headings + grid.visible[rows[0]].argmax())])
-    if keyframes is not None:
-        yield from _some([
-            Advice(f'no keyframe is within reach of {_area(grid, rows)}: drive there when you '
-                   'record again, or rely on the landmarks')
-            for rows in _areas(grid, keyframes.without)], 'areas that no keyframe reaches')
+            views = [grid.trials[row * grid.headings + heading]
+                     for row in rows for heading in range(grid.headings)]
+            best = max(views, key=lambda trial: trial.landmarks)
+            yield Advice(f'no heading localizes a robot at {_area(grid, rows)}: the best view '
+                         f'there shows {counted(best.landmarks, "landmark")}; drive there and map '
+                         'more objects', view=best)
 
 
 def _sees_double(position: NDArray[np.float64], pairs: Sequence[findings.LookAlike]) -> bool:
@@ -358,8 +358,8 @@ def _areas(grid: GridCheck, dead: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 
 def _area(grid: GridCheck, rows: NDArray[np.int64]) -> str:
     low, high = grid.positions[rows].min(axis=0), grid.positions[rows].max(axis=0)
-    return (f'{len(rows)} positions near the recording, x {low[0]:.1f} to {high[0]:.1f}, y '
-            f'{low[1]:.1f} to {high[1]:.1f}')
+    return (f'{len(rows)} positions, x {low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to '
+            f'{high[1]:.1f}')
 
 
 def _place(point: NDArray[np.float64] | tuple[float, ...]) -> str:

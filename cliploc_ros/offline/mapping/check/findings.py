@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from cliploc_ros.core.acceptance.look_alikes import find_alike
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import misspelt_classes
+from cliploc_ros.errors import counted, misspelt_classes
 from cliploc_ros.offline.mapping import evidence
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.doubles import close_pairs, find_doubles
@@ -81,7 +81,6 @@ class LandmarkCheck:
     overlaps: tuple[tuple[str, float], ...]
     faults: tuple[str, ...] = ()  #: The faults and what to do, the worst first
     severity: float = 0.0  #: 0: nothing; 1 and more: a serious fault
-    weight: float = 1.0  #: Number of frames it was mapped from; 1 for all if unknown
 
 
 class Witness(NamedTuple):
@@ -136,10 +135,8 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
     for overlap in overlaps:
         partners[overlap.first].append((overlap.second, overlap))
         partners[overlap.second].append((overlap.first, overlap))
-    supports = [detail.support for detail in landmark_map.details]
     misspelt = (misspelt_classes(classes, shipped_classes()) if witness is None
                 else misspelt_classes(classes, witness.class_names, all_known=True))
-    weights = np.array(supports if all(supports) else [], dtype=np.float64)
     checks = []
     for row, others in enumerate(partners):
         semi_axes = landmark_map.semi_axes[row]
@@ -174,8 +171,7 @@ def check_landmarks(landmark_map: LandmarkMap, witness: Witness | None,
         faults.sort(key=lambda fault: -fault[0])
         checks.append(replace(
             check, faults=tuple(text for _, text in faults),
-            severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0,
-            weight=float(weights[row]) if len(weights) else 1.0))
+            severity=faults[0][0] + 0.05 * (len(faults) - 1) if faults else 0.0))
     return sorted(checks, key=lambda check: (
         -check.severity, 1.0 if check.seen_ratio is None else check.seen_ratio))
 
@@ -206,13 +202,12 @@ def _support_faults(check: LandmarkCheck, size_m: float) -> list[tuple[float, st
     support, expected, ratio = check.support, check.expected, check.seen_ratio
     if support == 0:
         if expected is not None and expected < _MIN_EXPECTED:
-            return [(0.5, f'was in view in {expected} frames: record this place')]
+            return [(0.5, f'was in view in {counted(expected, "frame")}: record this place')]
         return [(1.4, f'is never detected, although {expected} frames should show it: delete it '
                       'if it is gone, or map again')]
     faults = []
     if support is not None and support < MappingOptions.min_viewpoints:
-        frames = 'frame' if support == 1 else 'frames'
-        faults.append((1.1, f'was seen in {support} {frames}: record it from more sides'))
+        faults.append((1.1, f'was seen in {counted(support, "frame")}: record it from more sides'))
     if ratio is not None and ratio < MappingOptions.min_seen_ratio:
         faults.append((1.2, f'is detected in {ratio:.1%} of the frames that should show it: '
                             'delete it if it has moved, or is hard to detect'))
@@ -252,12 +247,15 @@ def make_grid(landmark_map: LandmarkMap, recorded: NDArray[np.float64] | None,
     Parameters
     ----------
     recorded : ndarray (F, 4, 4), optional
-        Poses map_from_camera of a recording, which determine height, pitch and extent.
+        Poses map_from_camera of a recording, or of keyframes, which determine height, pitch and
+        extent.
     """
-    low, high = np.quantile(landmark_map.centers, [_OUTLYING, 1.0 - _OUTLYING], axis=0)
+    centers = landmark_map.centers if len(landmark_map) or recorded is None else (
+        recorded[:, :3, 3])
+    low, high = np.quantile(centers, [_OUTLYING, 1.0 - _OUTLYING], axis=0)
     if recorded is None:
         margin, pitch_deg = _GUESSED_MARGIN_M, _GUESSED_PITCH_DEG
-        height = float(np.median(landmark_map.centers[:, 2])) + _GUESSED_HEIGHT_M
+        height = float(np.median(centers[:, 2])) + _GUESSED_HEIGHT_M
         path = None
     else:
         path = recorded[:, :3, 3]

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Relocalize recorded frames and simulated frames in a map.
 
-Cross-validation over time: recorded frames are judged with landmarks fitted to other blocks of the
-recording. One localizer gets the frames of a fold in order, as on a robot, so that its evidence
-about cameras accumulates. Simulated frames have the errors of the recording's detector; each is an
-independent question to a new localizer, such as that of a robot that wakes up there.
+Cross-validation: recorded frames are judged without their own view, with landmarks fitted to the
+other views, and with the keyframes of the other views. One localizer gets the frames of a fold in
+order, as on a robot, so that its evidence about cameras accumulates. Simulated frames have the
+errors of the recording's detector; each is an independent question to a new localizer, such as
+that of a robot that wakes up there.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.geometry.transforms import SAME_BOXES, pose_error
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer
@@ -31,16 +32,14 @@ from cliploc_ros.offline.mapping.fitting import fit_landmarks, linearize_boxes
 from cliploc_ros.offline.mapping.landmarks import Landmarks, group_boxes
 from cliploc_ros.offline.mapping.options import CheckOptions, MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.views import Views
+from cliploc_ros.offline.mapping.views import KeyframeOptions, Views, number_viewpoints
 from cliploc_ros.offline.posed_query import PosedQuery, ask
 from cliploc_ros.units import NS_PER_S
 
 _MAX_SAMPLED_FRAMES = 600
 _CLUTTER_IOU = 0.1
-# Half a block of cross-validation.
-_SAME_TIME_S = 0.5 * CheckOptions.block_s
-#: A pose needs this number of landmarks.
-LANDMARKS_FOR_A_POSE = 3
+# Frames that differ by less from the first of a view belong to this view.
+_VIEW = KeyframeOptions(SAME_BOXES.distance_m, SAME_BOXES.angle_deg)
 
 Verdict = Literal['accepted', 'refused', 'misled']
 Tell = Callable[[float], None]
@@ -64,10 +63,9 @@ class RecordedKeyframes(NamedTuple):
     layer: KeyframeLayer
     image_of: ImageOf
 
-    def elsewhere(self, detections: PosedDetections, frame: int) -> KeyframeLocalizer | None:
-        """Return the keyframes that are not near a frame in time; None if there are none."""
-        is_other = np.abs(detections.stamps_s[_frames_of(self.layer, detections)]
-                          - detections.stamps_s[frame]) > _SAME_TIME_S
+    def elsewhere(self, pose: NDArray[np.float64]) -> KeyframeLocalizer | None:
+        """Return the keyframes of other views than that of a pose; None if there are none."""
+        is_other = ~SAME_BOXES.agreeing(self.layer.map_from_camera, pose[None])[:, 0]
         return KeyframeLocalizer(self.layer.select(is_other)) if is_other.any() else None
 
     def with_image(self, query: PosedQuery) -> PosedQuery:
@@ -76,38 +74,25 @@ class RecordedKeyframes(NamedTuple):
         return query if image is None else replace(query, image=partial(np.asarray, image))
 
 
-def make_folds(views: Views, witness: Witness, options: CheckOptions) -> Iterator[Fold]:
+def make_folds(detections: PosedDetections, views: Views, witness: Witness, options: CheckOptions
+               ) -> Iterator[Fold]:
     """Yield the folds of a recording, each with the map fitted to the other folds.
 
-    Blocks of time are assigned to the folds in turn, at least one to each. A landmark that fits
-    its
-    boxes is fitted again, to the boxes outside the fold; it is left out if they are too few. A
-    landmark that does not fit its boxes, or has none, is unchanged,
-    as a robot would use it.
+    Views are assigned to the folds in turn. A landmark that fits its boxes is fitted again, to the
+    boxes outside the fold; it is left out if they are too few. A landmark that does not fit its
+    boxes, or has none, is unchanged, as a robot would use it.
     """
-    stamps_s = views.stamps_s
-    elapsed = stamps_s - stamps_s[0]
-    block_s = min(options.block_s, max(float(elapsed[-1]), 1e-9) / options.folds)
-    of_frames = (elapsed / block_s).astype(np.int64) % options.folds
-    gap_s = min(options.gap_s, 0.25 * float(elapsed[-1]) / options.folds)
+    of_frames = number_viewpoints(detections, _VIEW) % options.folds
     fits = witness.gathered.median_iou >= MIN_MEDIAN_IOU
-    for number in range(options.folds):
-        judged = np.nonzero(of_frames == number)[0]
-        if len(judged) == 0:
-            continue
-        # frames within a gap of a judged frame are not used for fitting
-        times = stamps_s[judged]
-        after = np.searchsorted(times, stamps_s).clip(0, len(times) - 1)
-        nearest = np.minimum(np.abs(times[after] - stamps_s),
-                             np.abs(times[(after - 1).clip(0)] - stamps_s))
-        training = nearest > gap_s
+    for number in np.unique(of_frames):
+        training = of_frames != number
         shown = np.where(training[views.frames], witness.shown, -1)
         is_enough = np.array([len(np.unique(views.viewpoints[views.frames[rows]]))
                               for rows in group_boxes(shown, len(fits))]
                              ) >= MappingOptions.min_viewpoints
         fitted = fit_landmarks(views, witness.landmarks, shown, among=fits & is_enough)
         kept = is_enough | ~fits
-        yield Fold(judged, np.nonzero(kept)[0], fitted.select(kept), training)
+        yield Fold(np.nonzero(~training)[0], np.nonzero(kept)[0], fitted.select(kept), training)
 
 
 def measure_detector(landmark_map: LandmarkMap, detections: PosedDetections, views: Views,
@@ -166,10 +151,10 @@ class Trial:
     error_m: float | None
     reason: str  #: Of a refusal
     stamp_s: float | None = None  #: Of a recorded frame [s]
-    #: Of a recorded frame: the verdict without keyframes, if they were used; and whether the other
-    #: frames show enough of its objects to judge the map by it
-    by_objects: Verdict | None = None
-    is_judged: bool = True
+    #: Whether an accepted right pose follows from objects alone (of a recorded frame), and from
+    #: keyframes alone
+    by_objects: bool = False
+    by_keyframes: bool = False
     result: Relocalization | None = None  #: The complete result
 
 
@@ -202,31 +187,29 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
     taken_at = None if keyframes is None else _frames_of(keyframes.layer, detections)
     trials: list[Trial] = []
     for fold in folds:
-        frames = [frame for frame in fold.frames.tolist() if frame in chosen]
-        if not frames:
-            continue
-        semi_axes, quats_xyzw = fold.landmarks.axes_and_quats()
-        relocalizer = make_relocalizer(replace(
-            landmark_map.select(fold.rows.tolist()), centers=fold.landmarks.centers,
-            semi_axes=semi_axes, quats_xyzw=quats_xyzw), options)
-        of_objects, of_both = Localizer(relocalizer), None
+        columns = {name: getattr(landmark_map, name).copy()
+                   for name in ('centers', 'semi_axes', 'quats_xyzw')}
+        for column, fitted in zip(columns.values(), (
+                fold.landmarks.centers, *fold.landmarks.axes_and_quats()), strict=True):
+            column[fold.rows] = fitted
+        whole = replace(landmark_map, **columns)
+        of_objects, of_both = Localizer(make_relocalizer(
+            whole.select(fold.rows.tolist()), options)), None
         if keyframes is not None and fold.training[taken_at].any():
-            of_both = Localizer(relocalizer, KeyframeLocalizer(
+            # with all landmarks, since those of places that look alike refuse keyframes, too
+            of_both = Localizer(make_relocalizer(whole, options), KeyframeLocalizer(
                 keyframes.layer.select(fold.training[taken_at])))
-        for frame in frames:
+        for frame in sorted(chosen.intersection(fold.frames.tolist())):
             tell((len(trials) + 1) / len(chosen))
             seen = shown[slice(*detections.frame_offsets[frame:frame + 2])]
-            count, known = int((seen >= 0).sum()), int(np.isin(seen, fold.rows).sum())
             query = simulated(detections, frame, shown, labels, options.random_seed)
-            query = replace(query, observation=replace(query.observation, similarities=np.asarray(
-                query.observation.similarities)[:, fold.rows]))
-            trial = try_view(of_objects, query, count, options)
+            trial = alone = try_view(of_objects, replace(query, observation=replace(
+                query.observation, similarities=np.asarray(
+                    query.observation.similarities)[:, fold.rows])), int((seen >= 0).sum()),
+                options)
             if of_both is not None and keyframes is not None:
-                query = keyframes.with_image(query)
-            if of_both is not None and query.image is not None:
-                trial = replace(try_view(of_both, query, count, options),
-                                by_objects=trial.verdict)
-            trials.append(replace(trial, is_judged=known >= min(LANDMARKS_FOR_A_POSE, count)))
+                trial = try_view(of_both, keyframes.with_image(query), alone.landmarks, options)
+            trials.append(replace(trial, by_objects=alone.verdict == 'accepted'))
     return sorted(trials, key=lambda trial: trial.stamp_s or 0.0)
 
 
@@ -272,13 +255,10 @@ def count_verdicts(trials: Sequence[Trial]) -> dict[str, int]:
 
 
 def refused_spans(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
-    """Yield the runs of recorded frames without an accepted right pose, the longest first.
-
-    A frame that cannot be judged ends a run as well.
-    """
+    """Yield the runs of recorded frames without an accepted right pose, the longest first."""
     runs: list[list[Trial]] = [[]]
     for trial in trials:
-        if trial.verdict == 'accepted' or not trial.is_judged:
+        if trial.verdict == 'accepted':
             runs.append([])
         else:
             runs[-1].append(trial)
@@ -302,6 +282,8 @@ def try_view(localizer: Localizer, query: PosedQuery, landmarks: int, options: C
     verdict: Verdict = 'refused'
     if result.accepted and error_m is not None:
         verdict = 'misled' if error_m > options.wrong_m else 'accepted'
+    by_points = 0.0 if result.evidence is None else result.evidence.by_points
     return Trial(verdict, pose[:3, 3], pose[:3, 2], len(observation.detections), landmarks,
                  None if estimate is None else estimate[:3, 3], error_m, result.reason,
-                 observation.stamp_ns / NS_PER_S, result=result)
+                 observation.stamp_ns / NS_PER_S, result=result, by_keyframes=(
+                     verdict == 'accepted' and by_points >= options.relocalizer.min_confidence))
