@@ -15,6 +15,7 @@ from tqdm import tqdm
 from cliploc_ros import command
 from cliploc_ros.command import option
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.offline.datasets.bag_messages import ODOMETRY
 from cliploc_ros.offline.datasets.bags import BagReader
 from cliploc_ros.units import NS_PER_S
 
@@ -26,6 +27,7 @@ NODE_NAME = 'replay'
 EPILOG = """\
 examples:
   replay office --clock --wait-for-subscribers /image
+  replay office --loop --stand
   replay office --rate 0.5 --topics /image /camera_info --remap /image:=/camera/image
 """
 
@@ -49,6 +51,9 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '-r --rate X', 'speed: 2 is twice as fast as recorded (default: 1)',
            command.positive, 1.0)
     option(parser, '-l --loop', 'begin again at the end')
+    option(parser, '--stand S', 'let the robot stand for S seconds (default: 20) after every 3 s '
+           'of its drive: a robot that drives is not relocalized', command.positive, 0.0,
+           nargs='?', const=20.0)
     option(parser, '--start-offset S', 'begin S seconds after the start of the recording',
            command.not_negative, 0.0)
     option(parser, '--topics TOPIC', 'publish only these (default: all)', _absolute, nargs='+')
@@ -94,7 +99,7 @@ def replay(args: list[str], stop: command.Interruption) -> int:
             player = Player(node, reader, PlayOptions(
                 rate=options.rate, start_offset_s=options.start_offset, topics=options.topics,
                 exclude=options.exclude, remap=dict(options.remap), clock_hz=options.clock,
-                loop=options.loop), stop)
+                loop=options.loop, stand_s=options.stand), stop)
         except InvalidTopicNameException as error:
             raise OptionsError(f'--remap: {error}') from error
         return _play(player, options, stop)
@@ -107,11 +112,14 @@ def _play(player: 'Player', options: argparse.Namespace, stop: command.Interrupt
         print(f'not replayed: {topic.name}: {topic.msgtype} is not installed; '
               f'apt install ros-jazzy-{topic.msgtype.partition("/")[0].replace("_", "-")}, or '
               'source ROS', flush=True)
-    length_s = (player.end_ns - player.start_ns) / NS_PER_S
-    print(f'replaying {options.bag}: {len(player.topics)} topics, {length_s:.1f} s '
+    for topic in player.topics:
+        if topic.msgtype == ODOMETRY and not options.stand:
+            print(f'note: the robot of {topic.name} drives, so its poses are withheld until it '
+                  'stops: --stand lets it stop', flush=True)
+    print(f'replaying {options.bag}: {len(player.topics)} topics, {player.length_s:.1f} s '
           f'at rate {options.rate:g}', flush=True)
     begin = time.monotonic()
-    with tqdm(total=length_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
+    with tqdm(total=player.length_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
               disable=None) as bar:  # draws on a terminal only
         counts, passes, unread, late_s = player.play(lambda message: bar.update(
             (message.stamp_ns - player.start_ns) / NS_PER_S - bar.n))

@@ -22,10 +22,21 @@ from rosgraph_msgs.msg import Clock
 
 from cliploc_ros.command import Interruption
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, BagTopic
+from cliploc_ros.offline.datasets.bag_messages import COMPRESSED_IMAGE, IMAGE, ODOMETRY, stamp_ns
+from cliploc_ros.offline.datasets.bags import (
+    BagMessage,
+    BagReader,
+    BagTopic,
+    deserialize,
+    typestore,
+)
 from cliploc_ros.units import NS_PER_S
 
 CLOCK_TOPIC = '/clock'
+#: Recorded time between two stands: a robot drives a metre or two.
+DRIVE_NS = 3 * NS_PER_S
+# Period of the messages while the robot stands.
+_STAND_NS = NS_PER_S // 5
 _POLL_S = 0.02
 #: Delay after a subscriber appears: it must discover this publisher too, and ROS does not report
 #: when it has.
@@ -54,6 +65,8 @@ class PlayOptions:
     clock_hz: float | None = None
     #: Start again at the end, until stopped.
     loop: bool = False
+    #: Let the robot stand for this time after every DRIVE_NS, see with_stands; 0: never.
+    stand_s: float = 0.0
 
 
 class Player:
@@ -68,7 +81,7 @@ class Player:
         self._reader, self._options, self._stop = reader, options, stop
         self.topics, self.without_type = _select_topics(reader, options)
         self.start_ns = reader.start_ns + round(options.start_offset_s * NS_PER_S)
-        self.end_ns = reader.end_ns
+        self.end_ns = self._last_ns = reader.end_ns
         if self.start_ns > self.end_ns:
             raise DatasetError(
                 f'{reader.path}: start offset {options.start_offset_s} s is after its end at '
@@ -76,6 +89,12 @@ class Player:
         self._publishers = {topic.name: create_publisher(
             node, topic, options.remap.get(topic.name, topic.name)) for topic in self.topics}
         self._clock = node.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock_hz else None
+
+    @property
+    def length_s(self) -> float:
+        """Return the length of a pass, about right with stands."""
+        return (self.end_ns - self.start_ns) / NS_PER_S * (
+            1.0 + self._options.stand_s * NS_PER_S / DRIVE_NS)
 
     def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
         """Wait until each topic, given by recorded name, has a subscriber; default: all topics.
@@ -123,7 +142,7 @@ class Player:
             if not self._options.loop:
                 break
             # The gap before the next pass is the mean interval of messages, and never 0.
-            length_ns = self.end_ns - self.start_ns
+            length_ns = max(self._last_ns, self.end_ns) - self.start_ns
             gap_ns = length_ns // max(played.total() - 1, 1) or NS_PER_S
             origin_ns += round((length_ns + gap_ns) / self._options.rate)
             messages = self._read_ahead()
@@ -149,6 +168,9 @@ class Player:
     def _read_ahead(self) -> Iterator[BagMessage]:
         """Open the messages and read the first one, so that opening files delays no message."""
         messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
+        if self._options.stand_s:
+            messages = with_stands(messages, {
+                topic.name: topic.msgtype for topic in self.topics}, self._options.stand_s)
         return chain(list(islice(messages, 1)), messages)
 
     def _play_once(self, messages: Iterator[BagMessage], origin_ns: int,
@@ -181,6 +203,7 @@ class Player:
             worst_lateness_s = max(worst_lateness_s, late_s(message.stamp_ns))
             self._publishers[message.topic].publish(message.data)
             counts[message.topic] += 1
+            self._last_ns = message.stamp_ns
             on_message(message)
         return counts, worst_lateness_s
 
@@ -194,6 +217,53 @@ class Player:
             self._publishers[message.topic].publish(message.data)
             counts[message.topic] += 1
         return counts
+
+
+def with_stands(messages: Iterable[BagMessage], types: Mapping[str, str], stand_s: float
+                ) -> Iterator[BagMessage]:
+    """Let the robot of a recording stand for a time, at an image after every DRIVE_NS.
+
+    A robot that drives is not relocalized. While it stands, the newest message of each topic with
+    a header, and the newest transform of each coordinate frame, are repeated with new stamps, and
+    odometry has no speed. All later messages are later by the time of the stands. `types` are
+    the types of the topics.
+
+    DatasetError: a message does not fit its type.
+    """
+    newest: dict[tuple[str, str], Any] = {}
+    late_ns, stop_ns, known = 0, 0, typestore().types
+    for message in messages:
+        kind, stop_ns = types[message.topic], stop_ns or message.stamp_ns + DRIVE_NS
+        content = deserialize(message.data, kind, message.topic) if kind in known else None
+        stamped = getattr(content, 'transforms', [content] if hasattr(content, 'header') else [])
+        for part in stamped:
+            _set_stamp(part, stamp_ns(part) + late_ns)
+            newest[message.topic, getattr(part, 'child_frame_id', '')] = part
+        yield BagMessage(message.topic, message.stamp_ns + late_ns,
+                         _serialized(content, kind) if stamped else message.data)
+        if message.stamp_ns < stop_ns or kind not in (IMAGE, COMPRESSED_IMAGE):
+            continue
+        for _ in range(max(round(stand_s * NS_PER_S / _STAND_NS), 1)):
+            late_ns, now_ns = late_ns + _STAND_NS, stamp_ns(content) + _STAND_NS
+            for (topic, _child), part in newest.items():
+                # cameras are synchronized; the stamps of transforms may be in the future
+                is_transform = hasattr(part, 'transform')
+                _set_stamp(part, stamp_ns(part) + _STAND_NS if is_transform else now_ns)
+                if types[topic] == ODOMETRY:
+                    for speed in (part.twist.twist.linear, part.twist.twist.angular):
+                        speed.x = speed.y = speed.z = 0.0
+                yield BagMessage(topic, message.stamp_ns + late_ns, _serialized(
+                    known[types[topic]](transforms=[part]) if is_transform else part,
+                    types[topic]))
+        stop_ns = message.stamp_ns + DRIVE_NS
+
+
+def _set_stamp(message: Any, stamp_ns: int) -> None:
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NS_PER_S)
+
+
+def _serialized(message: Any, kind: str) -> bytes:
+    return bytes(typestore().serialize_cdr(message, kind))
 
 
 def _select_topics(reader: BagReader, options: PlayOptions

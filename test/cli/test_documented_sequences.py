@@ -9,12 +9,13 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from rig_bag import camera_messages, tf_messages, write_messages
+from rig_bag import camera_messages, make, tf_messages, write_messages
 from test_doc_commands import PROJECT, commands_of, program_of
 from without_pytorch import hide_pytorch
 
@@ -22,6 +23,7 @@ from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import layer_path
 from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.datasets.bag_messages import ODOMETRY, pose_message
 from cliploc_ros.offline.datasets.folders import read_sequence
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 from demo import ASSETS
@@ -38,22 +40,37 @@ BOTH = pytest.mark.parametrize('drive', WHOLE, indirect=True)
 
 
 def write_drive(path, folder, every):
-    """Write the bag that the pages record: images, camera_info and the robot's tf."""
+    """Write the bag that doc/your_robot.md records: images, camera_info, odometry and tf."""
     sequence, camera, _ = read_sequence(folder, None)
     sequence, recorded = sequence.every(every), []
+    stamps = [stamp for stamp in sequence.stamps_ns if sequence.pose_at(stamp) is not None]
     for stamp, file in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
         pixels = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
         for one, topic in zip(camera_messages(stamp, pixels, camera, 'camera_optical_frame'),
                               ('/camera/image_raw', '/camera/camera_info'), strict=True):
             recorded.append((stamp, topic, *one[2:]))
-        pose = sequence.pose_at(stamp)
-        if pose is not None:
-            recorded += tf_messages([(stamp, np.eye(4))], 'map', 'odom')
-            recorded += tf_messages([(stamp, pose @ invert_transform(MOUNT))], 'odom',
-                                    'base_footprint')
+    drive = replace(sequence.trajectory, max_gap_ns=10**10)
+    for stamp in sorted({*stamps, *range(stamps[0], stamps[-1], 50_000_000)}):
+        odom_from_base = drive.pose_at(stamp) @ invert_transform(MOUNT)
+        recorded += tf_messages([(stamp, np.eye(4))], 'map', 'odom')
+        recorded += tf_messages([(stamp, odom_from_base)], 'odom', 'base_footprint')
+        recorded.append(odometry_message(stamp, odom_from_base))
     write_messages(path, [*recorded, *tf_messages(
         [(sequence.stamps_ns[0], MOUNT)], 'base_footprint', 'camera_optical_frame',
         '/tf_static')])
+
+
+def odometry_message(stamp, odom_from_base):
+    """Return a message of /odom of a robot that drives, for `write_messages`."""
+    pose, still = pose_message(stamp, 'odom', odom_from_base), (0.0, 0.0, 0.0)
+    twist = make('geometry_msgs/msg/Twist', **{
+        part: make('geometry_msgs/msg/Vector3', **dict(zip('xyz', values, strict=True)))
+        for part, values in (('linear', (0.5, 0.0, 0.0)), ('angular', still))})
+    return stamp, '/odom', ODOMETRY, make(
+        ODOMETRY, header=pose.header, child_frame_id='base_footprint', **{
+            name: make(f'geometry_msgs/msg/{name.title()}WithCovariance', **{name: value},
+                       covariance=np.zeros(36)) for name, value in (
+                           ('pose', pose.pose), ('twist', twist))})
 
 
 @pytest.fixture(scope='module')

@@ -356,7 +356,6 @@ class RobotStateSource:
             return None
         try:
             body = self.odometry.pose_at(image.stamp)
-            self.problems.pop('odometry', None)
             camera_from_body = from_frame if body.frame == image.frame_id else \
                 camera_from_base if body.frame == parameters.base_frame else \
                 from_frame @ self._lookup(image, body.frame, parameters)
@@ -367,6 +366,7 @@ class RobotStateSource:
         except NoTransformError as error:
             self._warn('odometry', f'localizing without odometry: {error}')
             return None
+        self.problems.pop('odometry', None)
         return body._replace(
             odom_from_frame=body.odom_from_frame @ invert_transform(camera_from_body),
             frame=image.frame_id)
@@ -376,10 +376,13 @@ class RobotStateSource:
         """Return camera_from_frame; wait for a frame only if it was known the last time."""
         timeout_s = 0.0 if frame in self._unknown else parameters.tf_timeout_s
         self._unknown.add(frame)
-        found = self.transforms.lookup(image.frame_id, frame, image.stamp, timeout_s)
+        found = self.transforms.lookup(image.frame_id, frame, image.stamp, timeout_s,
+                                       f'set base_frame to {frame}, and base_from_camera')
         self._unknown.discard(frame)
         return found
 
     def _warn(self, what: str, text: str) -> None:
+        """Log a problem that is new: tf2_ros that is missing lacks at each request."""
+        if text != self.problems.get(what):
+            self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)
         self.problems[what] = text
-        self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)
