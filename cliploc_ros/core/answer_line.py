@@ -3,63 +3,53 @@
 """The line that every program prints for an answer. Diagnostics and files have all figures."""
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
-from cliploc_ros.core.geometry.transforms import move_covariance
+from cliploc_ros.core.geometry.transforms import quaternion_from_transform
 from cliploc_ros.core.relocalizer import Relocalization
 
 
-class Place(NamedTuple):
-    """The pose of a robot or of its camera, and its standard deviations."""
+def figures_of_pose(pose: NDArray[np.float64], covariance: NDArray[np.float64], ahead: int
+                    ) -> dict[str, Any]:
+    """Return the figures of a pose (4, 4) as doc/interface.md describes them.
 
-    pose: NDArray[np.float64]  #: (4, 4): into the map
-    covariance: NDArray[np.float64]  #: (6, 6)
-    heading_deg: float  #: From the map's x axis towards y
-    position_m: float  #: Standard deviation of the position
-    turn_deg: float  #: Standard deviation of the rotation about z
-
-
-def place_of(found: Relocalization, camera_from_base: NDArray[np.float64], ahead: int = 0
-             ) -> Place:
-    """Return where the robot is by the best pose. `ahead` is the axis of its heading: 0, x.
-
-    For a camera, it is 2: the viewing direction.
+    `ahead` is the axis of the heading: 0 (x) of a robot, 2 (the viewing direction) of a camera.
     """
-    camera, covariance = found.map_from_camera, found.covariance
-    assert camera is not None and covariance is not None
-    pose = camera @ camera_from_base
-    covariance = move_covariance(covariance, pose[:3, 3] - camera[:3, 3])
-    ahead_xy = pose[:2, ahead]
-    return Place(pose, covariance, math.degrees(math.atan2(*ahead_xy[::-1])), math.sqrt(
-        np.trace(covariance[:3, :3])), math.degrees(math.sqrt(covariance[5, 5])))
+    x, y, z = pose[:3, 3].tolist()
+    return {'x [m]': x, 'y [m]': y, 'z [m]': z,
+            'orientation xyzw': ' '.join(map(repr, quaternion_from_transform(pose).tolist())),
+            'heading [deg]': math.degrees(math.atan2(pose[1, ahead], pose[0, ahead])),
+            'position deviation [m]': math.sqrt(np.trace(covariance[:3, :3])),
+            'heading deviation [deg]': math.degrees(math.sqrt(covariance[5, 5])),
+            'covariance': ' '.join(map(repr, covariance.ravel().tolist()))}
 
 
-def detail_of(found: Relocalization, frame_id: str, place: Place | None = None,
-              left_out: Sequence[str] = ()) -> str:
+def detail_of(found: Relocalization, frame_id: str, figures: Mapping[str, Any] | None = None
+              ) -> str:
     """Return the pose of an accepted answer and its evidence, or the reason of a refusal.
 
-    `frame_id` is that of the map, `place` that of the robot (default: of the camera). `left_out`
-    names the cameras without an image.
+    `frame_id` is that of the map, `figures` are those of the robot's pose, by default those of
+    the camera's pose.
     """
     if not found.accepted:
         return found.reason
-    pose, _, *others = place or place_of(found, np.eye(4), 2)
-    evidence, points = found.evidence, found.recognized
+    assert found.map_from_camera is not None and found.covariance is not None
+    evidence, points, depth = found.evidence, found.recognized, found.depth
     by = [f'{evidence.inliers} landmarks'] if evidence and found.source != 'keyframes' else []
     by += [f'{points.inliers} keyframe points'] if points and found.source != 'objects' else []
-    by += [f'the depth of {found.depth.objects}'] if found.depth and found.depth.is_passed else []
+    by += [f'the depth of {depth.objects}'] if depth and depth.is_passed else []
     by += ['the prior'] if evidence and evidence.prior else []
     images = len(found.frame_matches)
-    return ('x {:.2f} y {:.2f} z {:.2f} m in {}, heading {:.0f} deg; deviation {:.2f} m, '
-            '{:.1f} deg; by {}{}{}').format(
-                *pose[:3, 3], frame_id, *others, ', '.join(by),
-                f' in {images} images' if images > 1 else '',
-                f', without {", ".join(left_out)}' if left_out else '')
+    of = figures or figures_of_pose(found.map_from_camera, found.covariance, 2)
+    return (f'x {of["x [m]"]:.2f} y {of["y [m]"]:.2f} z {of["z [m]"]:.2f} m in {frame_id}, '
+            f'heading {of["heading [deg]"]:.0f} deg; deviation '
+            f'{of["position deviation [m]"]:.2f} m, {of["heading deviation [deg]"]:.1f} deg; by '
+            + ', '.join(by) + (f' in {images} images' if images > 1 else ''))
 
 
 def answer_line(verdict: str, detail: str, kind: RefusalKind | None = None,

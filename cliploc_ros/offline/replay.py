@@ -38,6 +38,8 @@ DRIVE_NS = 3 * NS_PER_S
 # Period of the messages while the robot stands.
 _STAND_NS = NS_PER_S // 5
 _POLL_S = 0.02
+# Pause between the passes of a loop.
+_GAP_S = 0.1
 #: Delay after a subscriber appears: it must discover this publisher too, and ROS does not report
 #: when it has.
 _DISCOVERY_S = 0.2
@@ -81,7 +83,7 @@ class Player:
         self._reader, self._options, self._stop = reader, options, stop
         self.topics, self.without_type = _select_topics(reader, options)
         self.start_ns = reader.start_ns + round(options.start_offset_s * NS_PER_S)
-        self.end_ns = self._last_ns = reader.end_ns
+        self.end_ns = reader.end_ns
         if self.start_ns > self.end_ns:
             raise DatasetError(
                 f'{reader.path}: start offset {options.start_offset_s} s is after its end at '
@@ -118,35 +120,26 @@ class Player:
         self._stop.wait(_DISCOVERY_S)
 
     def play(self, on_message: Callable[[BagMessage], None] = lambda message: None
-             ) -> tuple[Counter[str], int, int, float]:
+             ) -> tuple[Counter[str], int, float]:
         """Publish the messages, each at its time; `on_message` is called after each.
 
         Return the number of messages by recorded topic, of passes to the end of the recording, and
-        of messages that the recording lists but does not contain, and the greatest delay of a
-        message after its time [s]. DatasetError: the recording is damaged.
+        the greatest delay of a message after its time [s]. DatasetError: the recording is damaged.
         """
-        counts = self._publish_latched()
-        messages = self._read_ahead()
-        origin_ns = time.monotonic_ns()
-        passes, unread, worst_s = 0, 0, 0.0
+        counts, passes, worst_s = self._publish_latched(), 0, 0.0
         while not self._stop.is_set():
-            played, late_s = self._play_once(messages, origin_ns, on_message)
-            counts += played
-            worst_s = max(worst_s, late_s)
-            if self._stop.is_set():
+            messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
+            if self._options.stand_s:
+                messages = with_stands(messages, {
+                    topic.name: topic.msgtype for topic in self.topics}, self._options.stand_s)
+            # read the first message, so that opening files delays no message
+            messages = chain(list(islice(messages, 1)), messages)
+            played, late_s = self._play_once(messages, time.monotonic_ns(), on_message)
+            counts, worst_s = counts + played, max(worst_s, late_s)
+            passes += not self._stop.is_set()
+            if not self._options.loop or self._stop.wait(_GAP_S):
                 break
-            passes += 1
-            # the metadata do not count the messages after a start offset
-            unread = 0 if self.start_ns > self._reader.start_ns else max(
-                sum(topic.message_count for topic in self.topics) - played.total(), 0)
-            if not self._options.loop:
-                break
-            # The gap before the next pass is the mean interval of messages, and never 0.
-            length_ns = max(self._last_ns, self.end_ns) - self.start_ns
-            gap_ns = length_ns // max(played.total() - 1, 1) or NS_PER_S
-            origin_ns += round((length_ns + gap_ns) / self._options.rate)
-            messages = self._read_ahead()
-        return counts, passes, unread, worst_s
+        return counts, passes, worst_s
 
     def wait_for_acknowledgement(self, timeout_s: float) -> tuple[str, ...]:
         """Wait until all reliable subscribers have acknowledged all messages, or until stopped.
@@ -164,14 +157,6 @@ class Player:
                 return tuple(publisher.topic_name for publisher in waiting)
             self._stop.wait(_POLL_S)
         return ()
-
-    def _read_ahead(self) -> Iterator[BagMessage]:
-        """Open the messages and read the first one, so that opening files delays no message."""
-        messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
-        if self._options.stand_s:
-            messages = with_stands(messages, {
-                topic.name: topic.msgtype for topic in self.topics}, self._options.stand_s)
-        return chain(list(islice(messages, 1)), messages)
 
     def _play_once(self, messages: Iterator[BagMessage], origin_ns: int,
                    on_message: Callable[[BagMessage], None]) -> tuple[Counter[str], float]:
@@ -203,7 +188,6 @@ class Player:
             worst_lateness_s = max(worst_lateness_s, late_s(message.stamp_ns))
             self._publishers[message.topic].publish(message.data)
             counts[message.topic] += 1
-            self._last_ns = message.stamp_ns
             on_message(message)
         return counts, worst_lateness_s
 
@@ -255,7 +239,8 @@ def with_stands(messages: Iterable[BagMessage], types: Mapping[str, str], stand_
                 yield BagMessage(topic, message.stamp_ns + late_ns, _serialized(
                     known[types[topic]](transforms=[part]) if is_transform else part,
                     types[topic]))
-        stop_ns = message.stamp_ns + DRIVE_NS
+        # messages of the time of the image may still follow
+        late_ns, stop_ns = late_ns + _STAND_NS, message.stamp_ns + DRIVE_NS
 
 
 def _set_stamp(message: Any, stamp_ns: int) -> None:

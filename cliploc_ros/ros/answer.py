@@ -17,7 +17,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind, needed_confidence
-from cliploc_ros.core.answer_line import answer_line, detail_of, place_of
+from cliploc_ros.core.answer_line import answer_line, detail_of, figures_of_pose
+from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
 from cliploc_ros.files.storage import make_folder
@@ -111,23 +112,20 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
         'cameras': len(localized.query.frames), 'left out': ', '.join(localized.left_out),
         'prior': 0.0 if evidence is None else evidence.prior,
         **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in stages_ms.items()}}
-    answer = Answer(Verdict.REFUSED, found.reason, None, frame.received_at, localized.query,
-                    is_cut, stages_ms, sum(stages_ms.values()) / 1e3, map_hash,
+    left_out = f'; no image of {figures["left out"]}' if localized.left_out else ''
+    answer = Answer(Verdict.REFUSED, found.reason + left_out, None, frame.received_at,
+                    localized.query, is_cut, stages_ms, sum(stages_ms.values()) / 1e3, map_hash,
                     found.refusal_kind, header, figures)
     if not found.accepted:
         return answer
-    place = place_of(found, state.camera_from_base, 0 if parameters.base_frame else 2)
-    pose = pose_with_covariance_msg(header, place.pose, place.covariance)
-    p, q = pose.pose.pose.position, pose.pose.pose.orientation
-    return replace(
-        answer, verdict=Verdict.ACCEPTED, pose=pose, pose_figures={
-            'x [m]': p.x, 'y [m]': p.y, 'z [m]': p.z,
-            'orientation xyzw': f'{q.x} {q.y} {q.z} {q.w}',
-            'heading [deg]': f'{place.heading_deg:.2f}',
-            'position deviation [m]': f'{place.position_m:.4f}',
-            'heading deviation [deg]': f'{place.turn_deg:.3f}',
-            'covariance': ' '.join(map(repr, map(float, pose.pose.covariance)))},
-        detail=detail_of(found, header.frame_id, place, localized.left_out))
+    assert found.covariance is not None and found.map_from_camera is not None
+    map_from_base = found.map_from_camera @ state.camera_from_base
+    covariance = move_covariance(
+        found.covariance, map_from_base[:3, 3] - found.map_from_camera[:3, 3])
+    of_pose = figures_of_pose(map_from_base, covariance, 0 if parameters.base_frame else 2)
+    return replace(answer, verdict=Verdict.ACCEPTED, pose_figures=of_pose,
+                   pose=pose_with_covariance_msg(header, map_from_base, covariance),
+                   detail=detail_of(found, header.frame_id, of_pose) + left_out)
 
 
 def answer_msg(answer: Answer, node: str) -> DiagnosticArray:

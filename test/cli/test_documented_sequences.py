@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rig_bag import camera_messages, make, tf_messages, write_messages
+from rig_bag import camera_messages, odometry_message, tf_messages, write_messages
 from test_doc_commands import PROJECT, commands_of, program_of
 from without_pytorch import hide_pytorch
 
@@ -23,7 +23,6 @@ from cliploc_ros.cli.studio import make_parser, open_studio
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import layer_path
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.offline.datasets.bag_messages import ODOMETRY, pose_message
 from cliploc_ros.offline.datasets.folders import read_sequence
 from cliploc_ros.offline.datasets.poses import mount_from_numbers
 from demo import ASSETS
@@ -58,19 +57,6 @@ def write_drive(path, folder, every):
     write_messages(path, [*recorded, *tf_messages(
         [(sequence.stamps_ns[0], MOUNT)], 'base_footprint', 'camera_optical_frame',
         '/tf_static')])
-
-
-def odometry_message(stamp, odom_from_base):
-    """Return a message of /odom of a robot that drives, for `write_messages`."""
-    pose, still = pose_message(stamp, 'odom', odom_from_base), (0.0, 0.0, 0.0)
-    twist = make('geometry_msgs/msg/Twist', **{
-        part: make('geometry_msgs/msg/Vector3', **dict(zip('xyz', values, strict=True)))
-        for part, values in (('linear', (0.5, 0.0, 0.0)), ('angular', still))})
-    return stamp, '/odom', ODOMETRY, make(
-        ODOMETRY, header=pose.header, child_frame_id='base_footprint', **{
-            name: make(f'geometry_msgs/msg/{name.title()}WithCovariance', **{name: value},
-                       covariance=np.zeros(36)) for name, value in (
-                           ('pose', pose.pose), ('twist', twist))})
 
 
 @pytest.fixture(scope='module')
