@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -18,9 +17,6 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.datasets.bag_messages import ODOMETRY
 from cliploc_ros.offline.datasets.bags import BagReader
 from cliploc_ros.units import NS_PER_S
-
-if TYPE_CHECKING:
-    from cliploc_ros.offline.replay import Player
 
 NODE_NAME = 'replay'
 
@@ -91,7 +87,7 @@ def replay(args: list[str], stop: command.Interruption) -> int:
         from rclpy.exceptions import InvalidTopicNameException
         from rclpy.node import Node
     with command.running_ros(ros_args), BagReader(options.bag) as reader:
-        from cliploc_ros.offline.replay import Player, PlayOptions
+        from cliploc_ros.offline.replay import DRIVE_NS, Player, PlayOptions
 
         # Nothing spins this node, so it could not serve its parameters.
         node = Node(NODE_NAME, start_parameter_services=False)
@@ -102,35 +98,32 @@ def replay(args: list[str], stop: command.Interruption) -> int:
                 loop=options.loop, stand_s=options.stand), stop)
         except InvalidTopicNameException as error:
             raise OptionsError(f'--remap: {error}') from error
-        return _play(player, options, stop)
-
-
-def _play(player: 'Player', options: argparse.Namespace, stop: command.Interruption) -> int:
-    if options.wait_for_subscribers is not None:
-        player.wait_for_subscribers(options.wait_for_subscribers, options.wait_timeout)
-    for topic in player.without_type:
-        print(f'not replayed: {topic.name}: {topic.msgtype} is not installed; '
-              f'apt install ros-jazzy-{topic.msgtype.partition("/")[0].replace("_", "-")}, or '
-              'source ROS', flush=True)
-    for topic in player.topics:
-        if topic.msgtype == ODOMETRY and not options.stand:
-            print(f'note: the robot of {topic.name} drives, so its poses are withheld until it '
-                  'stops: --stand lets it stop', flush=True)
-    print(f'replaying {options.bag}: {len(player.topics)} topics, {player.length_s:.1f} s '
-          f'at rate {options.rate:g}', flush=True)
-    begin = time.monotonic()
-    with tqdm(total=player.length_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
-              disable=None) as bar:  # draws on a terminal only
-        counts, passes, late_s = player.play(lambda message: bar.update(
-            (message.stamp_ns - player.start_ns) / NS_PER_S - bar.n))
-    times = f', {passes} passes' if passes > 1 else ''
-    print(f'{"stopped: " if stop.is_set() else ""}published {counts.total()} messages on '
-          f'{len(counts)} topics in {time.monotonic() - begin:.1f} s{times}; '
-          f'at most {late_s * 1000:.1f} ms late', flush=True)
-    if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
-        print(f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all messages '
-              f'within {options.wait_for_all_acked:g} s', file=sys.stderr)
-    return 0
+        if options.wait_for_subscribers is not None:
+            player.wait_for_subscribers(options.wait_for_subscribers, options.wait_timeout)
+        for topic in player.without_type:
+            print(f'not replayed: {topic.name}: {topic.msgtype} is not installed; apt install '
+                  f'ros-jazzy-{topic.msgtype.partition("/")[0].replace("_", "-")}, or source ROS')
+        for topic in player.topics:
+            if topic.msgtype == ODOMETRY and not options.stand:
+                print(f'note: the robot of {topic.name} drives, so its poses are withheld until '
+                      'it stops: --stand lets it stop')
+        length_s = (player.end_ns - player.start_ns) / NS_PER_S
+        print(f'replaying {options.bag}: {len(player.topics)} topics, {length_s:.1f} s '
+              f'at rate {options.rate:g}', flush=True)
+        begin = time.monotonic()
+        total_s = length_s * (1.0 + options.stand * NS_PER_S / DRIVE_NS)
+        with tqdm(total=total_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
+                  disable=None) as bar:  # draws on a terminal only
+            counts, passes, late_s = player.play(lambda message: bar.update(
+                (message.stamp_ns - player.start_ns) / NS_PER_S - bar.n))
+        times = f', {passes} passes' if passes > 1 else ''
+        print(f'{"stopped: " if stop.is_set() else ""}published {counts.total()} messages on '
+              f'{len(counts)} topics in {time.monotonic() - begin:.1f} s{times}; '
+              f'at most {late_s * 1000:.1f} ms late', flush=True)
+        if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
+            print(f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all '
+                  f'messages within {options.wait_for_all_acked:g} s', file=sys.stderr)
+        return 0
 
 
 def _remap_rule(text: str) -> tuple[str, str]:

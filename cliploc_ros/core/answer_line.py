@@ -42,7 +42,7 @@ def detail_of(found: Relocalization, frame_id: str, figures: Mapping[str, Any] |
     evidence, points, depth = found.evidence, found.recognized, found.depth
     by = [f'{evidence.inliers} landmarks'] if evidence and found.source != 'keyframes' else []
     by += [f'{points.inliers} keyframe points'] if points and found.source != 'objects' else []
-    by += [f'the depth of {depth.objects}'] if depth and depth.is_passed else []
+    by += [f'depth of {depth.objects} objects'] if depth and depth.is_passed else []
     by += ['the prior'] if evidence and evidence.prior else []
     images = len(found.frame_matches)
     of = figures or figures_of_pose(found.map_from_camera, found.covariance, 2)

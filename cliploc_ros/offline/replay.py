@@ -92,12 +92,6 @@ class Player:
             node, topic, options.remap.get(topic.name, topic.name)) for topic in self.topics}
         self._clock = node.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock_hz else None
 
-    @property
-    def length_s(self) -> float:
-        """Return the length of a pass, about right with stands."""
-        return (self.end_ns - self.start_ns) / NS_PER_S * (
-            1.0 + self._options.stand_s * NS_PER_S / DRIVE_NS)
-
     def wait_for_subscribers(self, topics: Iterable[str], timeout_s: float) -> None:
         """Wait until each topic, given by recorded name, has a subscriber; default: all topics.
 
@@ -130,8 +124,7 @@ class Player:
         while not self._stop.is_set():
             messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
             if self._options.stand_s:
-                messages = with_stands(messages, {
-                    topic.name: topic.msgtype for topic in self.topics}, self._options.stand_s)
+                messages = with_stands(messages, self._reader.topics, self._options.stand_s)
             # read the first message, so that opening files delays no message
             messages = chain(list(islice(messages, 1)), messages)
             played, late_s = self._play_once(messages, time.monotonic_ns(), on_message)
@@ -203,21 +196,21 @@ class Player:
         return counts
 
 
-def with_stands(messages: Iterable[BagMessage], types: Mapping[str, str], stand_s: float
-                ) -> Iterator[BagMessage]:
+def with_stands(messages: Iterable[BagMessage], topics: Mapping[str, BagTopic],
+                stand_s: float) -> Iterator[BagMessage]:
     """Let the robot of a recording stand for a time, at an image after every DRIVE_NS.
 
     A robot that drives is not relocalized. While it stands, the newest message of each topic with
     a header, and the newest transform of each coordinate frame, are repeated with new stamps, and
-    odometry has no speed. All later messages are later by the time of the stands. `types` are
-    the types of the topics.
+    odometry has no speed. All later messages are later by the time of the stands.
 
     DatasetError: a message does not fit its type.
     """
     newest: dict[tuple[str, str], Any] = {}
     late_ns, stop_ns, known = 0, 0, typestore().types
     for message in messages:
-        kind, stop_ns = types[message.topic], stop_ns or message.stamp_ns + DRIVE_NS
+        kind = topics[message.topic].msgtype
+        stop_ns = stop_ns or message.stamp_ns + DRIVE_NS
         content = deserialize(message.data, kind, message.topic) if kind in known else None
         stamped = getattr(content, 'transforms', [content] if hasattr(content, 'header') else [])
         for part in stamped:
@@ -233,12 +226,12 @@ def with_stands(messages: Iterable[BagMessage], types: Mapping[str, str], stand_
                 # cameras are synchronized; the stamps of transforms may be in the future
                 is_transform = hasattr(part, 'transform')
                 _set_stamp(part, stamp_ns(part) + _STAND_NS if is_transform else now_ns)
-                if types[topic] == ODOMETRY:
+                if topics[topic].msgtype == ODOMETRY:
                     for speed in (part.twist.twist.linear, part.twist.twist.angular):
                         speed.x = speed.y = speed.z = 0.0
                 yield BagMessage(topic, message.stamp_ns + late_ns, _serialized(
-                    known[types[topic]](transforms=[part]) if is_transform else part,
-                    types[topic]))
+                    known[topics[topic].msgtype](transforms=[part]) if is_transform else part,
+                    topics[topic].msgtype))
         # messages of the time of the image may still follow
         late_ns, stop_ns = late_ns + _STAND_NS, message.stamp_ns + DRIVE_NS
 

@@ -244,8 +244,7 @@ def test_a_robot_stands_on_its_way(tmp_path):
             recorded.append((at, *tf_messages([(at + second, np.eye(4))], 'map', 'odom')[0][1:]))
     bag, stamps, positions = write_messages(tmp_path / 'bag', recorded), defaultdict(list), {}
     with BagReader(bag) as reader:
-        played = [*with_stands(reader.messages(), {
-            name: topic.msgtype for name, topic in reader.topics.items()}, 1.0)]
+        played = [*with_stands(reader.messages(), reader.topics, 1.0)]
         for message in played:
             one = reader.deserialize(message)
             for part in getattr(one, 'transforms', [one]):

@@ -420,14 +420,13 @@ class Studio:
         view, landmarks = self.view, self.document.landmarks
         answers = self.seen().relocalize(landmarks, [view], self.layer)
         self.answers = answers
-        ids, trial, result = list(landmarks), answers[view], answers[view].result
+        trial, result = answers[view], answers[view].result
         assert result is not None
-        found = ', '.join(ids[match.landmark] for match in result.matches)
         return '; '.join(filter(None, [
             f'view {view}: ' + answer_line(trial.verdict, detail_of(
                 result, self.document.file.frame_id), result.refusal_kind),
             '' if trial.error_m is None else f'off by {trial.error_m:.2f} m',
-            found, 'similarities are simulated']))
+            'similarities are simulated']))
 
     def relocalize_all(self) -> str:
         """Relocalize in views along the trajectory, and compare with the previous run."""

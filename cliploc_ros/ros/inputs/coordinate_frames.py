@@ -36,7 +36,7 @@ class CoordinateFrames:
         #: Called with each transform that is received, and whether it is static
         self.on_transform: Callable[[TransformStamped, bool], None] = lambda *_: None
 
-    def open(self, missing: str = 'no transforms', remedy: str = 'set base_from_camera') -> Any:
+    def open(self, missing: str = 'no transforms', *, remedy: str) -> Any:
         """Subscribe to transforms, so that they are known when the first image arrives.
 
         NoTransformError: tf2_ros is not installed; `missing` and `remedy` are in the message.
@@ -97,7 +97,7 @@ class CoordinateFrames:
         NoTransformError: tf2 is not installed or has no such transform in time.
         """
         missing = f"no transform from '{source_frame}' to '{target_frame}'"
-        buffer = self.open(missing, remedy)
+        buffer = self.open(missing, remedy=remedy)
         try:
             found = buffer.lookup_transform(target_frame, source_frame, RclTime.from_msg(stamp),
                                             Duration(seconds=timeout_s)).transform

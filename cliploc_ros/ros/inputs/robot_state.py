@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -255,10 +256,11 @@ class RobotStateSource:
         self.vertical.open(parameters.gravity)
         self.prior.open(parameters)
         self.odometry.open()
-        if parameters.publish_tf or parameters.watch == 'tf' or (
-                parameters.base_frame and not any(parameters.base_from_camera)):
-            # in the worker, because importing tf2 takes long
-            self._node.worker.run(self.transforms.open)
+        remedy = 'set publish_tf: false' if parameters.publish_tf else 'set watch: amcl_pose' \
+            if parameters.watch == 'tf' else 'set base_from_camera' \
+            if parameters.base_frame and not any(parameters.base_from_camera) else ''
+        if remedy:  # in the worker, because importing tf2 takes long
+            self._node.worker.run(partial(self.transforms.open, remedy=remedy))
 
     def close(self) -> None:
         """Unsubscribe."""
