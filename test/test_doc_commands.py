@@ -58,7 +58,12 @@ def commands() -> list[Command]:
 
 def commands_of(page: Path) -> list[Command]:
     """Return the commands of the shell blocks of a page, in their order."""
-    return [Command(page.name, words) for block in shell_blocks(page.read_text())
+    return commands_in(page.read_text(), page.name)
+
+
+def commands_in(text: str, page: str) -> list[Command]:
+    """Return the commands of the shell blocks of a text, in their order."""
+    return [Command(page, words) for block in shell_blocks(text)
             for line in block.replace('\\\n', ' ').splitlines() for words in split(line)]
 
 

@@ -114,12 +114,10 @@ def replay(args: list[str], stop: command.Interruption) -> int:
         total_s = length_s * (1.0 + options.stand * NS_PER_S / DRIVE_NS)
         with tqdm(total=total_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
                   disable=None) as bar:  # draws on a terminal only
-            counts, passes, late_s = player.play(lambda message: bar.update(
+            counts = player.play(lambda message: bar.update(
                 (message.stamp_ns - player.start_ns) / NS_PER_S - bar.n))
-        times = f', {passes} passes' if passes > 1 else ''
         print(f'{"stopped: " if stop.is_set() else ""}published {counts.total()} messages on '
-              f'{len(counts)} topics in {time.monotonic() - begin:.1f} s{times}; '
-              f'at most {late_s * 1000:.1f} ms late', flush=True)
+              f'{len(counts)} topics in {time.monotonic() - begin:.1f} s', flush=True)
         if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
             print(f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all '
                   f'messages within {options.wait_for_all_acked:g} s', file=sys.stderr)

@@ -11,12 +11,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import cv2
 import numpy as np
 import pytest
 from rig_bag import camera_messages, odometry_message, tf_messages, write_messages
-from test_doc_commands import PROJECT, commands_of, program_of
+from test_doc_commands import PROJECT, commands_in, commands_of, program_of
 from without_pytorch import hide_pytorch
 
 from cliploc_ros.cli.studio import make_parser, open_studio
@@ -151,28 +152,42 @@ def test_the_other_commands_run(built, monkeypatch):
 
 @BOTH
 def test_the_nodes_answer_as_the_page_says(built, monkeypatch):
+    """The robot of the recording drives, with odometry."""
     folder, _, parameters, _ = built
     monkeypatch.chdir(folder)
+    walk('## 4. The pose', {
+        'detector': {'model': parameters['model']},
+        'relocalizer': {'clip_pretrained': parameters['clip_pretrained']}
+        if 'clip_pretrained' in parameters else {'matching': 'class'}})
+
+
+@FULL
+def test_the_nodes_answer_in_the_demos_room(tmp_path, monkeypatch):
+    shutil.copytree(ASSETS, tmp_path / 'room')
+    monkeypatch.chdir(tmp_path)
+    walk('## Without a recording')
+
+
+def walk(section, networks=MappingProxyType({})):
+    """Run the documented commands from a bag to a pose; `networks` are parameters of the nodes."""
+    text = PAGES[0].read_text().split(f'\n{section}')[1].split('\n## ')[0]
     processes = []
     try:
-        for command in commands_of(PAGES[0]):
+        for command in commands_in(text, section):
             module, arguments = program_of(command)
             name = module.rpartition('.')[2]
-            words = [sys.executable, '-m', module, *arguments]
-            if name in ('detector', 'relocalizer'):
-                own = {key: value for key, value in parameters.items()
-                       if key.startswith('clip') == (name == 'relocalizer')}
-                if name == 'relocalizer' and not own:
-                    own = {'matching': 'class'}
-                words += [word for key, value in own.items()
-                          for word in ('-p', f'{key}:={value}')]
+            words = [sys.executable, '-m', module, *arguments, *(
+                word for key, value in networks.get(name, {}).items()
+                for word in ('-p', f'{key}:={value}'))]
             if name in ('replay', 'detector', 'relocalizer'):
                 processes.append(subprocess.Popen(words))
+            elif name == 'tum_to_bag':
+                subprocess.run(words, check=True)
             elif name == 'wake_up':
-                done = subprocess.run([*words, '--timeout', '150'], capture_output=True,
-                                      text=True, timeout=300)
+                done = subprocess.run(words, capture_output=True, text=True, timeout=300)
                 assert done.returncode == 0, done.stdout + done.stderr
-                assert 'accepted' in done.stdout
+                assert re.search(r'^look \d+ .*: accepted: .*; by .*; [0-9.]+ s\n$', done.stdout,
+                                 re.MULTILINE)
     finally:
         for process in processes:
             process.send_signal(signal.SIGINT)
