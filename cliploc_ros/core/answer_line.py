@@ -47,7 +47,7 @@ def detail_of(found: Relocalization, frame_id: str, figures: Mapping[str, Any] |
     images = len(found.frame_matches)
     of = figures or figures_of_pose(found.map_from_camera, found.covariance, 2)
     return (f'x {of["x [m]"]:.2f} y {of["y [m]"]:.2f} z {of["z [m]"]:.2f} m in {frame_id}, '
-            f'heading {of["heading [deg]"]:.0f} deg; deviation '
+            f'heading {round(of["heading [deg]"])} deg; deviation '
             f'{of["position deviation [m]"]:.2f} m, {of["heading deviation [deg]"]:.1f} deg; by '
             + ', '.join(by) + (f' in {images} images' if images > 1 else ''))
 

@@ -140,7 +140,7 @@ def test_the_other_commands_run(built, monkeypatch):
         if name == 'studio':
             studio = open_studio(make_parser().parse_args(arguments))
             assert studio.views > 10 and studio.document.landmarks
-            assert 'pose by' in studio.relocalize_here()
+            assert ' deg; by ' in studio.relocalize_here()
             studio.document.close()
         elif name == 'check_map':
             assert main_of(name)([*arguments, *FEW]) in (0, 1), arguments
