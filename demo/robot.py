@@ -3,7 +3,6 @@
 """The demo's robot: play a recording, and request the pose at each wake-up."""
 
 import heapq
-import re
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -11,11 +10,11 @@ from functools import partial
 from itertools import groupby
 
 import numpy as np
+from diagnostic_msgs.srv import SelfTest
 from geometry_msgs.msg import PoseArray
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.core.observation import Detections
@@ -41,7 +40,8 @@ class WakeUp:
 
     stamp_ns: int  #: Stamp of the answer's image [ns]
     accepted: bool  #: Whether the relocalizer published a pose
-    message: str  #: The answer's message
+    message: str  #: The answer in one line
+    fields: Mapping[str, str]  #: Its figures, see doc/interface.md
     #: tuple of (4, 4): ``map_from_camera`` of the best distinct hypotheses, best first; an
     #: accepted pose is the first
     hypotheses: tuple[NDArray[np.float64], ...]
@@ -50,28 +50,24 @@ class WakeUp:
 
     @property
     def score(self) -> float:
-        """Return the score in the message."""
-        return float(self._stated(r'score ([0-9.]+)'))
+        """Return the score of the pose."""
+        return float(self.fields['score'])
 
     @property
     def landmarks(self) -> int:
-        """Return the number of landmarks matched in the message."""
-        return int(self._stated(r'(\d+) landmarks'))
+        """Return the number of matched landmarks."""
+        return int(self.fields['landmarks'])
 
     @property
     def stage_ms(self) -> dict[str, int]:
-        """Return the time of each stage in the message [ms]."""
-        return {stage: int(ms) for stage, ms in re.findall(r'(\w+) (\d+) ms', self.message)}
+        """Return the time of each stage [ms]."""
+        return {key.removesuffix(' [ms]'): round(float(value))
+                for key, value in self.fields.items() if key.endswith(' [ms]')}
 
     @property
     def reason(self) -> str:
         """Return the reason of a refusal without its figures; empty if accepted."""
-        return '' if self.accepted else self.message.removeprefix('refused: ').split(' [')[0]
-
-    def _stated(self, pattern: str) -> str:
-        # The reason before the bracket may also contain a score.
-        found = re.search(pattern, self.message.rpartition(' [')[2])
-        return found[1] if found else '0'
+        return '' if self.accepted else self.message.removeprefix('refused: ').split('; kind ')[0]
 
 
 class Robot(Node):
@@ -87,7 +83,7 @@ class Robot(Node):
         self._executor.add_node(self)
         self._topics = {topic.name: create_publisher(self, topic, topic.name)
                         for reader in readers.values() for topic in reader.topics.values()}
-        self._client = self.create_client(Trigger, 'relocalizer/relocalize')
+        self._client = self.create_client(SelfTest, 'relocalizer/relocalize_fields')
         self._detections: dict[str, dict[int, Detections]] = {}
         self._hypotheses: dict[int, tuple[NDArray[np.float64], ...]] = {}
         for camera in readers:
@@ -127,7 +123,7 @@ class Robot(Node):
     def _wake_up(self, stamp: int, frame: list[BagMessage]) -> WakeUp:
         """Request the pose of this frame, and publish it until the answer arrives."""
         start = time.monotonic()
-        future = self._client.call_async(Trigger.Request())
+        future = self._client.call_async(SelfTest.Request())
         # One in nine images was lost and resent after up to 3 s if it was published right after
         # the request and larger than Fast DDS's shared memory.
         shown_at = start + _HEAD_START_S - _FRAME_PERIOD_S
@@ -143,12 +139,14 @@ class Robot(Node):
             return bool(future.done())
 
         self._wait(answered)
-        answer_s, answer = time.monotonic() - start, future.result()
-        if not answer.message.startswith(('accepted', 'refused')):
+        answer_s, (answer,) = time.monotonic() - start, future.result().status
+        fields = {field.key: field.value for field in answer.values}
+        if fields['verdict'] not in ('accepted', 'refused'):
             raise DemoError(f'the relocalizer neither accepted nor refused: {answer.message}')
         self._wait(lambda: stamp in self._hypotheses
                    and all(stamp in heard for heard in self._detections.values()))
-        return WakeUp(stamp, answer.success, answer.message, self._hypotheses[stamp],
+        return WakeUp(stamp, fields['verdict'] == 'accepted', answer.message, fields,
+                      self._hypotheses[stamp],
                       {camera: heard[stamp] for camera, heard in self._detections.items()},
                       answer_s)
 

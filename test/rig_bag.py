@@ -100,6 +100,20 @@ def tf_messages(poses, parent='map', child='camera', topic='/tf'):
     return [(at, topic, TF, transform(at, parent, child, pose)) for at, pose in poses]
 
 
+def odometry_message(at, odom_from_base, speed_m_s=0.5):
+    """Return a message of /odom, of a robot that drives, for `write_messages`."""
+    pose = bag_messages.pose_message(at, 'odom', odom_from_base)
+    twist = make('geometry_msgs/msg/Twist', **{
+        name: make('geometry_msgs/msg/Vector3', x=x, y=0.0, z=0.0)
+        for name, x in (('linear', speed_m_s), ('angular', 0.0))})
+    with_covariance = {name: make(f'geometry_msgs/msg/{name.title()}WithCovariance',
+                                  covariance=np.zeros(36), **{name: value})
+                       for name, value in (('pose', pose.pose), ('twist', twist))}
+    return at, '/odom', bag_messages.ODOMETRY, make(
+        bag_messages.ODOMETRY, header=pose.header, child_frame_id='base_footprint',
+        **with_covariance)
+
+
 def write_messages(path, recorded):
     """Write messages, given by time of recording [ns], topic, type and message, in any order."""
     with BagWriter(path) as bag:

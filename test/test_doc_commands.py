@@ -22,6 +22,7 @@ import yaml
 
 from cliploc_ros.cli.wake_up import make_parser
 from cliploc_ros.command import split_ros_args
+from cliploc_ros.core.watch.watch import WatchState
 from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -57,7 +58,12 @@ def commands() -> list[Command]:
 
 def commands_of(page: Path) -> list[Command]:
     """Return the commands of the shell blocks of a page, in their order."""
-    return [Command(page.name, words) for block in shell_blocks(page.read_text())
+    return commands_in(page.read_text(), page.name)
+
+
+def commands_in(text: str, page: str) -> list[Command]:
+    """Return the commands of the shell blocks of a text, in their order."""
+    return [Command(page, words) for block in shell_blocks(text)
             for line in block.replace('\\\n', ' ').splitlines() for words in split(line)]
 
 
@@ -248,6 +254,7 @@ def literals(name: str) -> dict:
 
 
 PASSED = literals('relocalization.launch.py')
+OURS = 'reinitialize_global_localization'
 #: Arguments of wake_up.launch.py: defaults and descriptions.
 OF_WAKE_UP = literals('wake_up.launch.py')['ARGUMENTS']
 
@@ -286,14 +293,44 @@ def test_the_documents_give_arguments_that_exist():
         'NAMES', 'OTHERS', 'DETECTOR_PARAMETERS', 'RELOCALIZER_PARAMETERS')))
 
 
+# Ports of the nodes in our tree: nav2_tree_nodes.xml of Nav2 1.3 (Jazzy), BehaviorTree.CPP 4
+PORTS = {
+    'root': 'BTCPP_format main_tree_to_execute', 'BehaviorTree': 'ID', 'SubTree': 'ID _autoremap',
+    'Sequence': '', 'ReactiveSequence': '', 'PipelineSequence': '', 'RoundRobin': '',
+    'Parallel': 'success_count failure_count', 'ScriptCondition': 'code',
+    'RecoveryNode': 'number_of_retries', 'RateController': 'hz', 'Wait': 'wait_duration',
+    'Spin': 'spin_dist time_allowance', 'FollowPath': 'path controller_id goal_checker_id',
+    'ComputePathToPose': 'goal path planner_id', 'ClearEntireCostmap': 'service_name',
+    'GoalCheckerSelector': 'topic_name default_goal_checker selected_goal_checker',
+    'ReinitializeGlobalLocalization': 'service_name server_timeout'}
+
+
 def test_nav2_calls_our_service_and_waits_long_enough():
-    text = (PROJECT / 'doc/nav2.md').read_text()
-    tree = re.search(r'    <Parallel.*</Parallel>', text, re.DOTALL).group()
-    call = ElementTree.fromstring(tree).find('ReinitializeGlobalLocalization')
-    (name,) = set(re.findall(r'reinitialize_global_localization:=(\w+)', text))
-    assert call.get('service_name') == name != 'reinitialize_global_localization'
-    timeout_s = RelocalizerParameters().timeout_s
-    assert int(call.get('server_timeout')) > 1000 * (timeout_s + 2.0)
+    """Our tree has known ports, and states, names and types of the relocalizer."""
+    assert "files('config', '*.*')" in (PROJECT / 'setup.py').read_text(), 'it is installed'
+    page, types = ((PROJECT / f'doc/{name}.md').read_text() for name in ('nav2', 'interface'))
+    (name,) = set(re.findall(r'reinitialize_global_localization:=(\w+)', page))
+    tree = ElementTree.parse(PROJECT / 'config/navigate_unless_lost.xml').getroot()
+    for node in tree.iter():
+        assert node.attrib.keys() <= {'name', *PORTS[node.tag].split()}, node.tag
+    trees = {each.get('ID'): each for each in tree.iter('BehaviorTree')}
+    assert {tree.get('main_tree_to_execute'), *(each.get('ID') for each in tree.iter('SubTree'))
+            } == trees.keys() == set(re.findall('^\\| `([A-Z]\\w+)` \\| ', page, re.MULTILINE))
+    calls = list(tree.iter('ReinitializeGlobalLocalization'))
+    assert {call.get('service_name') for call in calls} == {name} != {OURS}
+    assert f'| `{OURS}` | std_srvs/Empty |' in types
+    assert min(int(call.get('server_timeout')) for call in calls
+               ) > 1000 * (RelocalizerParameters().timeout_s + 2.0)
+    (state,) = tree.iter('GoalCheckerSelector')
+    assert state.get('topic_name') in names_of_interface()
+    assert '| `~/localization_state` | std_msgs/String |' in types
+    variable = state.get('selected_goal_checker').strip('{}')
+    compared = {tuple(node.get('code').replace('!=', '==').split(' == '))
+                for node in tree.iter('ScriptCondition')}
+    assert compared == {(variable, f"'{WatchState.LOST}'")}
+    assert state.get('default_goal_checker') == WatchState.UNCERTAIN
+    spin = (PROJECT / 'script/nav2_msgs/action/Spin.action').read_text()
+    assert 'float32 target_yaw' in spin  # the port spin_dist
 
 
 def made(name: str, **given: str) -> list:

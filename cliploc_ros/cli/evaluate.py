@@ -291,7 +291,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:
     """Answer a recorded request again; return 0 if the verdict is the same, 1 otherwise."""
     from cliploc_ros.cli.sources import clip_options
-    from cliploc_ros.core.geometry.transforms import quaternion_from_transform
+    from cliploc_ros.core.answer_line import answer_line, detail_of
     from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
     from cliploc_ros.core.localizer import Localizer, repeat
     from cliploc_ros.core.query import read_case
@@ -312,16 +312,12 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
         layer = shared.read_layer(options.map[0], landmark_map, wanted)
     again = repeat(case, Localizer(Relocalizer(landmark_map, case.options),
                                    None if layer is None else KeyframeLocalizer(layer)), observer)
-    place = 'none' if (pose := again.map_from_camera) is None else (
-        'the camera at x {:.3f} y {:.3f} z {:.3f} m, quaternion (x y z w) {:.6f} {:.6f} {:.6f} '
-        '{:.6f}, in {}; confidence {:.3f}'.format(
-            *pose[:3, 3], *quaternion_from_transform(pose),  # type: ignore[str-format]
-            landmark_map.frame_id, again.confidence))
     is_same = again.accepted == (case.report.get('found') == 'accepted')
     print(f'{options.bag}: {len(case.queries)} frames, map {case.report.get("map_hash")}\n'
           f'recorded: {case.report.get("message")}\n'
-          f'again:    {"accepted" if again.accepted else f"refused: {again.reason}"}\n'
-          f'pose:     {place}\n'
+          'again (pose of the camera): ' + answer_line(
+              'accepted' if again.accepted else 'refused', detail_of(again, landmark_map.frame_id),
+              again.refusal_kind, again.search_ms / 1e3) + '\n'
           f'{"the same verdict" if is_same else "another verdict"}', flush=True)
     return 0 if is_same else 1
 

@@ -8,24 +8,22 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from cliploc_ros import command
 from cliploc_ros.command import option
 from cliploc_ros.errors import OptionsError
+from cliploc_ros.offline.datasets.bag_messages import ODOMETRY
 from cliploc_ros.offline.datasets.bags import BagReader
 from cliploc_ros.units import NS_PER_S
-
-if TYPE_CHECKING:
-    from cliploc_ros.offline.replay import Player
 
 NODE_NAME = 'replay'
 
 EPILOG = """\
 examples:
   replay office --clock --wait-for-subscribers /image
+  replay office --loop --stand
   replay office --rate 0.5 --topics /image /camera_info --remap /image:=/camera/image
 """
 
@@ -49,6 +47,9 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '-r --rate X', 'speed: 2 is twice as fast as recorded (default: 1)',
            command.positive, 1.0)
     option(parser, '-l --loop', 'begin again at the end')
+    option(parser, '--stand S', 'let the robot stand for S seconds (default: 20) after every 3 s '
+           'of its drive: a robot that drives is not relocalized', command.positive, 0.0,
+           nargs='?', const=20.0)
     option(parser, '--start-offset S', 'begin S seconds after the start of the recording',
            command.not_negative, 0.0)
     option(parser, '--topics TOPIC', 'publish only these (default: all)', _absolute, nargs='+')
@@ -86,7 +87,7 @@ def replay(args: list[str], stop: command.Interruption) -> int:
         from rclpy.exceptions import InvalidTopicNameException
         from rclpy.node import Node
     with command.running_ros(ros_args), BagReader(options.bag) as reader:
-        from cliploc_ros.offline.replay import Player, PlayOptions
+        from cliploc_ros.offline.replay import DRIVE_NS, Player, PlayOptions
 
         # Nothing spins this node, so it could not serve its parameters.
         node = Node(NODE_NAME, start_parameter_services=False)
@@ -94,38 +95,33 @@ def replay(args: list[str], stop: command.Interruption) -> int:
             player = Player(node, reader, PlayOptions(
                 rate=options.rate, start_offset_s=options.start_offset, topics=options.topics,
                 exclude=options.exclude, remap=dict(options.remap), clock_hz=options.clock,
-                loop=options.loop), stop)
+                loop=options.loop, stand_s=options.stand), stop)
         except InvalidTopicNameException as error:
             raise OptionsError(f'--remap: {error}') from error
-        return _play(player, options, stop)
-
-
-def _play(player: 'Player', options: argparse.Namespace, stop: command.Interruption) -> int:
-    if options.wait_for_subscribers is not None:
-        player.wait_for_subscribers(options.wait_for_subscribers, options.wait_timeout)
-    for topic in player.without_type:
-        print(f'not replayed: {topic.name}: {topic.msgtype} is not installed; '
-              f'apt install ros-jazzy-{topic.msgtype.partition("/")[0].replace("_", "-")}, or '
-              'source ROS', flush=True)
-    length_s = (player.end_ns - player.start_ns) / NS_PER_S
-    print(f'replaying {options.bag}: {len(player.topics)} topics, {length_s:.1f} s '
-          f'at rate {options.rate:g}', flush=True)
-    begin = time.monotonic()
-    with tqdm(total=length_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
-              disable=None) as bar:  # draws on a terminal only
-        counts, passes, unread, late_s = player.play(lambda message: bar.update(
-            (message.stamp_ns - player.start_ns) / NS_PER_S - bar.n))
-    times = f', {passes} passes' if passes > 1 else ''
-    print(f'{"stopped: " if stop.is_set() else ""}published {counts.total()} messages on '
-          f'{len(counts)} topics in {time.monotonic() - begin:.1f} s{times}; '
-          f'at most {late_s * 1000:.1f} ms late', flush=True)
-    if unread:
-        print(f'warning: {unread} messages that the recording lists were not found in it; '
-              'it may be damaged', file=sys.stderr)
-    if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
-        print(f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all messages '
-              f'within {options.wait_for_all_acked:g} s', file=sys.stderr)
-    return 0
+        if options.wait_for_subscribers is not None:
+            player.wait_for_subscribers(options.wait_for_subscribers, options.wait_timeout)
+        for topic in player.without_type:
+            print(f'not replayed: {topic.name}: {topic.msgtype} is not installed; apt install '
+                  f'ros-jazzy-{topic.msgtype.partition("/")[0].replace("_", "-")}, or source ROS')
+        for topic in player.topics:
+            if topic.msgtype == ODOMETRY and not options.stand:
+                print(f'note: the robot of {topic.name} drives, so its poses are withheld until '
+                      'it stops: --stand lets it stop')
+        length_s = (player.end_ns - player.start_ns) / NS_PER_S
+        print(f'replaying {options.bag}: {len(player.topics)} topics, {length_s:.1f} s '
+              f'at rate {options.rate:g}', flush=True)
+        begin = time.monotonic()
+        total_s = length_s * (1.0 + options.stand * NS_PER_S / DRIVE_NS)
+        with tqdm(total=total_s, unit='s', bar_format='{l_bar}{bar}| {n:.1f}/{total:.1f} s',
+                  disable=None) as bar:  # draws on a terminal only
+            counts = player.play(lambda message: bar.update(
+                (message.stamp_ns - player.start_ns) / NS_PER_S - bar.n))
+        print(f'{"stopped: " if stop.is_set() else ""}published {counts.total()} messages on '
+              f'{len(counts)} topics in {time.monotonic() - begin:.1f} s', flush=True)
+        if lacking := player.wait_for_acknowledgement(options.wait_for_all_acked):
+            print(f'warning: a subscriber of {", ".join(lacking)} did not acknowledge all '
+                  f'messages within {options.wait_for_all_acked:g} s', file=sys.stderr)
+        return 0
 
 
 def _remap_rule(text: str) -> tuple[str, str]:

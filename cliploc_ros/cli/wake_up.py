@@ -39,8 +39,8 @@ def make_parser() -> argparse.ArgumentParser:
         "the pose until one is accepted, turning with Nav2's action spin between requests.")
     option(parser, '--relocalizer NAME', 'its name, in the namespace of this node or absolute '
            '(%(default)s)', default='relocalizer')
-    option(parser, '--timeout S', 'start no more turns after S seconds (%(default)g)',
-           command.positive, 60.0)
+    option(parser, '--timeout S', 'start no more turns after S seconds, not counting those in '
+           'which the relocalizer loads (%(default)g)', command.positive, 60.0)
     option(parser, '--turn-deg DEG', 'turn counterclockwise by this angle between requests; 0: '
            'never (%(default)g)', command.within(-180.0, 180.0), 45.0)
     option(parser, '--watch', 'keep running: wake up again whenever the relocalizer, whose '

@@ -43,7 +43,7 @@ from cliploc_ros.ros.clients import NotRunningError, ask, check_name
 from cliploc_ros.ros.conversions import of_camera
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, keyframes_path
 from cliploc_ros.ros.inputs.frame_source import NoFrameError
-from cliploc_ros.ros.node.diagnostics import StageTimes, in_words
+from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.threads import NodeExecutor
 from cliploc_ros.ros.parameters import CommonParameters, RelocalizerParameters, map_files
 
@@ -365,7 +365,8 @@ def time_request(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,
     # the options of the most expensive request
     localizer.answer(Query((Observation(camera, boxes),), (image_rgb,), None),
                      replace(parameters.options(), crops='all'), times)
-    return f'{in_words(times.ms)} with {len(boxes)} boxes, {len(drawn)} of them drawn'
+    stages = ', '.join(f'{stage} {ms:.0f} ms' for stage, ms in times.ms.items())
+    return f'{stages} with {len(boxes)} boxes, {len(drawn)} of them drawn'
 
 
 def carrying(cache_dir: Path, used: Sequence[CommonParameters]) -> list[str]:

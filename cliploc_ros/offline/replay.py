@@ -22,11 +22,24 @@ from rosgraph_msgs.msg import Clock
 
 from cliploc_ros.command import Interruption
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.offline.datasets.bags import BagMessage, BagReader, BagTopic
+from cliploc_ros.offline.datasets.bag_messages import COMPRESSED_IMAGE, IMAGE, ODOMETRY, stamp_ns
+from cliploc_ros.offline.datasets.bags import (
+    BagMessage,
+    BagReader,
+    BagTopic,
+    deserialize,
+    typestore,
+)
 from cliploc_ros.units import NS_PER_S
 
 CLOCK_TOPIC = '/clock'
+#: Recorded time between two stands: a robot drives a metre or two.
+DRIVE_NS = 3 * NS_PER_S
+# Period of the messages while the robot stands.
+_STAND_NS = NS_PER_S // 5
 _POLL_S = 0.02
+# Pause between the passes of a loop.
+_GAP_S = 0.1
 #: Delay after a subscriber appears: it must discover this publisher too, and ROS does not report
 #: when it has.
 _DISCOVERY_S = 0.2
@@ -54,6 +67,8 @@ class PlayOptions:
     clock_hz: float | None = None
     #: Start again at the end, until stopped.
     loop: bool = False
+    #: Let the robot stand for this time after every DRIVE_NS, see with_stands; 0: never.
+    stand_s: float = 0.0
 
 
 class Player:
@@ -99,35 +114,48 @@ class Player:
         self._stop.wait(_DISCOVERY_S)
 
     def play(self, on_message: Callable[[BagMessage], None] = lambda message: None
-             ) -> tuple[Counter[str], int, int, float]:
-        """Publish the messages, each at its time; `on_message` is called after each.
+             ) -> Counter[str]:
+        """Publish the messages, each at its time; return their number by recorded topic.
 
-        Return the number of messages by recorded topic, of passes to the end of the recording, and
-        of messages that the recording lists but does not contain, and the greatest delay of a
-        message after its time [s]. DatasetError: the recording is damaged.
+        `on_message` is called after each. DatasetError: the recording is damaged.
         """
-        counts = self._publish_latched()
-        messages = self._read_ahead()
-        origin_ns = time.monotonic_ns()
-        passes, unread, worst_s = 0, 0, 0.0
+        rate, counts = self._options.rate, self._publish_latched()
+
+        def late_s(stamp_ns: int) -> float:
+            """Return the time since a stamp's time, without drift; negative in the future."""
+            due_ns = origin_ns + (stamp_ns - self.start_ns) / rate
+            return (time.monotonic_ns() - due_ns) / NS_PER_S
+
+        def wait_for(stamp_ns: int) -> bool:
+            """Sleep until a stamp's time; return False if stopped before."""
+            left_s = -late_s(stamp_ns)
+            return not self._stop.wait(left_s) if left_s > 0 else not self._stop.is_set()
+
         while not self._stop.is_set():
-            played, late_s = self._play_once(messages, origin_ns, on_message)
-            counts += played
-            worst_s = max(worst_s, late_s)
-            if self._stop.is_set():
+            messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
+            if self._options.stand_s:
+                messages = with_stands(messages, self._reader.topics, self._options.stand_s)
+            # read the first message, so that opening files delays no message
+            messages = chain(list(islice(messages, 1)), messages)
+            origin_ns = time.monotonic_ns()
+            # /clock ticks on a regular grid of real time; without a clock, nothing ticks
+            step_ns = max(round(rate * NS_PER_S / (self._options.clock_hz or 1.0)), 1)
+            tick_ns = self.start_ns
+            for message in messages:
+                while self._clock and tick_ns <= message.stamp_ns and wait_for(tick_ns):
+                    tick = Clock()
+                    tick.clock.sec, tick.clock.nanosec = divmod(tick_ns, NS_PER_S)
+                    self._clock.publish(tick)
+                    missed = round(late_s(tick_ns) * rate * NS_PER_S) // step_ns  # skipped
+                    tick_ns += step_ns * max(missed, 1)
+                if not wait_for(message.stamp_ns):
+                    break
+                self._publishers[message.topic].publish(message.data)
+                counts[message.topic] += 1
+                on_message(message)
+            if not self._options.loop or self._stop.wait(_GAP_S):
                 break
-            passes += 1
-            # the metadata do not count the messages after a start offset
-            unread = 0 if self.start_ns > self._reader.start_ns else max(
-                sum(topic.message_count for topic in self.topics) - played.total(), 0)
-            if not self._options.loop:
-                break
-            # The gap before the next pass is the mean interval of messages, and never 0.
-            length_ns = self.end_ns - self.start_ns
-            gap_ns = length_ns // max(played.total() - 1, 1) or NS_PER_S
-            origin_ns += round((length_ns + gap_ns) / self._options.rate)
-            messages = self._read_ahead()
-        return counts, passes, unread, worst_s
+        return counts
 
     def wait_for_acknowledgement(self, timeout_s: float) -> tuple[str, ...]:
         """Wait until all reliable subscribers have acknowledged all messages, or until stopped.
@@ -146,44 +174,6 @@ class Player:
             self._stop.wait(_POLL_S)
         return ()
 
-    def _read_ahead(self) -> Iterator[BagMessage]:
-        """Open the messages and read the first one, so that opening files delays no message."""
-        messages = self._reader.messages(self._publishers, start_ns=self.start_ns)
-        return chain(list(islice(messages, 1)), messages)
-
-    def _play_once(self, messages: Iterator[BagMessage], origin_ns: int,
-                   on_message: Callable[[BagMessage], None]) -> tuple[Counter[str], float]:
-        """Publish messages; return their number by topic, and the greatest delay [s]."""
-        rate = self._options.rate
-
-        def late_s(stamp_ns: int) -> float:
-            """Return the time since a stamp's time, without drift; negative in the future."""
-            due_ns = origin_ns + (stamp_ns - self.start_ns) / rate
-            return (time.monotonic_ns() - due_ns) / NS_PER_S
-
-        def wait_for(stamp_ns: int) -> bool:
-            """Sleep until a stamp's time; return False if stopped before."""
-            left_s = -late_s(stamp_ns)
-            return not self._stop.wait(left_s) if left_s > 0 else not self._stop.is_set()
-
-        # /clock ticks on a regular grid of real time; without a clock, nothing ticks
-        step_ns = max(round(rate * NS_PER_S / (self._options.clock_hz or 1.0)), 1)
-        tick_ns, counts, worst_lateness_s = self.start_ns, Counter[str](), 0.0
-        for message in messages:
-            while self._clock is not None and tick_ns <= message.stamp_ns and wait_for(tick_ns):
-                tick = Clock()
-                tick.clock.sec, tick.clock.nanosec = divmod(tick_ns, NS_PER_S)
-                self._clock.publish(tick)
-                missed = round(late_s(tick_ns) * rate * NS_PER_S) // step_ns  # skipped
-                tick_ns += step_ns * max(missed, 1)
-            if not wait_for(message.stamp_ns):
-                break
-            worst_lateness_s = max(worst_lateness_s, late_s(message.stamp_ns))
-            self._publishers[message.topic].publish(message.data)
-            counts[message.topic] += 1
-            on_message(message)
-        return counts, worst_lateness_s
-
     def _publish_latched(self) -> Counter[str]:
         """Publish latched messages from before the start, which late subscribers would receive."""
         counts: Counter[str] = Counter()
@@ -194,6 +184,50 @@ class Player:
             self._publishers[message.topic].publish(message.data)
             counts[message.topic] += 1
         return counts
+
+
+def with_stands(messages: Iterable[BagMessage], topics: Mapping[str, BagTopic],
+                stand_s: float) -> Iterator[BagMessage]:
+    """Let the robot of a recording stand for a time, at an image after every DRIVE_NS.
+
+    A robot that drives is not relocalized. While it stands, the newest message of each topic with
+    a header, and the newest transform of each coordinate frame, are repeated with new stamps, and
+    odometry has no speed. All later messages are later by the time of the stands.
+
+    DatasetError: a message does not fit its type.
+    """
+    newest: dict[tuple[str, str], Any] = {}
+    late_ns, stop_ns, store = 0, 0, typestore()
+    for message in messages:
+        kind = topics[message.topic].msgtype
+        stop_ns = stop_ns or message.stamp_ns + DRIVE_NS
+        content = deserialize(message.data, kind, message.topic) if kind in store.types else None
+        stamped = getattr(content, 'transforms', [content] if hasattr(content, 'header') else [])
+        for part in stamped:
+            _set_stamp(part, stamp_ns(part) + late_ns)
+            newest[message.topic, getattr(part, 'child_frame_id', '')] = part
+        yield BagMessage(message.topic, message.stamp_ns + late_ns,
+                         bytes(store.serialize_cdr(content, kind)) if stamped else message.data)
+        if message.stamp_ns < stop_ns or kind not in (IMAGE, COMPRESSED_IMAGE):
+            continue
+        for _ in range(max(round(stand_s * NS_PER_S / _STAND_NS), 1)):
+            late_ns, now_ns = late_ns + _STAND_NS, stamp_ns(content) + _STAND_NS
+            for (topic, _child), part in newest.items():
+                # cameras are synchronized; the stamps of transforms may be in the future
+                kind, is_transform = topics[topic].msgtype, hasattr(part, 'transform')
+                _set_stamp(part, stamp_ns(part) + _STAND_NS if is_transform else now_ns)
+                if kind == ODOMETRY:
+                    for speed in (part.twist.twist.linear, part.twist.twist.angular):
+                        speed.x = speed.y = speed.z = 0.0
+                whole = store.types[kind](transforms=[part]) if is_transform else part
+                yield BagMessage(topic, message.stamp_ns + late_ns,
+                                 bytes(store.serialize_cdr(whole, kind)))
+        # messages of the time of the image may still follow
+        late_ns, stop_ns = late_ns + _STAND_NS, message.stamp_ns + DRIVE_NS
+
+
+def _set_stamp(message: Any, stamp_ns: int) -> None:
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NS_PER_S)
 
 
 def _select_topics(reader: BagReader, options: PlayOptions

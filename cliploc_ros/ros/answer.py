@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind, needed_confidence
+from cliploc_ros.core.answer_line import answer_line, detail_of, figures_of_pose
 from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays
 from cliploc_ros.errors import CliplocError, DatasetError, OptionsError
@@ -25,24 +26,12 @@ from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import Localized
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import RobotState
-from cliploc_ros.ros.node.diagnostics import in_words
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 # Number of past frames that acceptance uses, see cliploc_ros.core.acceptance.looks.
 _MAX_FRAMES = 20
 _MAX_BYTES = 256 * 2**20
 _MIB = 2**20
-# How the text of an answer shows a figure, unless it has one of these usual values.
-_PHRASES: tuple[tuple[str, tuple[object, ...], str], ...] = (
-    ('confidence', (), 'confidence {confidence:.3f}'), ('score', (), 'score {score:.2f}'),
-    ('landmarks', (), '{landmarks} landmarks'), ('frames', (0, 1), '{frames} frames'),
-    ('hypotheses', (), '{hypotheses} hypotheses'),
-    ('searched percent', (), '{searched percent:.3g} % of the search'),
-    ('crops', ('',), 'CLIP of {crops} crops'), ('source', ('', 'objects'), 'pose by {source}'),
-    ('keyframe points', (0,), '{keyframe points} points of keyframes agree'),
-    ('keyframe search', ('none', 'fast'), '{keyframe search} search of keyframes'),
-    ('depth', ('',), '{depth}'), ('cameras', (1,), '{cameras} cameras'),
-    ('left out', ('',), 'no image of {left out}'), ('prior', (0.0,), 'prior {prior:.1f}'))
 
 
 class Verdict(StrEnum):
@@ -71,6 +60,7 @@ class Answer:
     #: Whether the frame was refused before all crops were compared, so that a retry may succeed
     is_cut: bool = False
     stages_ms: Mapping[str, float] = field(default_factory=dict)  #: Duration of each stage [ms]
+    time_s: float | None = None  #: From the request, or from the image, to the answer [s]
     #: Hash of the searched map, see frame_localizer.load_map; empty without a map
     map_hash: str = ''
     kind: RefusalKind | None = None  #: Kind of a refusal; None for other verdicts
@@ -83,15 +73,13 @@ class Answer:
     def withheld(self, why: str) -> 'Answer':
         """Return this accepted answer without its pose, which is not delivered."""
         return replace(self, verdict=Verdict.WITHHELD, pose=None, pose_figures={},
-                       detail=f'{why} ({self.message})')
+                       detail=f'{why} ({answer_line(self.verdict, self.detail)})')
 
     @property
     def message(self) -> str:
-        """Return the verdict, its reason, the kind of a refusal and the map in one line."""
-        text = self.detail if self.verdict is Verdict.FAILED else f'{self.verdict}: {self.detail}'
-        if self.kind is not None:
-            text = f'{text}; kind {self.kind}'
-        return f'{text}; map {self.map_hash}' if self.map_hash else text
+        """Return the answer in one line."""
+        return self.detail if self.verdict is Verdict.FAILED else answer_line(
+            self.verdict, self.detail, self.kind, self.time_s)
 
 
 def answer_to(frame: Frame, localized: Localized, state: RobotState,
@@ -124,35 +112,20 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
         'cameras': len(localized.query.frames), 'left out': ', '.join(localized.left_out),
         'prior': 0.0 if evidence is None else evidence.prior,
         **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in stages_ms.items()}}
-    # the reason of a refusal may state the confidence already, with other rounding
-    said = ', '.join(phrase.format_map(figures) for name, usual, phrase in _PHRASES
-                     if figures[name] not in usual
-                     and not (name == 'confidence' and name in found.reason))
-    summary = f'[{said}; {in_words(stages_ms)}]'
-    answer = Answer(Verdict.REFUSED, f'{found.reason} {summary}', None, frame.received_at,
-                    localized.query, is_cut, stages_ms, map_hash, found.refusal_kind,
-                    header, figures)
+    left_out = f'; no image of {figures["left out"]}' if localized.left_out else ''
+    answer = Answer(Verdict.REFUSED, found.reason + left_out, None, frame.received_at,
+                    localized.query, is_cut, stages_ms, sum(stages_ms.values()) / 1e3, map_hash,
+                    found.refusal_kind, header, figures)
     if not found.accepted:
         return answer
     assert found.covariance is not None and found.map_from_camera is not None
     map_from_base = found.map_from_camera @ state.camera_from_base
-    pose = pose_with_covariance_msg(header, map_from_base, move_covariance(
-        found.covariance, map_from_base[:3, 3] - found.map_from_camera[:3, 3]))
-    # the heading of a robot is its x axis, that of a camera its viewing direction (z axis)
-    ahead = map_from_base[:2, 0 if parameters.base_frame else 2]
-    heading_deg = math.degrees(math.atan2(ahead[1], ahead[0]))
-    covariance, p, q = pose.pose.covariance, pose.pose.pose.position, pose.pose.pose.orientation
-    position_m = math.sqrt(sum(covariance[:15:7]))
-    turn_deg = math.degrees(math.sqrt(covariance[35]))
-    return replace(answer, verdict=Verdict.ACCEPTED, pose=pose, pose_figures={
-        'x [m]': p.x, 'y [m]': p.y, 'z [m]': p.z,
-        'orientation xyzw': f'{q.x} {q.y} {q.z} {q.w}', 'heading [deg]': f'{heading_deg:.2f}',
-        'position deviation [m]': f'{position_m:.4f}',
-        'heading deviation [deg]': f'{turn_deg:.3f}',
-        'covariance': ' '.join(map(repr, map(float, covariance)))}, detail=(
-            f'x {p.x:.2f} y {p.y:.2f} z {p.z:.2f} m in {header.frame_id}, heading '
-            f'{heading_deg:.0f} deg, deviation {position_m:.2f} m and {turn_deg:.1f} deg '
-            f'{summary}'))
+    covariance = move_covariance(
+        found.covariance, map_from_base[:3, 3] - found.map_from_camera[:3, 3])
+    of_pose = figures_of_pose(map_from_base, covariance, 0 if parameters.base_frame else 2)
+    return replace(answer, verdict=Verdict.ACCEPTED, pose_figures=of_pose,
+                   pose=pose_with_covariance_msg(header, map_from_base, covariance),
+                   detail=detail_of(found, header.frame_id, of_pose) + left_out)
 
 
 def answer_msg(answer: Answer, node: str) -> DiagnosticArray:

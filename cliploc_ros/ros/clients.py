@@ -197,7 +197,7 @@ class WakeUp(Node):
             with suppress(ImportError):
                 self._action = importlib.import_module('nav2_msgs.action').Spin
                 self._spinner = ActionClient(self, self._action, 'spin')
-        self._began_at = time.monotonic()
+        self._began_at = self._counts_from = time.monotonic()
         self._timeout_s, self._watches = timeout_s, watch
         self._interrupted = interrupted
         self._said: dict[str, tuple[str, float]] = {}
@@ -213,7 +213,7 @@ class WakeUp(Node):
             while (outcome := self._look_about()) is Outcome.ACCEPTED and self._watches:
                 if problem := self._until_lost():
                     return _end(Outcome.NOT_READY, f'not ready: {problem}')
-                self._began_at = time.monotonic()
+                self._began_at = self._counts_from = time.monotonic()
             return outcome
         finally:
             self._interrupted = Interruption()  # the first interruption is handled
@@ -246,6 +246,9 @@ class WakeUp(Node):
                 '--relocalizer or its namespace')
             if self._elapsed_s > _DISCOVERY_S:
                 self._say('waiting', problem, _AGAIN_S)
+            if self._status.values.get('state') == 'configuring' \
+                    and self._status.silent_s <= SILENT_S:
+                self._counts_from = time.monotonic()  # its first start takes long
             if not problem or self._is_time_up:
                 return problem
             self._spin()
@@ -354,7 +357,7 @@ class WakeUp(Node):
 
     @property
     def _is_time_up(self) -> bool:
-        return self._elapsed_s > self._timeout_s
+        return time.monotonic() - self._counts_from > self._timeout_s
 
     def _say(self, topic: str, text: str, again_s: float = math.inf) -> None:
         """Print a text when it changes, and again after `again_s`."""

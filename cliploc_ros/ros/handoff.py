@@ -420,16 +420,9 @@ class MapToOdom:
             'pauses: stop that node (SLAM or a localizer), or set publish_tf: false')
 
     def open(self) -> None:
-        """Start broadcasting as soon as there is a pose.
-
-        NoTransformError: tf2_ros is not installed.
-        """
-        try:
-            from tf2_ros import TransformBroadcaster
-        except ImportError as error:
-            raise NoTransformError('publish_tf is true, but tf2_ros is not installed: install it, '
-                                   'or set publish_tf: false') from error
+        """Start broadcasting as soon as there is a pose. The transforms must be open."""
         if self._broadcaster is None:
+            from tf2_ros import TransformBroadcaster
             self._broadcaster = TransformBroadcaster(self._node)
         self._timer = steady_timer(self._node, _PERIOD_S, self._broadcast)
 

@@ -223,7 +223,7 @@ class Requests:
         last: Answer | None = None
         problem: CliplocError | None = None
         stages_ms: Counter[str] = Counter()
-        looks, unlinked, after, may_go_on, is_up = 0, 0, arrived_at, True, False
+        unlinked, after, may_go_on, is_up = 0, arrived_at, True, False
         while may_go_on and unlinked < _MAX_UNLINKED:
             times = StageTimes('image', after)
             try:
@@ -250,7 +250,6 @@ class Requests:
             may_go_on = may_go_on and self._robot.is_linked_soon(frame.image.header.stamp,
                                                                  deadline)
             last, is_up, after = answer, answer.is_cut, time.monotonic()
-            looks += 1
             unlinked += answer.query is None or answer.query.run is None  # by odometry
             stages_ms.update(answer.stages_ms)
         assert last is not None
@@ -258,10 +257,7 @@ class Requests:
         if is_up and last.verdict is Verdict.REFUSED and (
                 last.is_cut or last.kind not in _WITHOUT_OBJECTS):
             last = replace(last, detail=f'{last.detail}; {time_is_up(stages_ms)}')
-        if looks == 1:
-            return last
-        return replace(last, detail=f'{last.detail} [{looks} frames in '
-                                    f'{time.monotonic() - arrived_at:.1f} s]')
+        return replace(last, time_s=time.monotonic() - arrived_at)
 
     def _deliver(self, look: Look, deadline: float) -> tuple[Answer, bool]:
         """Publish a result and hand its pose over; return the answer, and whether to go on.

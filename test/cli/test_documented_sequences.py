@@ -9,13 +9,15 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import cv2
 import numpy as np
 import pytest
-from rig_bag import camera_messages, tf_messages, write_messages
-from test_doc_commands import PROJECT, commands_of, program_of
+from rig_bag import camera_messages, odometry_message, tf_messages, write_messages
+from test_doc_commands import PROJECT, commands_in, commands_of, program_of
 from without_pytorch import hide_pytorch
 
 from cliploc_ros.cli.studio import make_parser, open_studio
@@ -38,19 +40,21 @@ BOTH = pytest.mark.parametrize('drive', WHOLE, indirect=True)
 
 
 def write_drive(path, folder, every):
-    """Write the bag that the pages record: images, camera_info and the robot's tf."""
+    """Write the bag that doc/your_robot.md records: images, camera_info, odometry and tf."""
     sequence, camera, _ = read_sequence(folder, None)
     sequence, recorded = sequence.every(every), []
+    stamps = [stamp for stamp in sequence.stamps_ns if sequence.pose_at(stamp) is not None]
     for stamp, file in zip(sequence.stamps_ns, sequence.image_paths, strict=True):
         pixels = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
         for one, topic in zip(camera_messages(stamp, pixels, camera, 'camera_optical_frame'),
                               ('/camera/image_raw', '/camera/camera_info'), strict=True):
             recorded.append((stamp, topic, *one[2:]))
-        pose = sequence.pose_at(stamp)
-        if pose is not None:
-            recorded += tf_messages([(stamp, np.eye(4))], 'map', 'odom')
-            recorded += tf_messages([(stamp, pose @ invert_transform(MOUNT))], 'odom',
-                                    'base_footprint')
+    drive = replace(sequence.trajectory, max_gap_ns=10**10)
+    for stamp in sorted({*stamps, *range(stamps[0], stamps[-1], 50_000_000)}):
+        odom_from_base = drive.pose_at(stamp) @ invert_transform(MOUNT)
+        recorded += tf_messages([(stamp, np.eye(4))], 'map', 'odom')
+        recorded += tf_messages([(stamp, odom_from_base)], 'odom', 'base_footprint')
+        recorded.append(odometry_message(stamp, odom_from_base))
     write_messages(path, [*recorded, *tf_messages(
         [(sequence.stamps_ns[0], MOUNT)], 'base_footprint', 'camera_optical_frame',
         '/tf_static')])
@@ -138,7 +142,7 @@ def test_the_other_commands_run(built, monkeypatch):
         if name == 'studio':
             studio = open_studio(make_parser().parse_args(arguments))
             assert studio.views > 10 and studio.document.landmarks
-            assert 'pose by' in studio.relocalize_here()
+            assert ' deg; by ' in studio.relocalize_here()
             studio.document.close()
         elif name == 'check_map':
             assert main_of(name)([*arguments, *FEW]) in (0, 1), arguments
@@ -150,28 +154,42 @@ def test_the_other_commands_run(built, monkeypatch):
 
 @BOTH
 def test_the_nodes_answer_as_the_page_says(built, monkeypatch):
+    """The robot of the recording drives, with odometry."""
     folder, _, parameters, _ = built
     monkeypatch.chdir(folder)
+    walk('## 4. The pose', {
+        'detector': {'model': parameters['model']},
+        'relocalizer': {'clip_pretrained': parameters['clip_pretrained']}
+        if 'clip_pretrained' in parameters else {'matching': 'class'}})
+
+
+@FULL
+def test_the_nodes_answer_in_the_demos_room(tmp_path, monkeypatch):
+    shutil.copytree(ASSETS, tmp_path / 'room')
+    monkeypatch.chdir(tmp_path)
+    walk('## Without a recording')
+
+
+def walk(section, networks=MappingProxyType({})):
+    """Run the documented commands from a bag to a pose; `networks` are parameters of the nodes."""
+    text = PAGES[0].read_text().split(f'\n{section}')[1].split('\n## ')[0]
     processes = []
     try:
-        for command in commands_of(PAGES[0]):
+        for command in commands_in(text, section):
             module, arguments = program_of(command)
             name = module.rpartition('.')[2]
-            words = [sys.executable, '-m', module, *arguments]
-            if name in ('detector', 'relocalizer'):
-                own = {key: value for key, value in parameters.items()
-                       if key.startswith('clip') == (name == 'relocalizer')}
-                if name == 'relocalizer' and not own:
-                    own = {'matching': 'class'}
-                words += [word for key, value in own.items()
-                          for word in ('-p', f'{key}:={value}')]
+            words = [sys.executable, '-m', module, *arguments, *(
+                word for key, value in networks.get(name, {}).items()
+                for word in ('-p', f'{key}:={value}'))]
             if name in ('replay', 'detector', 'relocalizer'):
                 processes.append(subprocess.Popen(words))
+            elif name == 'tum_to_bag':
+                subprocess.run(words, check=True)
             elif name == 'wake_up':
-                done = subprocess.run([*words, '--timeout', '150'], capture_output=True,
-                                      text=True, timeout=300)
+                done = subprocess.run(words, capture_output=True, text=True, timeout=300)
                 assert done.returncode == 0, done.stdout + done.stderr
-                assert 'accepted' in done.stdout
+                assert re.search(r'^look \d+ .*: accepted: .*; by .*; [0-9.]+ s\n$', done.stdout,
+                                 re.MULTILINE)
     finally:
         for process in processes:
             process.send_signal(signal.SIGINT)

@@ -23,6 +23,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from rig_bag import camera_messages, odometry_message, tf_messages, write_messages
 from rosbags.interfaces import QosDurability, QosHistory, QosReliability
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
@@ -34,6 +35,7 @@ from cliploc_ros.messages import image_from_msg
 from cliploc_ros.offline.datasets import bag_messages, tum
 from cliploc_ros.offline.datasets.bags import LATCHED_QOS, RELIABLE_QOS, BagReader, BagWriter
 from cliploc_ros.offline.datasets.parsing import PRESETS
+from cliploc_ros.offline.replay import with_stands
 
 PROJECT = Path(__file__).resolve().parents[2]
 TIMEOUT_S = 120.0  # only to stop hangs, on a machine under load
@@ -229,6 +231,40 @@ def test_names_selection_and_a_start_offset_that_sends_what_is_latched_first(tmp
     wait_until(lambda: len(listener.received['/x/a']) + len(listener.received['/renamed']) == 6)
     assert {name: [*map(offset_ms, got)] for name, got in listener.received.items() if got} == {
         '/x/a': [5000, 5050], '/renamed': [0, 100, 5000, 5050]}
+
+
+def test_a_robot_stands_on_its_way(tmp_path):
+    recorded, second, end = [], 1000 * MS, 5200 * MS
+    for tick in range(81):
+        at, pose = START_NS + tick * second // 20, np.eye(4)
+        pose[0, 3] = 0.025 * tick
+        recorded += [odometry_message(at, pose), *tf_messages([(at, pose)], 'odom', 'base')]
+        if not tick % 2:
+            recorded += camera_messages(at, np.zeros((2, 2, 3), np.uint8), PRESETS['fr3'])
+            recorded.append((at, *tf_messages([(at + second, np.eye(4))], 'map', 'odom')[0][1:]))
+    bag, stamps, positions = write_messages(tmp_path / 'bag', recorded), defaultdict(list), {}
+    with BagReader(bag) as reader:
+        played = [*with_stands(reader.messages(), reader.topics, 1.0)]
+        for message in played:
+            one = reader.deserialize(message)
+            for part in getattr(one, 'transforms', [one]):
+                stamps[message.topic, getattr(part, 'child_frame_id', '')].append(
+                    bag_messages.stamp_ns(part) - START_NS)
+            if message.topic == '/odom':
+                positions[stamps['/odom', 'base_footprint'][-1]] = one
+    assert [message.stamp_ns for message in played] == sorted(
+        message.stamp_ns for message in played)
+    assert all((np.diff(times) > 0).all() for times in stamps.values())
+    # only the image that the stand begins with loses its camera_info
+    assert {*stamps['/image', '']} - {*stamps['/camera_info', '']} == {3 * second}
+    assert stamps['/tf', 'odom'][-1] - second == stamps['/odom', 'base_footprint'][-1] == end
+    standing = [(one.pose.pose.position.x, one.twist.twist.linear.x)
+                for at, one in positions.items() if 3 * second < at <= 4 * second]
+    assert standing == [(pytest.approx(1.5), 0.0)] * 5
+    assert positions[end].twist.twist.linear.x == 0.5
+    note = 'the robot of /odom drives'
+    assert note in run(bag, '--rate', 100).stdout
+    assert note not in run(bag, '--rate', 100, '--stand', 1).stdout
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

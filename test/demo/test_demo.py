@@ -110,7 +110,7 @@ def test_four_cameras_need_not_turn(tmp_path):
     assert any(f'4 cameras; with the first camera alone, {number:.0f} of {places:.0f} would be '
                'accepted' in output for number in alone)
     page = (tmp_path / 'index.html').read_text()
-    assert page.count(', 4 cameras') == places
+    assert page.count(' in 4 images; ') == places
     assert 'The robot has 4 cameras, front, left, back, right,' in page
     assert 'rank its place' not in page, 'the pictures have no list'
     height, width = cv2.imread(str(tmp_path / 'wake_up_01.png')).shape[:2]

@@ -65,7 +65,7 @@ def four_cameras(start_shared, tester, tmp_path_factory):
 
 def test_four_cameras_see_enough_at_once(four_cameras, tester):
     process, ask = four_cameras
-    while not ask_until(ask, ', 4 cameras;').success:
+    while not ask_until(ask, ' in 4 images; ').success:
         tester.forget()
     tester.wait(lambda: tester.poses, 'a pose')
     assert pose_error(transform_of(tester.poses[-1].pose.pose), np.eye(4))[0] < 0.3

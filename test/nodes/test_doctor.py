@@ -103,7 +103,7 @@ def test_a_whole_robot_passes_and_nothing_is_handed_over(own_relocalizer, examin
                     base_from_camera=MOUNT)
     found, code = examine('--relocalizer', '/relocalizer')
     assert code == 0
-    assert re.fullmatch(r'accepted: x 0\.\d+ y .* m in map, heading .* 12 landmarks, .*; map \w+',
+    assert re.fullmatch(r'accepted: x 0\.\d+ y .* m in map, heading .* by 12 landmarks; [0-9.]+ s',
                         found['pose'][1])
     assert found['relocalizer'][0] == 'pass'
     for what, text in WHOLE.items():

@@ -13,7 +13,7 @@ from scene import make_room, write_bare_map, write_map
 from tester import make_frame, transform_of
 
 from cliploc_ros.cli.evaluate import main as evaluate
-from cliploc_ros.core.geometry.transforms import pose_error, transform_from_pose
+from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, save_layer
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.offline.datasets.folders import read_folder
@@ -59,7 +59,7 @@ def test_keyframes_answer_where_no_object_is_seen_and_a_bad_layer_stops_nothing(
     seen, (image, info, detections) = query_frame()
     answer = tester.relocalize((image, info, detections))
     assert answer.success, answer.message
-    assert 'pose by keyframes' in answer.message and 'points of keyframes' in answer.message
+    assert re.search(r' deg; by \d+ keyframe points; [0-9.]+ s$', answer.message)
     tester.wait(lambda: tester.poses, 'a pose')
     assert pose_error(transform_of(tester.poses[0].pose.pose), seen.map_from_camera)[0] < 0.05
     # boxes that the object search accepts, in an image of another place
@@ -100,11 +100,7 @@ def test_a_map_of_keyframes_alone(start, tester, layer, room_map, tmp_path, caps
     assert tester.trigger('record').success
     case, = (tmp_path / 'cases').iterdir()
     assert evaluate(['--bag', str(case), '--map', str(bare)]) == 0
-    shown = re.search('again:    accepted\npose:     the camera at x (.*) y (.*) z (.*) m, '
-                      r'quaternion \(x y z w\) (.*), in map;', capsys.readouterr().out)
-    again = transform_from_pose(np.array([float(number) for number in shown.groups()[:3]]),
-                                np.array([float(number) for number in shown[4].split()]))
-    assert pose_error(transform_of(tester.poses[0].pose.pose), again)[0] < 0.001
+    assert f'camera): {answer.message.rpartition("; ")[0]}; ' in capsys.readouterr().out
     refusal = tester.relocalize(make_frame()).message
     assert 'the map has only keyframes, and none matches' in refusal
     assert 'detector' not in process.output()

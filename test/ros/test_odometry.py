@@ -4,6 +4,7 @@
 
 import threading
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import make_transform, transform_from_pose
 from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg
+from cliploc_ros.ros.inputs import robot_state
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.watch import LaterError, LocalizerPose, NoLocalizerPoseError
@@ -58,10 +60,14 @@ def place(robot, seconds, **values):
     return robot.at(image, replace(PARAMETERS, **values)).place
 
 
-def test_a_body_that_nobody_places_links_nothing(robot, source, capfd):
+def test_a_body_that_nobody_places_links_nothing_and_is_named_once(robot, source, capfd,
+                                                                  monkeypatch):
+    monkeypatch.setattr(robot_state, 'LOG_PERIOD_S', 0.0)  # log lines are not throttled
     talk(source, 10.0, child_frame='wheels')
-    assert place(robot, 10.0) is None
-    assert 'localizing without odometry: ' in capfd.readouterr().err
+    assert place(robot, 10.0) is None and place(robot, 10.0) is None
+    said = capfd.readouterr().err
+    assert said.count('localizing without odometry: ') == 1
+    assert find_spec('tf2_ros') or 'set base_frame to wheels, and base_from_camera' in said
 
 
 def test_an_image_waits_for_the_message_after_it(robot, source):

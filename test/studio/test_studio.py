@@ -249,7 +249,7 @@ def test_a_map_of_keyframes_alone_gets_its_first_landmark(tmp_path, capsys):
     walk = ASSETS / 'sequence'
     studio = open_studio(make_parser().parse_args([str(path), '--images', str(walk)]))
     assert len(studio.layer) == 6
-    assert 'refused; the map has only keyframes' in studio.relocalize_here()
+    assert 'refused: the map has only keyframes' in studio.relocalize_here()
     studio.document.edit(edits.create, 'a lamp', 'lamp', np.ones(3), np.eye(3))
     studio.document.save()
     studio.document.close()

@@ -22,6 +22,7 @@ CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 DETECTIONS = 'vision_msgs/msg/Detection2DArray'
 POSE = 'geometry_msgs/msg/PoseStamped'
 IMU = 'sensor_msgs/msg/Imu'
+ODOMETRY = 'nav_msgs/msg/Odometry'
 
 
 def stamp_ns(message: Any) -> int:

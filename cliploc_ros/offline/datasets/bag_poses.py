@@ -34,7 +34,7 @@ from cliploc_ros.units import NS_PER_S
 _POSE_TYPES: dict[str, Callable[[Any], Any]] = {
     'geometry_msgs/msg/PoseStamped': lambda message: message.pose,
     'geometry_msgs/msg/PoseWithCovarianceStamped': lambda message: message.pose.pose,
-    'nav_msgs/msg/Odometry': lambda message: message.pose.pose,
+    bag_messages.ODOMETRY: lambda message: message.pose.pose,
 }
 #: Default sources of poses: the topic that tum_to_bag writes, and the map's frame in tf.
 GROUND_TRUTH, MAP_FRAME = '/ground_truth', 'map'

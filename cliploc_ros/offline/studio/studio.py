@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from cliploc_ros.core.answer_line import answer_line, detail_of
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.errors import CliplocError
@@ -419,16 +420,13 @@ class Studio:
         view, landmarks = self.view, self.document.landmarks
         answers = self.seen().relocalize(landmarks, [view], self.layer)
         self.answers = answers
-        ids, trial, result = list(landmarks), answers[view], answers[view].result
+        trial, result = answers[view], answers[view].result
         assert result is not None
-        found = ', '.join(ids[match.landmark] for match in result.matches)
         return '; '.join(filter(None, [
-            f'view {view}: {trial.verdict}', result.reason,
-            '' if trial.error_m is None else f'pose off by {trial.error_m:.2f} m',
-            f'pose by {result.source}' if result.recognized and result.solved else '',
-            f'confidence {result.confidence:.2f}, {len(result.matches)} inliers'
-            + (f' ({found})' if found else ''),
-            f'{max(0, len(result.hypotheses) - 1)} rivals; similarities are simulated']))
+            f'view {view}: ' + answer_line(trial.verdict, detail_of(
+                result, self.document.file.frame_id), result.refusal_kind),
+            '' if trial.error_m is None else f'off by {trial.error_m:.2f} m',
+            'similarities are simulated']))
 
     def relocalize_all(self) -> str:
         """Relocalize in views along the trajectory, and compare with the previous run."""

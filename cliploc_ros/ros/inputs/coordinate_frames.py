@@ -36,18 +36,18 @@ class CoordinateFrames:
         #: Called with each transform that is received, and whether it is static
         self.on_transform: Callable[[TransformStamped, bool], None] = lambda *_: None
 
-    def open(self) -> Any:
+    def open(self, missing: str = 'no transforms', *, remedy: str) -> Any:
         """Subscribe to transforms, so that they are known when the first image arrives.
 
-        NoTransformError: tf2_ros is not installed.
+        NoTransformError: tf2_ros is not installed; `missing` and `remedy` are in the message.
         """
         buffer = self._buffer
         if buffer is None:
             try:
                 buffer = self._buffer = _make_buffer(self._node, self)
             except ImportError as error:
-                raise NoTransformError('a transform is needed, but tf2_ros is not installed: '
-                                       'install it, or set base_from_camera') from error
+                raise NoTransformError(f'{missing}: tf2_ros is not installed; install it, or '
+                                       f'{remedy}') from error
         return buffer
 
     def close(self) -> None:
@@ -96,14 +96,13 @@ class CoordinateFrames:
 
         NoTransformError: tf2 is not installed or has no such transform in time.
         """
-        buffer = self.open()
+        missing = f"no transform from '{source_frame}' to '{target_frame}'"
+        buffer = self.open(missing, remedy=remedy)
         try:
             found = buffer.lookup_transform(target_frame, source_frame, RclTime.from_msg(stamp),
                                             Duration(seconds=timeout_s)).transform
         except Exception as error:  # tf2 raises a different type for each cause
-            raise NoTransformError(
-                f"no transform from '{source_frame}' to '{target_frame}': {error}; publish it, or "
-                f'{remedy}') from error
+            raise NoTransformError(f'{missing}: {error}; publish it, or {remedy}') from error
         t, q = found.translation, found.rotation
         return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
 

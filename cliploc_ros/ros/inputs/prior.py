@@ -50,7 +50,7 @@ class PriorSource:
         self._last: tuple[PoseWithCovarianceStamped, str] | None = None
         # The pose that was stored last, its time, and the hash of the current map.
         self._written: NDArray[np.float64] | None = None
-        self._written_at, self._map_hash = 0.0, ''
+        self._written_at, self._map_hash, self._warned = 0.0, '', ''
         self._subscriptions: list[Subscription] = []
 
     def open(self, parameters: RelocalizerParameters) -> None:
@@ -170,7 +170,9 @@ class PriorSource:
         return Region(frame_id, mean, covariance, probability, camera_from_body)
 
     def _warn(self, text: str) -> None:
-        self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)
+        if text != self._warned:
+            self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)
+        self._warned = text
 
 
 def planar_of(msg: PoseWithCovarianceStamped

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -255,10 +256,11 @@ class RobotStateSource:
         self.vertical.open(parameters.gravity)
         self.prior.open(parameters)
         self.odometry.open()
-        if parameters.publish_tf or parameters.watch == 'tf' or (
-                parameters.base_frame and not any(parameters.base_from_camera)):
-            # in the worker, because importing tf2 takes long
-            self._node.worker.run(self.transforms.open)
+        remedy = 'set publish_tf: false' if parameters.publish_tf else 'set watch: amcl_pose' \
+            if parameters.watch == 'tf' else 'set base_from_camera' \
+            if parameters.base_frame and not any(parameters.base_from_camera) else ''
+        if remedy:  # in the worker, because importing tf2 takes long
+            self._node.worker.run(partial(self.transforms.open, remedy=remedy))
 
     def close(self) -> None:
         """Unsubscribe."""
@@ -356,7 +358,6 @@ class RobotStateSource:
             return None
         try:
             body = self.odometry.pose_at(image.stamp)
-            self.problems.pop('odometry', None)
             camera_from_body = from_frame if body.frame == image.frame_id else \
                 camera_from_base if body.frame == parameters.base_frame else \
                 from_frame @ self._lookup(image, body.frame, parameters)
@@ -367,6 +368,7 @@ class RobotStateSource:
         except NoTransformError as error:
             self._warn('odometry', f'localizing without odometry: {error}')
             return None
+        self.problems.pop('odometry', None)
         return body._replace(
             odom_from_frame=body.odom_from_frame @ invert_transform(camera_from_body),
             frame=image.frame_id)
@@ -376,10 +378,13 @@ class RobotStateSource:
         """Return camera_from_frame; wait for a frame only if it was known the last time."""
         timeout_s = 0.0 if frame in self._unknown else parameters.tf_timeout_s
         self._unknown.add(frame)
-        found = self.transforms.lookup(image.frame_id, frame, image.stamp, timeout_s)
+        found = self.transforms.lookup(image.frame_id, frame, image.stamp, timeout_s,
+                                       f'set base_frame to {frame}, and base_from_camera')
         self._unknown.discard(frame)
         return found
 
     def _warn(self, what: str, text: str) -> None:
+        """Log a problem that is new: tf2_ros that is missing lacks at each request."""
+        if text != self.problems.get(what):
+            self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)
         self.problems[what] = text
-        self._node.get_logger().warning(text, throttle_duration_sec=LOG_PERIOD_S)

@@ -104,11 +104,6 @@ class StageTimes:
         return {**ms, stage: ms.get(stage, 0.0) + max(0.0, now - start) * 1e3}
 
 
-def in_words(stages_ms: Mapping[str, float]) -> str:
-    """Return the times of stages [ms] in words."""
-    return ', '.join(f'{stage} {ms:.0f} ms' for stage, ms in stages_ms.items())
-
-
 class Stages:
     """Times of the stages of recent results, written in one thread and read in another."""
 
