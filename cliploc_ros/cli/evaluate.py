@@ -247,8 +247,8 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
         if file and Path(file).is_file():
             with Path(file).open('rb') as content:
                 hashes[str(file)] = hashlib.file_digest(content, 'sha256').hexdigest()[:12]
-    return {'sha256': hashes, 'detector': detector, 'similarities': similarities,
-            'options': shlex.join(words)}
+    return {'map': ' '.join(file.name for file in options.map), 'sha256': hashes,
+            'detector': detector, 'similarities': similarities, 'options': shlex.join(words)}
 
 
 def _notes(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
