@@ -57,7 +57,7 @@ def test_boxes_are_drawn_dragged_and_linked(person, studio):
     person.page.mouse.up()
     wait_for(lambda: studio.new.boxes[0][2] > 395, 'the edge')
     assert np.allclose(studio.new.boxes[0], (300, 200, 400, 290), atol=2.0)
-    person.page.get_by_text('changed the box of view 0').wait_for()
+    person.page.get_by_text('changed the box of view 1').wait_for()
     person.page.keyboard.press('c')
     wait_for(lambda: studio.view != 0, 'a view from another side')
     person.page.locator('polyline.guess').wait_for(state='attached')

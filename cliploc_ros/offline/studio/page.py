@@ -31,7 +31,7 @@ from cliploc_ros.offline import page as html
 from cliploc_ros.offline.studio import edits, scene, viewpoint
 from cliploc_ros.offline.studio.edits import EditError, Landmark, shape_fields
 from cliploc_ros.offline.studio.room import Cloud, draw_cloud, draw_walls, find_cloud
-from cliploc_ros.offline.studio.studio import Rgb, Studio
+from cliploc_ros.offline.studio.studio import NO_VIEWS, Rgb, Studio
 from cliploc_ros.offline.studio.web import Board, Content, Gate
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ class Desk:
             thread.start()
             return None
         raise EditError(f"the studio has no action '{name:.60}'"
-                        + ('' if studio.new else ': there are no views to draw boxes in'))
+                        + ('' if studio.new else f': {NO_VIEWS}'))
 
     def _run(self, name: str, action: Callable[[], str | None]) -> None:
         self.ask(action)
@@ -375,7 +375,7 @@ def parts_of(desk: Desk) -> dict[str, Any]:
             'name': document.path.name, 'frame': document.file.frame_id,
             'is_saved': document.is_saved, 'notes': document.notes, 'undo': document.to_undo,
             'redo': document.to_redo, 'conflict': document.has_conflict, 'views': studio.views,
-            'has_boxes': review.has_boxes, 'images': studio.recording is not None
+            'has_boxes': review.has_boxes, 'no_views': NO_VIEWS, 'images': studio.recording is not None
             and studio.recording.images is not None,
             'classes': sorted({landmark.class_id for landmark in document.landmarks.values()})},
         'rows': [[key, one.label, one.class_id, one.is_locked, one.is_hidden,

@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.studio.live import LiveRelocalizer
 
 Rgb = tuple[int, int, int]
+#: Answer to actions that need views.
+NO_VIEWS = ('there are no views: start the studio with --images DIR, a folder with poses; a bag needs '
+            '--observations, too')
 # Greatest number of views of a recording in which the relocalizer is tried.
 _MAX_TRIALS = 100
 # Distinct on grey and on photographs. Yellow is used for the selection, magenta for drawn boxes.
@@ -44,6 +47,9 @@ _PALETTE: tuple[Rgb, ...] = (
     (190, 140, 255), (90, 70, 0), (120, 200, 255), (20, 40, 110), (255, 170, 120), (0, 220, 130),
     (110, 110, 110), (180, 70, 0))
 _MAX_PHRASES = 5
+# Past verb of the edit of each field; '': of a text.
+_VERBS = {'label': '', 'class_id': '', 'center': 'moved', 'by': 'moved', 'angles': 'turned',
+          'semi_axes': 'resized'}
 
 
 class ReviewQueue:
@@ -280,8 +286,7 @@ class Studio:
     def seen(self) -> Recording:
         """Return the recording; EditError: there is none."""
         if self.recording is None:
-            raise EditError('there are no views: start the studio with --observations, or with '
-                            '--images and a TUM folder with poses')
+            raise EditError(NO_VIEWS)
         return self.recording
 
     def show_view(self, view: int) -> None:
@@ -338,18 +343,22 @@ class Studio:
     def edit(self, field: str, value: Any, gesture: object = None) -> str | None:
         """Set a field or the angles [deg] of the selected landmark, or move it by metres."""
         key, landmark = self.document.only_chosen()
-        is_text = field in ('label', 'class_id')
-        if not is_text and field not in ('center', 'by', 'angles', 'semi_axes'):
+        verb = _VERBS.get(str(field))
+        if verb is None:
             raise EditError(f"a landmark has no field '{field!s:.60}'")
-        value = str(value) if is_text else edits.numbers(value, 3, field)
+        value = edits.numbers(value, 3, field) if verb else str(value)
         values: dict[str, Any] = {field: value}
         if field == 'angles':
             values = {'orientation': Rotation.from_euler('xyz', value, degrees=True).as_quat()}
         elif field == 'by':
-            values = {'center': np.add(landmark.center, value)}
+            values = {'center': (value := np.add(landmark.center, value))}
         change = self.document.edit(edits.set_fields, [key], **values,
                                     gesture=(field, key, gesture))
-        return f'{key}: {change.what}' if is_text and change.after else None
+        if not change.after:
+            return None
+        return f'{key}: {change.what}' if not verb else (
+            f'{verb} {key} to {" ".join(f"{number:.2f}" for number in value)} '
+            f'{"deg" if field == "angles" else "m"}')
 
     def delete(self) -> str:
         """Delete the selection."""
@@ -423,7 +432,7 @@ class Studio:
         assert result is not None
         found = ', '.join(ids[match.landmark] for match in result.matches)
         return '; '.join(filter(None, [
-            f'view {view}: {trial.verdict}', result.reason,
+            f'view {view + 1}: {trial.verdict}', result.reason,
             '' if trial.error_m is None else f'pose off by {trial.error_m:.2f} m',
             f'pose by {result.source}' if result.recognized and result.solved else '',
             f'confidence {result.confidence:.2f}, {len(result.matches)} inliers'

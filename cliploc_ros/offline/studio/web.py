@@ -15,6 +15,7 @@ import asyncio
 import hmac
 import http
 import json
+import logging
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -25,7 +26,7 @@ from urllib.parse import urlsplit
 
 import websockets.asyncio.server
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 
 from cliploc_ros.errors import OptionsError
@@ -166,6 +167,7 @@ class Gate:
         it starts, so that function is replaced while the context is open.
         """
         serve = websockets.asyncio.server.serve
+        logging.getLogger('websockets.server').addFilter(_is_fault)
 
         def guarded(handler: Callable[[Any], Any], *args: Any,
                     process_request: Callable[..., Any], **options: Any) -> Any:
@@ -199,6 +201,15 @@ class Gate:
             yield
         finally:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def _is_fault(record: logging.LogRecord) -> bool:
+    """Return whether a record of websockets is not of a connection that a browser dropped.
+
+    Chromium opens connections that it may need, and closes them without a request.
+    """
+    return record.exc_info is None or not isinstance(
+        record.exc_info[1], InvalidHandshake | ConnectionError | EOFError)
 
 
 def _file(path: str) -> Content | None:
