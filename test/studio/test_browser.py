@@ -29,6 +29,10 @@ def test_select_type_relabel_undo_save_reload(person, studio, path):
     person.type('Class', 'cup')
     wait_for(lambda: document.landmarks['mug_2'].class_id == 'cup', 'the class')
     person.picture('edited')
+    person.page.keyboard.press('ArrowUp')
+    person.page.get_by_text('moved mug_2 to 5.50 0.42 0.81 m').wait_for()
+    person.page.keyboard.press('Control+z')
+    person.page.get_by_text('undid: move mug_2').wait_for()
     person.page.keyboard.press('Control+z')
     wait_for(lambda: document.landmarks['mug_2'].class_id == 'mug', 'undo')
     assert path.read_text() == before
@@ -153,3 +157,9 @@ def test_layers_film_and_a_click_on_the_image(person, studio):
     wait_for(lambda: studio.document.selection, 'the selection')
     page.mouse.click(*person.on_image((2, 2)))
     wait_for(lambda: not studio.document.selection, 'nothing there')
+    page.evaluate("send('select', {id: 'plant_8'})")
+    page.wait_for_function("() => $('rows').querySelector('[aria-selected=true]')")
+    page.set_viewport_size({'width': 1000, 'height': 500})
+    page.wait_for_function(
+        "() => $('rows').querySelector('[aria-selected=true]').getBoundingClientRect().bottom"
+        " <= $('rows').getBoundingClientRect().bottom + 1")

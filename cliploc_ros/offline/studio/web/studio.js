@@ -341,8 +341,10 @@ function showRows() {
   }));
   if (found.length > MOST_ROWS) $('rows').append(note(`${found.length - MOST_ROWS} more landmarks: use Find`));
   $('rows').scrollTop = top;
-  $('rows').querySelector('[aria-selected=true]')?.scrollIntoView({block: 'nearest'});
+  showChosen();
 }
+
+const showChosen = () => $('rows').querySelector('[aria-selected=true]')?.scrollIntoView({block: 'nearest'});
 
 // ---- the image
 
@@ -642,6 +644,7 @@ $('splitter').onpointermove = event => {
 $('splitter').onpointerup = () => { document.body.classList.remove('dragging'); if (state.view) showView(); };
 document.addEventListener('click', event => { if (!$('menu').contains(event.target)) $('menu').open = false; });
 window.addEventListener('resize', () => { resize(); showView(); });
+new ResizeObserver(showChosen).observe($('rows'));
 window.addEventListener('keydown', keyDown, true);
 // The keys also work in the scene, where they take precedence over viser's keys.
 $('frame').onload = () => {
