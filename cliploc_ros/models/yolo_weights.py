@@ -100,7 +100,7 @@ def resolve_published(given: str, cache_dir: str, option: str) -> Path:
 
     return download(name, folder, (
         f'Without a network: download {name} from https://github.com/ultralytics/assets/releases '
-        f'on another machine and set the {option} to the path of the file'), fetch)
+        f'on another machine and set `{option}` to the path of the file'), fetch)
 
 
 def load_yolo(file: Path) -> Any:
@@ -206,7 +206,7 @@ def _tower(name: str, options: DetectorOptions
                                cache_dir=options.cache_dir)
             weights = resolve_clip_weights(clip)
         except ModelError as error:
-            remedy = str(error).replace(f'{CHECKPOINT}{WITHOUT_CLIP}', 'text_model to the file')
+            remedy = str(error).replace(f'{CHECKPOINT}{WITHOUT_CLIP}', '`text_model` to the file')
             raise ModelError(f'text tower of {options.model}: {remedy}') from error
         return weights.text_key, lambda texts: encode_labels(weights, texts, clip)
     if name not in ('clip', *_TOWERS):
