@@ -37,7 +37,7 @@ _MOST_EXPORTS = 8
 _ABOUT = 'export.json'
 #: The file of an exported detector in its folder.
 DETECTOR = 'model.onnx'
-#: Remedy without CLIP, and the option for a file of weights: of nodes; see command.py for programs.
+#: Remedy without CLIP, and the option for a file of weights, of nodes: run_command shows others.
 WITHOUT_CLIP = ', or do without CLIP: `matching: class`'
 CHECKPOINT = '`clip_checkpoint_path` to the file'
 #: The files of a published CLIP, first in the layout of transformers, then in that of open_clip.

@@ -132,12 +132,13 @@ def check_weights_file(path: Path) -> None:
                          'name is not that of an ONNX or safetensors file')
 
 
-def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path]) -> Path:
+def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path],
+             setting: str = '') -> Path:
     """Download a file with a function of a library; ModelError: that fails.
 
     ``fetch`` returns the path of the file, and must not leave a partial file there. The folder is
-    made if it does not exist; it is in the cache folder. The error names the file (``what``), and
-    a ``remedy`` without a network.
+    made if it does not exist. The error names the file (``what``), and a ``remedy`` without a
+    network. ``setting`` is the option that sets the folder; '': it is in the cache folder.
     """
     logger.info('downloading %s into %s', what, folder)
     try:
@@ -150,10 +151,11 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
     except Exception as error:  # each library has different exceptions
         reason = f'{type(error).__name__}: {first_line(error).rstrip(".")}'
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            reason = f'the disk of {folder} is full: make room'
-        raise ModelError(
-            f'cannot download {what}: {reason}. {remedy}; or run doctor --prepare --cache-dir DIR '
-            f'there, and copy the content of DIR into {folder.parent}') from error
+            reason = f'the disk of {folder} is full: make room{setting and f", or set {setting}"}'
+        if not setting:
+            remedy += ('; or run doctor --prepare --cache-dir DIR there, and copy the content of '
+                       f'DIR into {folder.parent}')
+        raise ModelError(f'cannot download {what}: {reason}. {remedy}') from error
 
 
 def remove_unused(folder: Path, most: int) -> None:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -215,7 +216,9 @@ def test_networks_run_once_and_a_map_of_the_same_images_is_noted(walk, evaluated
                                                                 evaluate_here, caplog):
     own = walk / 'own.yaml'
     shutil.copy(ASSETS / 'map.yaml', own)
-    cache, = walk.glob('bag.cliploc-*.npz')
+    cache = Path(re.search(r'(?:wrote|earlier run:) (\S+\.npz)', evaluated_bag.stderr)[1])
+    assert {path.name for path in walk.iterdir() if path.suffix != '.yaml'} <= {
+        'bag', 'tum', 'saved.npz', 'from_bag', 'from_tum', 'from_saved'}
     before = cache.stat().st_mtime_ns
     given = (*NETWORKS[:-1], own, '--methods', 'clip_b-prosac', '--trials', 1, '--no-figures')
     for source, is_noted in (('bag', True), ('tum', False)):

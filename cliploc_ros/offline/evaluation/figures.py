@@ -305,11 +305,10 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results:
                                           ('refused', '#D55E00', 'X', False)):
         chosen = [result for result in first
                   if result.solved and result.accepted == verdict]
-        # one line with gaps: a line for each pose takes half a minute for thousands of poses
-        ends = [(truth[result.query][:2, 3], np.array(result.map_from_camera)[:2, 3], (np.nan,) * 2)
-                for result in chosen]
+        ends = [[truth[result.query][:2, 3], np.array(result.map_from_camera)[:2, 3],
+                 np.full(2, np.nan)] for result in chosen]  # a line with gaps is faster than many
         if chosen:
-            axes.plot(*np.reshape(ends, (-1, 2)).T, color=color, linewidth=0.9, zorder=5,
+            axes.plot(*np.array(ends).reshape(-1, 2).T, color=color, linewidth=0.9, zorder=5,
                       marker=marker, markevery=(1, 3), markersize=4,
                       label=f'{label} ({len(chosen)})')
     add_legend(figure)

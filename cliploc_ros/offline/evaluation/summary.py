@@ -38,9 +38,10 @@ _OF_SEARCHES = ('mean_search_ms', 'search_ms_std', 'coverage', 'accepted', 'prec
                 'precision_1m_low', 'precision_1m_high', 'recall_1m', 'wrongly_accepted',
                 'crops_share')
 # Columns of the LaTeX table, with their formats.
-_LATEX = {'method': '', **dict.fromkeys(('success_0.25m', 'success_0.5m', 'success_1m', 'accepted',
-                                         'precision_1m', 'median_error_deg', 'mean_error_m'), '.2f'),
-          'median_error_m': '.3f', 'mean_search_ms': '.1f', 'wrongly_accepted': 'g'}
+_LATEX = {'method': '', **dict.fromkeys(
+    ('success_0.25m', 'success_0.5m', 'success_1m', 'accepted', 'precision_1m', 'median_error_deg',
+     'mean_error_m'), '.2f'), 'median_error_m': '.3f', 'mean_search_ms': '.1f',
+    'wrongly_accepted': 'g'}
 _OF_LATEX = {'\\': r'\textbackslash{}', '~': r'\textasciitilde{}', '^': r'\textasciicircum{}',
              '±': r'$\pm$', **{char: rf'\{char}' for char in '&%$#_{}'}}
 

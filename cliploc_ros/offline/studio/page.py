@@ -375,8 +375,8 @@ def parts_of(desk: Desk) -> dict[str, Any]:
             'name': document.path.name, 'frame': document.file.frame_id,
             'is_saved': document.is_saved, 'notes': document.notes, 'undo': document.to_undo,
             'redo': document.to_redo, 'conflict': document.has_conflict, 'views': studio.views,
-            'has_boxes': review.has_boxes, 'no_views': NO_VIEWS, 'images': studio.recording is not None
-            and studio.recording.images is not None,
+            'has_boxes': review.has_boxes, 'no_views': NO_VIEWS,
+            'images': studio.recording is not None and studio.recording.images is not None,
             'classes': sorted({landmark.class_id for landmark in document.landmarks.values()})},
         'rows': [[key, one.label, one.class_id, one.is_locked, one.is_hidden,
                   review.severity(key), one.decision,

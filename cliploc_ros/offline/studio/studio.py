@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 Rgb = tuple[int, int, int]
 #: Answer to actions that need views.
-NO_VIEWS = ('there are no views: start the studio with --images DIR, a folder with poses; a bag needs '
-            '--observations, too')
+NO_VIEWS = ('there are no views: start the studio with --images DIR, a folder with poses; a bag '
+            'needs --observations, too')
 # Greatest number of views of a recording in which the relocalizer is tried.
 _MAX_TRIALS = 100
 # Distinct on grey and on photographs. Yellow is used for the selection, magenta for drawn boxes.
