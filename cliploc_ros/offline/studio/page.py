@@ -32,7 +32,7 @@ from cliploc_ros.offline.studio import edits, scene, viewpoint
 from cliploc_ros.offline.studio.edits import EditError, Landmark, shape_fields
 from cliploc_ros.offline.studio.room import Cloud, draw_cloud, draw_walls, find_cloud
 from cliploc_ros.offline.studio.studio import NO_VIEWS, Rgb, Studio
-from cliploc_ros.offline.studio.web import Board, Content, Gate
+from cliploc_ros.offline.studio.web import FILES, Board, Content, Gate
 
 if TYPE_CHECKING:
     from cliploc_ros.offline.studio.live import LiveRelocalizer
@@ -184,7 +184,9 @@ class Desk:
     def export(self) -> str:
         """Write the scene as an HTML file that can be opened without a server."""
         path = self.studio.document.path.with_suffix('.html')
-        write_text(path, self.server.scene.as_html())
+        style = (FILES / 'scene.css').read_text()
+        write_text(path, self.server.scene.as_html().replace(
+            '</head>', f'<style>{style}</style></head>', 1))
         return f'wrote {path.name}; open it in a browser'
 
     def extent(self) -> viewpoint.Bounds:

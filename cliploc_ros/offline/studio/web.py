@@ -33,7 +33,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.storage import parse_json, unfinished
 
 LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
-_FILES = Path(__file__).parent / 'web'
+FILES = Path(__file__).parent / 'web'
 _TYPES = {'.html': 'text/html; charset=utf-8', '.css': 'text/css; charset=utf-8',
           '.js': 'text/javascript; charset=utf-8', '.jpg': 'image/jpeg'}
 # The page may only load its own files, and other pages may not embed it in a frame.
@@ -122,7 +122,8 @@ def private_page(url: str, beside: Path) -> Iterator[Path]:
         try:
             page = written.enter_context(unfinished(
                 beside.with_suffix('.html'), partial(Path.touch, mode=0o600)))
-            page.write_text(f'<meta http-equiv="refresh" content="0;url={url}">')
+            page.write_text('<meta name="color-scheme" content="light dark">'
+                            f'<meta http-equiv="refresh" content="0;url={url}">')
         except OSError as error:
             raise OptionsError(f'{beside.parent}: cannot be written to: {error.strerror}; make '
                                'room, or give --no-browser') from error
@@ -215,9 +216,9 @@ def _is_fault(record: logging.LogRecord) -> bool:
 def _file(path: str) -> Content | None:
     """Return a file of the page; None for other paths."""
     name = path.lstrip('/') or 'studio.html'
-    if name not in ('studio.html', 'studio.css', 'studio.js'):
+    if name not in ('studio.html', 'studio.css', 'studio.js', 'scene.css'):
         return None
-    return Content((_FILES / name).read_bytes(), Path(name).suffix, False)
+    return Content((FILES / name).read_bytes(), Path(name).suffix, False)
 
 
 def _response(status: http.HTTPStatus, answer: Content) -> Response:

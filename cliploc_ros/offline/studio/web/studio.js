@@ -650,12 +650,7 @@ window.addEventListener('keydown', keyDown, true);
 $('frame').onload = () => {
   const scene = $('frame').contentWindow;
   scene.addEventListener('keydown', keyDown, true);
-  // Hide viser's notices, which repeat the log, and its developer panel: both cover the scene. Its
-  // dark mode is that of all pages; this one is of each page, less dark for the landmarks' colours.
-  const style = scene.document.createElement('style');
-  style.textContent = '.mantine-Notifications-root, .mantine-Paper-root { display: none !important } '
-    + '@media (prefers-color-scheme: dark) { body, div:has(canvas) { background: #4b545f !important } }';
-  scene.document.head.append(style);
+  scene.document.head.append(el('link', {rel: 'stylesheet', href: `${base}scene.css`}));
 };
 $('frame').src = `${base}scene/${person}/`;
 setMode('review');
