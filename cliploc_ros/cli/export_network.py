@@ -12,7 +12,7 @@ from pathlib import Path
 
 from cliploc_ros.cli.options import add_weights_options
 from cliploc_ros.command import option, run_main
-from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.storage import MAKE_ROOM, make_folder, unfinished
 
 EPILOG = """\
@@ -66,7 +66,7 @@ def export_network(options: argparse.Namespace) -> int:
     # The imports take seconds.
     from cliploc_ros.cli.sources import clip_options, detector_options
     from cliploc_ros.models.export import export_clip
-    from cliploc_ros.models.exports import DETECTOR, WITHOUT_CLIP, run_export
+    from cliploc_ros.models.exports import DETECTOR, run_export
     from cliploc_ros.models.onnx_clip import names_onnx
     from cliploc_ros.models.yolo_weights import export_detector, resolve_published
 
@@ -76,11 +76,7 @@ def export_network(options: argparse.Namespace) -> int:
             clip = clip_options(options)
             if names_onnx(clip):
                 raise OptionsError(f'{clip.pretrained} has ONNX files already')
-            try:
-                run_export(f'CLIP {clip.model}', partial(export_clip, clip, half=options.half),
-                           found)
-            except ModelError as error:  # this program has no other task
-                raise ModelError(str(error).replace(WITHOUT_CLIP, '')) from error
+            run_export(f'CLIP {clip.model}', partial(export_clip, clip, half=options.half), found)
         else:
             detector = detector_options(options)
             file = resolve_published(detector.model, '', 'model')

@@ -118,7 +118,7 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
     assert severities == sorted(severities, reverse=True) and severities[0] > 1.0
     total = len(document.landmarks)
     document.select(['tv_1'])
-    assert any('away from where' in text for text in review.check_of('tv_1').faults)
+    assert any('away from where' in text for text in review.checks['tv_1'].faults)
     review.fix()
     assert review.decision('tv_1') == 'fixed'
     assert np.linalg.norm(document.landmarks['tv_1'].center - moved.center) < 0.1

@@ -184,7 +184,8 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     write_text(out / 'run.json', json.dumps(about, indent=1) + '\n')
     write_text(out / 'table.md', '\n\n'.join([summary.as_markdown(rows), *remarks, '\n'.join(
         f'- {name}: {value}' for name, value in facts)]) + '\n')
-    write_text(out / 'results.json', summary.as_json(shown))
+    lines = ',\n'.join(json.dumps(vars(result)) for result in shown)
+    write_text(out / 'results.json', f'[\n{lines}\n]\n')
     statistics = summary.csv_rows(summaries, summary.relative_errors(
         shown, {query.number: query.map_from_camera for query in queries}))
     write_text(out / 'table.tex', ''.join(

@@ -4,7 +4,6 @@
 
 import csv
 import io
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -371,9 +370,3 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
         writer.writerow({name: f'{value:.6g}' if isinstance(value, float) else value
                          for name, value in row.items()})
     return text.getvalue()
-
-
-def as_json(results: Sequence[Result]) -> str:
-    """Return JSON with one result on each line."""
-    lines = ',\n'.join(json.dumps(vars(result)) for result in results)
-    return f'[\n{lines}\n]\n'

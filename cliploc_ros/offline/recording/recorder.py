@@ -103,16 +103,13 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
     files = [options.detector.model, options.detector.text_model]
     if clip is not None:
         files += [clip.model, clip.pretrained, clip.checkpoint_path]
-    source = frames.source
-    parts = [source] if source.is_file() else sorted(
-        part for part in (source.iterdir() if source.is_dir() else ()) if part.suffix in _OF_BAGS)
+    parts = _content(frames.source, _OF_BAGS)
     return json.dumps({
         # by content; frames that a program made have a name only
-        'source': [frames.count, frames.digest or (not parts and source.name),
-                   *map(fingerprint_file, parts)],
+        'source': [frames.count, frames.digest or (not parts and frames.source.name), *parts],
         'detector': _settings(options.detector), 'clip': None if clip is None else _settings(clip),
         # Path('') is the working folder, whose state changes with every file written there
-        'files': [_state(Path(file)) if file else None for file in files],
+        'files': [_content(Path(file)) if file else None for file in files],
         'keyframes': asdict(options.keyframes), 'reading': options.reading})
 
 
@@ -211,9 +208,9 @@ def outputs_name(frames: Frames, described: str) -> str:
     """
     content = parse_json(described.encode()) | {
         'keyframes': None, 'fields': list(SeenFrame.__dataclass_fields__)}  # of this release
-    if frames.digest:  # of images with cameras, and of poses
-        count, digest, *parts = content['source']
-        content |= {'source': [count, digest.partition(' ')[0], *parts], 'reading': None}
+    count, digest, *parts = content['source']
+    if frames.digest and not parts:  # a folder: of images with cameras, and of poses
+        content |= {'source': [count, digest.partition(' ')[0]], 'reading': None}
     return f'.{_digest(json.dumps(content))}.outputs'
 
 
@@ -383,13 +380,11 @@ def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
     return {name: value for name, value in asdict(options).items() if name != 'cache_dir'}
 
 
-def _state(path: Path) -> tuple[int, int] | None:
-    """Return size and time of change of a file; None for the name of a published model."""
-    try:
-        stat = path.stat()
-    except OSError:
-        return None
-    return (0, stat.st_mtime_ns) if path.is_dir() else (stat.st_size, stat.st_mtime_ns)
+def _content(path: Path, suffixes: tuple[str, ...] = ('',)) -> list[str]:
+    """Return the fingerprints of a file, or of files in a folder; none for other names."""
+    files = [path] if path.is_file() else sorted(
+        file for file in path.rglob('*') if file.is_file() and file.name.endswith(suffixes))
+    return [fingerprint_file(file) for file in files]
 
 
 def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:

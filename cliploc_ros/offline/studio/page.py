@@ -343,7 +343,7 @@ class Page:
             is_here = state.pose is not None and state.pose.frame_id == document.file.frame_id
             show('Robot', state if is_here else None, scene.draw_robot)
         # before the image of the scene, which takes time
-        self.board.show({**parts_of(self.desk), 'people': self.board.people})
+        self.board.show({**parts_of(self.desk), 'people': len(self.board.pages)})
         if recording is not None:
             show('Image', studio.view, self._draw_image)
 
@@ -403,7 +403,7 @@ def _selected_part(studio: Studio) -> dict[str, Any] | None:
     if studio.document.selected is None:
         return None
     key, one = studio.document.selected
-    check, sightings = studio.review.check_of(key), studio.sightings(key)
+    check, sightings = studio.review.checks.get(key), studio.sightings(key)
     return {
         'id': key, 'label': one.label, 'class_id': one.class_id,
         'is_locked': one.is_locked, 'decision': one.decision,

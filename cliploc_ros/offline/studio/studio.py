@@ -64,7 +64,8 @@ class ReviewQueue:
 
     def __init__(self, document: Document, recording: Recording | None):
         self._document, self._recording = document, recording
-        self._checks: dict[str, findings.LandmarkCheck] = {}
+        #: The last check of each landmark
+        self.checks: dict[str, findings.LandmarkCheck] = {}
         self._duplicates: list[tuple[str, str]] = []
         self._order: tuple[str, ...] = ()
 
@@ -74,10 +75,6 @@ class ReviewQueue:
     def has_boxes(self) -> bool:
         """Return whether landmarks are checked by boxes of a recording, not by the map alone."""
         return self._recording is not None and len(self._recording.detections.classes) > 0
-
-    def check_of(self, landmark_id: str) -> findings.LandmarkCheck | None:
-        """Return the last check of a landmark."""
-        return self._checks.get(landmark_id)
 
     @property
     def order(self) -> list[str]:
@@ -91,7 +88,7 @@ class ReviewQueue:
 
     def severity(self, landmark_id: str) -> float:
         """Return the severity of the faults of a landmark; 0 after a decision on it."""
-        check = self._checks.get(landmark_id)
+        check = self.checks.get(landmark_id)
         return 0.0 if check is None or self.decision(landmark_id) else check.severity
 
     def counts(self) -> dict[str, int]:
@@ -110,8 +107,8 @@ class ReviewQueue:
             begins_anew = self._order and all(self.decision(key) for key in landmarks)
             if begins_anew:
                 self._document.edit(edits.mark, landmarks, 'review', decision='')
-        self._order = tuple(self._checks)
-        serious = sum(check.severity >= SERIOUS for check in self._checks.values())
+        self._order = tuple(self.checks)
+        serious = sum(check.severity >= SERIOUS for check in self.checks.values())
         source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'
         what = f'checked {len(self._order)} landmarks{source}: {serious} with a serious fault'
         # keep the selection that the user has made meanwhile
@@ -156,7 +153,7 @@ class ReviewQueue:
         gesture = object()  # one undo reverts both the fix and the decision
         self._document.apply(change, gesture)
         self._judge()
-        left = self._checks[landmark_id]
+        left = self.checks[landmark_id]
         if left.severity >= SERIOUS:
             self._document.select([landmark_id])
             return f'{what}; it still {left.faults[0]}'
@@ -200,7 +197,7 @@ class ReviewQueue:
         overlaps = findings.find_map_overlaps(landmark_map, witness, views)
         found = findings.check_landmarks(landmark_map, witness, overlaps)
         ids = list(landmarks)
-        self._checks = {check.landmark_id: check for check in found}
+        self.checks = {check.landmark_id: check for check in found}
         self._duplicates = [(ids[overlap.first], ids[overlap.second]) for overlap in overlaps
                             if overlap.is_duplicate]
 

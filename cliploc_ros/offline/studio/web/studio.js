@@ -130,7 +130,8 @@ function show(changed) {
       name => `${name.replaceAll('_', ' ')} ...`).join(' ');
     if (wantsCheck && state.rows.length && mode === 'review') {
       wantsCheck = false;
-      if (!state.review.total && !state.review.running.includes('check')) send('check');
+      if (state.review.total) selectNext();
+      else if (!state.review.running.includes('check')) send('check');
     }
   }
 }
@@ -144,7 +145,14 @@ function setMode(name) {
     'aria-pressed': String(one === name), onclick: () => setMode(one),
     title: `${one} (${place + 1})`}, capital(one))));
   if (mode === 'create') { send('select', {id: ''}); send('overview'); }
+  if (mode === 'review') selectNext();
   if (state.file.name) show(new Set(Object.keys(state)));
+}
+
+// The review is about a landmark: without a selection, the first one without a decision.
+function selectNext() {
+  const next = state.rows.find(row => !row[6]);
+  if (next && state.review.total && !state.selection.ids.length) send('select', {id: next[0]});
 }
 
 function resize() {
