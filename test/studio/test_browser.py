@@ -118,6 +118,8 @@ def test_without_views_the_scene_has_the_page_and_ids_tell_equal_labels_apart(ch
             label = server.scene._handle_from_node_name['/labels/0']
             wait_for(lambda label=label, chair=chair: label.text == f'{chair}: a chair', 'it')
         person.picture('labels')
+        person.mode('Create')
+        page.get_by_text('start the studio with --images DIR').wait_for()
 
 
 def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, person, studio):

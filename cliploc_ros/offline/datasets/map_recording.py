@@ -30,8 +30,6 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 # The comments at the head of a map are shorter than this [bytes].
 _HEAD = 65_536
 _PATHS = ('observations', 'source', 'images')
-#: Environment variable with the folder of observation files, in place of the cache folder.
-RECORDINGS = 'CLIPLOC_RECORDINGS'
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,8 @@ class MapRecording:
 
 def recordings_folder() -> Path:
     """Return the folder of the observation files that no option names."""
-    return Path(os.environ.get(RECORDINGS) or resolve_cache_dir('') / 'recordings').resolve()
+    named = os.environ.get('CLIPLOC_RECORDINGS')
+    return Path(named or resolve_cache_dir('') / 'recordings').resolve()
 
 
 def recording_path(map_file: Path) -> Path:
