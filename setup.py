@@ -67,7 +67,7 @@ setup(
         f'{PACKAGE}.offline.datasets': ['vision_msgs/msg/*.msg'],
         f'{PACKAGE}.core': ['calibration.yaml'],
         f'{PACKAGE}.offline': ['page.css'],
-        f'{PACKAGE}.offline.studio': ['web/studio.*'],
+        f'{PACKAGE}.offline.studio': ['web/*'],
         f'{PACKAGE}.offline.vocabulary': ['*.yaml'],
     },
     data_files=[

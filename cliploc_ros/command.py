@@ -22,6 +22,8 @@ from cliploc_ros.errors import CliplocError, MapError, OptionsError
 EXIT_INTERRUPTED = 130
 # poll() counts milliseconds in 32 bits.
 _LONGEST_WAIT_S = 2e6
+# Options of the commands that have another name than the parameters of the nodes.
+_OPTIONS = {'clip_checkpoint_path': 'clip_pretrained', 'matching: class': 'no_clip'}
 
 
 def run_main(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int],
@@ -64,7 +66,8 @@ def run_command(command: Callable[[], int], failure: int = 1) -> int:
         return command()
     except CliplocError as error:
         # messages name `parameters` of the library; show the option of the command instead
-        text = re.sub('`([a-z_]+)`', lambda name: f'--{name[1].replace("_", "-")}', str(error))
+        text = re.sub('`([a-z_: ]+)`', lambda name: '--' + _OPTIONS.get(name[1], name[1]).replace(
+            '_', '-'), str(error))
         print('error:', ' '.join(text.split()), file=sys.stderr)
         return failure
     except ModuleNotFoundError as error:

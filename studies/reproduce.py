@@ -399,8 +399,8 @@ def _write_results(names: Sequence[str], sources: Sources, out: Path) -> None:
         recording, folder = sources.recordings[name], out / name / 'evaluation'
         rows, title = _table(folder, recording.paper), f'{name}: {recording.name}'
         texts += [title, summary.as_text(rows), '']
-        latex.append(f'% {title}\n{summary.as_latex(rows)}')
-        lines += _csv_rows(name, folder, recording.paper)
+        lines += (own := [*_csv_rows(name, folder, recording.paper)])
+        latex.append(f'% {title}\n{summary.as_latex(own)}')
         parts.append(html.fold(title, html.table(rows[0], rows[1:]), html.side_by_side(
             html.figure((folder / f'{figure}.png').read_bytes(), CAPTIONS[figure], figure)
             for figure in _FIGURES), is_open=True))

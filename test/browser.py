@@ -80,7 +80,7 @@ class Person:
     def show_view(self, studio, view):
         self.page.evaluate(f"send('show_view', {{view: {view}}})")
         wait_for(lambda: studio.view == view, 'the view')
-        self.page.get_by_text(re.compile(f'^view {view}\\b')).first.wait_for()
+        self.page.get_by_text(re.compile(f'^view {view + 1} of ')).first.wait_for()
 
     def on_image(self, pixel):
         """Return the position on the page of a pixel (2,) of the image."""

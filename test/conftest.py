@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import cv2
@@ -77,6 +78,9 @@ def pytest_configure(config):
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     # The older variable for this setting: ROS warns if both are set.
     os.environ.pop('ROS_LOCALHOST_ONLY', None)
+    # The outputs of networks of an earlier run of the tests are of other code.
+    config.recordings = tempfile.TemporaryDirectory()
+    os.environ['CLIPLOC_RECORDINGS'] = config.recordings.name
     # As in the nodes: waiting threads of PyTorch sleep instead of spinning.
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
 

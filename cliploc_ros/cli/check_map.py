@@ -48,7 +48,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--observations NPZ', 'boxes and poses of a recording of the place (default: '
            'those that the map was built from, as named by NAME.recording.json next to the map)')
     option(parser, '--images BAG|DIR', 'the images of this recording (default: those named by '
-           'NAME.recording.json, or those next to the observations)')
+           'NAME.recording.json)')
     option(parser, '--out DIR', 'folder of check.html and check.json (NAME_check next to the map)')
     option(parser, '--every N', 'use only every N-th frame of the observations (%(default)s)',
            command.positive_int, 1)
@@ -126,13 +126,11 @@ def _read_recording(options: argparse.Namespace, recording: 'MapRecording | None
     from cliploc_ros.cli.sources import images_at
     from cliploc_ros.offline.datasets.images import images_of_recording
     from cliploc_ros.offline.datasets.observations import load_observations
-    from cliploc_ros.offline.recording.recorder import source_of
 
     if options.observations is not None:
-        detections, source = load_observations(options.observations), source_of(
-            options.observations)
+        detections = load_observations(options.observations)
     elif recording is not None:
-        detections, source = recording.load(), None
+        detections = recording.load()
     elif options.images is not None:
         raise OptionsError('--images needs --observations: no recording of this map is known')
     else:
@@ -141,8 +139,8 @@ def _read_recording(options: argparse.Namespace, recording: 'MapRecording | None
         return None
     images = None
     try:
-        if (path := options.images or source) is not None:
-            images = images_at(options, path, detections.camera_names
+        if options.images is not None:
+            images = images_at(options, options.images, detections.camera_names
                                if options.cameras == [''] else options.cameras)
         elif recording is not None:
             images = images_of_recording(recording, detections.camera_names)

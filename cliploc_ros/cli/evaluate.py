@@ -3,7 +3,6 @@
 """The executable ``evaluate``: the paper's table and figures for your own data."""
 
 import argparse
-import hashlib
 import logging
 import math
 import os
@@ -221,6 +220,7 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
     from cliploc_ros.cli.sources import clip_options, detector_options, source_of
     from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_embeddings import embeddings_path
+    from cliploc_ros.models.files import digest_file
     from cliploc_ros.models.onnx_clip import names_onnx
 
     files = [options.queries or source_of(options), *options.map,
@@ -242,13 +242,10 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
     for name, value in given.items():
         values = value if isinstance(value, list) else [value]
         words += [name, *(str(each) for each in values if not isinstance(each, bool))]
-    hashes = {}
-    for file in files:
-        if file and Path(file).is_file():
-            with Path(file).open('rb') as content:
-                hashes[str(file)] = hashlib.file_digest(content, 'sha256').hexdigest()[:12]
-    return {'sha256': hashes, 'detector': detector, 'similarities': similarities,
-            'options': shlex.join(words)}
+    hashes = {str(file): digest_file(Path(file))[:12] for file in files
+              if file and Path(file).is_file()}
+    return {'map': ' '.join(file.name for file in options.map), 'sha256': hashes,
+            'detector': detector, 'similarities': similarities, 'options': shlex.join(words)}
 
 
 def _notes(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',

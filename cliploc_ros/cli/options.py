@@ -41,7 +41,7 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
     add_network_options(group)
     option(group, '--conf', 'least confidence of a detection (%(default)s)', within(0.0, 1.0),
            0.25)
-    option(group, '--record-to NPZ', 'the observation file (next to the recording)')
+    option(group, '--record-to NPZ', 'the observation file (in the cache folder)')
     option(group, '--workers N', 'local processes (%(default)s)', positive_int, 1)
 
 

@@ -18,6 +18,7 @@ from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.models import protocols
+from cliploc_ros.models.files import digest_file
 from cliploc_ros.offline.datasets import bag_frames, bag_poses, frames
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.images import Images, open_images
@@ -118,7 +119,8 @@ def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeO
     They include a text with all options that affect reading, and with `more` from the program.
     Each text has its own observation file.
     """
-    reading = [*(str(getattr(options, name)) for name in _READING), *map(str, more)]
+    reading = [*(str(getattr(options, name)) for name in _READING), *map(str, more),
+               options.trajectory and digest_file(options.trajectory)]
     conf = {'conf': options.conf} if 'conf' in options else {}
     return recorder.RecordingOptions(
         detector_options(options, **conf), clip_options(options) if options.clip else None,

@@ -27,7 +27,6 @@ from cliploc_ros.models.exports import (
     PREPROCESS,
     TEXT_TOWERS,
     TOKENIZER,
-    WITHOUT_CLIP,
     ExportError,
     describe_export,
 )
@@ -139,7 +138,7 @@ def _find(options: ClipOptions) -> _Weights:
         address = f'https://huggingface.co/{where}' if where else tag.get('url')
         file = download(f"the weights '{name}' of CLIP model '{model}'", own, (
             f'Without a network: download {address} on another machine and set {CHECKPOINT}'
-            f'{WITHOUT_CLIP}'), partial(open_clip.download_pretrained, tag, cache_dir=str(own)))
+            ), partial(open_clip.download_pretrained, tag, cache_dir=str(own)))
     check_weights_file(file)
     quick_gelu = bool(config.get('quick_gelu') or tag.get('quick_gelu') or _is_torchscript(file))
     return _Weights(model, file, quick_gelu, {

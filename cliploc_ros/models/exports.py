@@ -31,10 +31,9 @@ _MOST_EXPORTS = 8
 _ABOUT = 'export.json'
 #: The file of an exported detector in its folder.
 DETECTOR = 'model.onnx'
-#: Remedy without CLIP, with the options of the nodes and of the programs.
-WITHOUT_CLIP = ", or do without CLIP ('matching: class', --no-clip)"
-#: The option for a file of weights, as named in messages.
-CHECKPOINT = 'clip_checkpoint_path (of programs: --clip-pretrained) to the file'
+#: Remedy without CLIP, and the option for a file of weights, of nodes: run_command shows others.
+WITHOUT_CLIP = ', or do without CLIP: `matching: class`'
+CHECKPOINT = '`clip_checkpoint_path` to the file'
 #: The files of a published CLIP, first in the layout of transformers, then in that of open_clip.
 IMAGE_TOWERS = ('vision_model.onnx', 'onnx/vision_model.onnx', 'visual/model.onnx')
 TEXT_TOWERS = ('text_model.onnx', 'onnx/text_model.onnx', 'textual/model.onnx')

@@ -162,12 +162,12 @@ def check_weights_file(path: Path) -> None:
 
 
 def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Path],
-             setting: str = 'cache_dir') -> Path:
+             setting: str = '') -> Path:
     """Download a file with a function of a library; ModelError: that fails.
 
     ``fetch`` returns the path of the file, and must not leave a partial file there. The folder is
     made if it does not exist. The error names the file (``what``), and a ``remedy`` without a
-    network. ``setting`` is the option that sets the folder.
+    network. ``setting`` is the option that sets the folder; '': it is in the cache folder.
     """
     logger.info('downloading %s into %s', what, folder)
     try:
@@ -180,10 +180,10 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
     except Exception as error:  # each library has different exceptions
         reason = f'{type(error).__name__}: {first_line(error).rstrip(".")}'
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            reason = f'the disk of {folder} is full: make room, or set {setting} to another disk'
-        if setting == 'cache_dir':
-            remedy += ('; or run doctor --prepare --cache-dir there, and set cache_dir to a '
-                       'copy of its folder')
+            reason = f'the disk of {folder} is full: make room{setting and f", or set {setting}"}'
+        if not setting:
+            remedy += ('; or run doctor --prepare --cache-dir DIR there, and copy the content of '
+                       f'DIR into {folder.parent}')
         raise ModelError(f'cannot download {what}: {reason}. {remedy}') from error
 
 
@@ -222,7 +222,7 @@ def is_hub_name(name: str) -> bool:
 
 
 def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequence[str],
-                   cache_dir: str) -> Path:
+                   cache_dir: str, option: str = 'model') -> Path:
     """Return a folder with networks and the files next to them; download it if necessary.
 
     A complete download is marked, and no further request is sent. Each file is compared with the
@@ -240,7 +240,9 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
         For each network, the patterns of its ONNX file. The first file that exists is used, with
         its file of weights. A FILE in the name replaces the patterns of the first network.
     beside : sequence of str
-        Patterns of all other files.
+        Patterns of all other files. Those in folders belong to another layout than the first.
+    option : str
+        The option that takes the name.
     """
     folder = Path(name).expanduser().absolute()
     if folder.is_dir():
@@ -306,10 +308,11 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
             partial.write_text(json.dumps(str(snapshot.resolve().relative_to(own.resolve()))))
         return snapshot
 
-    listed = ', '.join([*(patterns[0] for patterns in wanted), *beside])
+    listed = ', '.join([*(patterns[0] for patterns in wanted),
+                        *(pattern for pattern in beside if '/' not in pattern)])
     return download(f"the network '{name}'", own, (
         f'Without a network: download {listed} from https://huggingface.co/{repository} on '
-        'another machine into a folder, and give the path of that folder'), fetch)
+        f'another machine into a folder, and set `{option}` to its path'), fetch)
 
 
 def find_network(folder: Path, name: str, networks: Sequence[str]) -> Path:

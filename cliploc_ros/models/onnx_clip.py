@@ -82,7 +82,7 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     named = options.checkpoint_path or options.pretrained
     if names_onnx(options):
         name, folder = named, resolve_folder(named, [IMAGE_TOWERS, TEXT_TOWERS], BESIDE,
-                                             options.cache_dir)
+                                             options.cache_dir, 'clip_pretrained')
     else:
         given, config = Path(named).expanduser().absolute(), ''
         name = options.model.replace('/', '-')  # OpenAI's spelling is ViT-L/14

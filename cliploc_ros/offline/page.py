@@ -32,8 +32,9 @@ def page(title: str, *parts: str) -> str:
 
 
 def first_screen(left: Iterable[str], right: Iterable[str]) -> str:
-    """Return two columns that fill a screen."""
-    return f'<div class="first"><div>{"".join(left)}</div><div>{"".join(right)}</div></div>'
+    """Return two columns that fill a screen, or one if the other would be empty."""
+    columns = map(''.join, (left, right))
+    return f'<div class="first">{"".join(f"<div>{one}</div>" for one in columns if one)}</div>'
 
 
 def verdict(text: str, is_good: bool) -> str:

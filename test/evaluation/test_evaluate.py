@@ -11,6 +11,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -147,7 +148,8 @@ def test_the_files_say_what_was_compared(files, recording, tmp_path, evaluate_he
     assert '--trials' not in about['options']
     for name in ('report.html', 'table.md', 'table.tex'):
         text = (tmp_path / 'out' / name).read_text()
-        assert about['sha256'][str(poses)] in text and 'theirs' in text
+        assert about['sha256'][str(poses)] in text and 'theirs' in text and '>Figures<' not in text
+    assert '<h1>Evaluation of map.yaml</h1>' in (tmp_path / 'out/report.html').read_text()
     assert [row['solved'] for row in results_of(tmp_path / 'out')
             if row['method'] == 'theirs'] == [True] * 9 + [False] * 3
     assert not (tmp_path / 'out/trajectories/theirs.txt').exists()
@@ -215,7 +217,8 @@ def test_networks_run_once_and_a_map_of_the_same_images_is_noted(walk, evaluated
                                                                 evaluate_here, caplog):
     own = walk / 'own.yaml'
     shutil.copy(ASSETS / 'map.yaml', own)
-    cache, = walk.glob('bag.cliploc-*.npz')
+    cache = Path(re.search(r'(?:wrote|earlier run:) (\S+\.npz)', evaluated_bag.stderr)[1])
+    assert [path.name for path in walk.glob('*.npz')] == ['saved.npz'] and not [*walk.glob('.*')]
     before = cache.stat().st_mtime_ns
     given = (*NETWORKS[:-1], own, '--methods', 'clip_b-prosac', '--trials', 1, '--no-figures')
     for source, is_noted in (('bag', True), ('tum', False)):

@@ -216,7 +216,7 @@ def test_success_errors_and_their_spread_over_trials():
     assert summary.table_rows([one])[1][2:4] == (
         '.38±.12 / .50±.00 / .62±.12', '0.650±0.575, 6.50±5.75; 1.10±0.06')
     assert [row[-1] for row in summary.table_rows([one])] == ['solved', '.88']
-    row, = csv.DictReader(summary.as_csv([one]).splitlines())
+    row, = csv.DictReader(summary.csv_text(summary.csv_rows([one])).splitlines())
     assert (row['success_1m'], row['success_1m_std']) == ('0.625', '0.125')
     assert (row['mean_error_m'], row['mean_error_m_std']) == ('1.1', '0.0583333')
     half = make_summary([[0.1, np.inf], [np.inf, np.inf]])
@@ -273,7 +273,8 @@ def test_poses_of_another_program_have_errors_only(questions):
     ours = make_summary([[0.1] * 6 + [2.0] * 6] * 5, 'clip_ransac')
     rows = summary.table_rows([ours, theirs])
     assert rows[2] == ('theirs', '', '.17 / .17 / .17', 'inf, inf; 0.10', *[''] * 4, '.17')
-    _, row = csv.DictReader(summary.as_csv([ours, theirs]).splitlines())
+    _, row = csv.DictReader(summary.csv_text(
+        summary.csv_rows([ours, theirs])).splitlines())
     assert (row['solved'], row['accepted'], row['mean_search_ms']) == ('0.166667', '', '')
     assert 'theirs: poses of another program; 10 of 12 queries have none' in '\n'.join(
         summary.notes([ours, theirs]))
@@ -316,11 +317,17 @@ def test_poses_of_another_program_that_fit_after_one_transform(questions, change
 
 
 def test_the_table_in_latex():
-    text = summary.as_latex([('method', 'success (95 %)'), ('my_own{}', '.10±.02 ~ a\\b & c')])
-    assert text.splitlines() == [
-        r'\begin{tabular}{ll}', r'\toprule', r'method & success (95 \%) \\', r'\midrule',
-        r'my\_own\{\} & .10$\pm$.02 \textasciitilde{} a\textbackslash{}b \& c \\',
-        r'\bottomrule', r'\end{tabular}']
+    """A cell holds one number, also of rows that were read from CSV; an empty cell stays empty."""
+    rows = summary.csv_rows([make_summary([[0.1, 0.4]] * 2, 'my_own{}')])
+    cells = r'my\_own\{\} & 0.50 & 1.00 & 1.00 & 0.250 & 2.50 & 0.25 & 2.0 & 0.00 & 1.00 & 0 & \%'
+    for again in (rows, [*csv.DictReader(summary.csv_text(rows).splitlines())]):
+        text = summary.as_latex([{**again[0], 'paper_success': '%'}])
+        assert text.splitlines() == [
+            rf'\begin{{tabular}}{{l{"r" * 11}}}', r'\toprule',
+            'method & success 0.25m & success 0.5m & success 1m & median error m & median error '
+            r'deg & mean error m & mean search ms & accepted & precision 1m & wrongly accepted & '
+            r'paper success \\', r'\midrule', rf'{cells} \\', r'\bottomrule', r'\end{tabular}']
+    assert '& &' in summary.as_latex([rows[0] | {'accepted': ''}]).replace('  ', ' ')
 
 
 def test_errors_of_the_motion_between_queries():

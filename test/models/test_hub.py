@@ -44,7 +44,7 @@ try:
         with contextlib.suppress(ModelError):
             resolve_clip_weights(ClipOptions(name, 'openai', cache_dir=cache))
         resolve_clip_weights(ClipOptions(name, 'openai', cache_dir=cache))
-    folder = resolve_folder(name, [networks], ['config.json'], cache)
+    folder = resolve_folder(name, [networks], ['config.json', 'visual/c.json'], cache)
     print(json.dumps({'network': str(find_network(folder, name, networks))}))
 except ModelError as error:
     print(json.dumps({'error': str(error)}))
@@ -235,6 +235,7 @@ def test_without_a_network_the_message_names_files_and_remedy(tmp_path):
         text = resolve(tmp_path, **environment)['error']
         assert "cannot download the network 'someone/net'" in text
         assert 'model.onnx, config.json from https://huggingface.co/someone/net' in text
+        assert 'set `model` to its path' in text and text.endswith(f'into {tmp_path}'), text
     text = resolve(tmp_path, 'not/a/name')['error']
     assert 'does not exist' in text
     text = resolve(tmp_path, 'yolov8n', HTTPS_PROXY=f'http://127.0.0.1:{port}')['error']

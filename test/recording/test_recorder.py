@@ -3,6 +3,7 @@
 """Observations of the demo's walk with its real networks: complete, resumed, by two workers."""
 
 import fcntl
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,7 +27,9 @@ from cliploc_ros.core.map.landmark_embeddings import load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.models.protocols import DetectorOptions
-from cliploc_ros.offline.datasets.frames import Frames, RawFrame
+from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.frames import FolderOptions, Frames, RawFrame
+from cliploc_ros.offline.datasets.map_recording import load_recording
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.recording import recorder
 
@@ -61,20 +64,27 @@ def recorded(walk):
         assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--out',
                               walk.parent / 'map.yaml')) == 0
     assert 'no pose: 1 of 16' in output.getvalue()
-    file, = walk.parent.glob('tum.cliploc-*.npz')
-    assert len(list(walk.parent.glob('.tum.cliploc-*.outputs'))) == 1
-    return file
+    assert {path.name.partition('.')[0] for path in walk.parent.iterdir()} == {'tum', 'map'}
+    recording = load_recording(walk.parent / 'map.yaml')
+    return recording.observations
 
 
-def test_observations_lie_next_to_the_recording(walk, recorded, capsys):
+def test_observations_lie_in_the_cache_under_their_content(walk, recorded, tmp_path, capsys):
     content = load_observations(recorded)
     assert (content.images, content.without_pose, len(content)) == (16, 1, 15)
     embeddings = content.embeddings
     assert embeddings.shape == (len(content.scores), 128)
     np.testing.assert_allclose(np.linalg.norm(embeddings.astype(float), axis=1), 1.0, atol=1e-3)
     assert content.encoder_key
-    before = recorded.stat().st_mtime_ns
-    assert main(arguments('--tum', walk, *NETWORKS, *CLIP, *ALL, '--seed', 3, '--out',
+    before, copy = recorded.stat().st_mtime_ns, tmp_path / 'tum'
+    shutil.copytree(walk, copy, copy_function=shutil.copyfile)
+    frames = read_folder(copy, FolderOptions(layout='tum'))
+    image = min((copy / 'rgb').iterdir())
+    pixels = image.read_bytes()
+    image.write_bytes(pixels[:-1] + b'x')
+    assert read_folder(copy, FolderOptions(layout='tum')).digest != frames.digest
+    image.write_bytes(pixels)
+    assert main(arguments('--tum', copy, *NETWORKS, *CLIP, *ALL, '--seed', 3, '--out',
                           walk.parent / 'second.yaml')) == 0
     assert recorded.stat().st_mtime_ns == before
     assert main(arguments('--observations', recorded, *ALL, '--seed', 3, '--out',
@@ -151,24 +161,25 @@ def test_an_input_that_does_not_suit_the_detector_is_named(tmp_path, caplog, ord
     assert said in caplog.text
 
 
-@pytest.mark.parametrize('seen', [0, 2])
-def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen):
-    """Before the first image nothing is left; later the next run resumes from the file."""
+@pytest.mark.parametrize(('seen', 'error', 'kept'), [
+    (0, KeyboardInterrupt, 0), (2, KeyboardInterrupt, 1), (2, DatasetError, 0)])
+def test_a_run_that_fails_leaves_no_more_than_it_says(tmp_path, caplog, seen, error, kept):
+    """The next run resumes from the images that are done, unless the source is unusable."""
     image = cv2.imread(str(min((ASSETS / 'sequence/rgb').iterdir())))
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 
     def read(wanted):
         for place in range(seen):
             yield RawFrame(place, place, np.eye(4), lambda: (image, camera), None)
-        raise DatasetError('ends here')
+        raise error('ends here')
     frames = Frames(tmp_path / 'walk', 3, read)
     options = recorder.RecordingOptions(DetectorOptions(str(ASSETS / 'yolo.onnx')), None)
-    with pytest.raises(DatasetError, match='ends here'):
+    with pytest.raises(error, match='ends here'):
         recorder.record_once(frames, options, tmp_path / 'seen.npz')
     left = list(tmp_path.iterdir())
-    assert len(left) == bool(seen)
+    assert len(left) == kept
     for path in left:  # while another run has it open
-        with path.open('ab') as other, pytest.raises(DatasetError, match='ends here'):
+        with path.open('ab') as other, pytest.raises(error, match='ends here'):
             fcntl.flock(other, fcntl.LOCK_EX)
             recorder.record_once(frames, options, tmp_path / 'seen.npz')
         assert len(list(tmp_path.iterdir())) == 1
@@ -205,13 +216,16 @@ def test_other_poses_use_the_boxes_again_and_depth_is_stored(walk, recorded, tmp
                tmp_path / 'map.yaml')
     for unit_m in (1.0, 1e-7):  # implausible
         assert main(arguments(*command, '--depth-unit', unit_m)) == 1
+        assert not [*tmp_path.glob('.*')]
+    wide = (*command, '--keyframes', '1', '180')
+    assert main(arguments(*wide)) in (0, 1)  # few keyframes may give no map
     outputs, = tmp_path.glob('.*.outputs')
+    count = len(load_observations(file))
     rows, moved = np.loadtxt(walk / 'groundtruth.txt'), tmp_path / 'moved.txt'
     rows[:, 1] += 1.0
     np.savetxt(moved, rows, fmt='%.9f')
-    code = main(arguments(*command, '--keyframes', '1', '180', '--trajectory', moved))
-    assert code in (0, 1)  # few keyframes may give no map
-    assert f'boxes of 1 images of earlier runs: {outputs}' in caplog.text
+    assert main(arguments(*wide, '--trajectory', moved)) in (0, 1)
+    assert f'boxes of {count} images of earlier runs: {outputs}' in caplog.text
     content = load_observations(file)
     assert 2 <= len(content) < 15
     assert content.embeddings is None

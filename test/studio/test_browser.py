@@ -29,6 +29,10 @@ def test_select_type_relabel_undo_save_reload(person, studio, path):
     person.type('Class', 'cup')
     wait_for(lambda: document.landmarks['mug_2'].class_id == 'cup', 'the class')
     person.picture('edited')
+    person.page.keyboard.press('ArrowUp')
+    person.page.get_by_text('moved mug_2 to 5.50 0.42 0.81 m').wait_for()
+    person.page.keyboard.press('Control+z')
+    person.page.get_by_text('undid: move mug_2').wait_for()
     person.page.keyboard.press('Control+z')
     wait_for(lambda: document.landmarks['mug_2'].class_id == 'mug', 'undo')
     assert path.read_text() == before
@@ -57,7 +61,7 @@ def test_boxes_are_drawn_dragged_and_linked(person, studio):
     person.page.mouse.up()
     wait_for(lambda: studio.new.boxes[0][2] > 395, 'the edge')
     assert np.allclose(studio.new.boxes[0], (300, 200, 400, 290), atol=2.0)
-    person.page.get_by_text('changed the box of view 0').wait_for()
+    person.page.get_by_text('changed the box of view 1').wait_for()
     person.page.keyboard.press('c')
     wait_for(lambda: studio.view != 0, 'a view from another side')
     person.page.locator('polyline.guess').wait_for(state='attached')
@@ -114,6 +118,8 @@ def test_without_views_the_scene_has_the_page_and_ids_tell_equal_labels_apart(ch
             label = server.scene._handle_from_node_name['/labels/0']
             wait_for(lambda label=label, chair=chair: label.text == f'{chair}: a chair', 'it')
         person.picture('labels')
+        person.mode('Create')
+        page.get_by_text('start the studio with --images DIR').wait_for()
 
 
 def test_pages_that_share_a_selection_say_so_and_an_old_line_is_told(chromium, person, studio):
@@ -153,3 +159,14 @@ def test_layers_film_and_a_click_on_the_image(person, studio):
     wait_for(lambda: studio.document.selection, 'the selection')
     page.mouse.click(*person.on_image((2, 2)))
     wait_for(lambda: not studio.document.selection, 'nothing there')
+    page.get_by_text('checked 60 landmarks').first.wait_for(state='attached')
+    person.mode('Create')
+    page.wait_for_function('() => !state.selection.ids.length')
+    person.mode('Review')
+    wait_for(lambda: studio.document.selection == ('mug_1',), 'a landmark to review')
+    page.evaluate("send('select', {id: 'plant_8'})")
+    page.wait_for_function("() => $('rows').querySelector('[aria-selected=true]')")
+    page.set_viewport_size({'width': 1000, 'height': 500})
+    page.wait_for_function(
+        "() => $('rows').querySelector('[aria-selected=true]').getBoundingClientRect().bottom"
+        " <= $('rows').getBoundingClientRect().bottom + 1")

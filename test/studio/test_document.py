@@ -102,11 +102,14 @@ def test_every_edit_is_undone_and_done_again(document):
                                  (edits.mark, ['plant_1'], {'what': 'lock', 'is_locked': True}),
                                  (edits.delete, ['book_1'], {})):
         document.edit(edit, chosen, **values)
+        document.select(['cup_1'])
         assert state() != states[-1]
         states.append(state())
     for before in states[-2::-1]:
+        gone = set(before) - set(document.landmarks)
         assert document.undo()
         assert state() == before
+        assert not gone or set(document.selection) == gone, 'it shows what is back'
     assert not document.undo() and document.is_saved
     for after in states[1:]:
         assert document.redo()

@@ -47,6 +47,8 @@ _MOST_M = 1e7
 _ORIENTED = 3
 
 _NO_OPTIONS = frames.FolderOptions()
+# Bytes at the end of an image that distinguish images of equal size.
+_END_BYTES = 4096
 # Incomplete layouts: name, a file that identifies the layout, and the file that is missing.
 _NEARLY = (('TUM RGB-D', 'groundtruth.txt', 'rgb.txt'), ('TUM RGB-D', 'depth.txt', 'rgb.txt'),
            ('Stray Scanner', 'camera_matrix.csv', 'odometry.csv'),
@@ -175,9 +177,21 @@ def _placed(folder: Path, layout: Layout, capture: frames.Capture, options: fram
         notes.append(f'{flat} of {len(files)} images have no depth image')
     posed = [(file, file.pose) for file in files if file.pose is not None]
     digest = ' '.join(hashlib.sha256(repr(known).encode()).hexdigest()[:12] for known in (
-        [(file.color.name, file.stamp_ns, file.camera) for file, _ in posed],
-        [np.round(pose, 6).tolist() for _, pose in posed]))
+        [(file.color.name, file.stamp_ns, file.camera, _end_of(file.color)) for file, _ in posed],
+        [(np.round(pose, 6).tolist(), file.depth and _end_of(file.depth))
+         for file, pose in posed]))
     return replace(found, digest=digest, notes=(*filter(None, notes), *found.notes))
+
+
+def _end_of(file: Path) -> tuple[int, bytes]:
+    """Return the size and the last bytes of an image, which depend on all of its content."""
+    try:
+        with file.open('rb') as content:
+            size = content.seek(0, os.SEEK_END)
+            content.seek(max(0, size - _END_BYTES))
+            return size, content.read()
+    except OSError:  # reported when the image is read
+        return 0, b''
 
 
 def rgbd_frames(folder: Path, options: frames.FolderOptions) -> frames.Frames:

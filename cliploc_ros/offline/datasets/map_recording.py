@@ -3,7 +3,7 @@
 """The recording of a map: NAME.recording.json next to NAME.yaml.
 
 ``check_map`` and the studio use it to find observations and images. Its paths are relative to the
-map, so that the folders can be moved together.
+map, so that the folders can be moved together, unless they are in the cache folder.
 """
 
 import json
@@ -17,7 +17,13 @@ import numpy as np
 from cliploc_ros.core.geometry.transforms import is_rigid, make_transform
 from cliploc_ros.core.map.parameter_file import check_set, set_of
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.files.storage import open_file, parse_json, read_file, write_text
+from cliploc_ros.files.storage import (
+    open_file,
+    parse_json,
+    read_file,
+    resolve_cache_dir,
+    write_text,
+)
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
@@ -57,6 +63,12 @@ class MapRecording:
         return load_observations(self.observations).moved(self.scale, np.array(self.rotation))
 
 
+def recordings_folder() -> Path:
+    """Return the folder of the observation files that no option names."""
+    named = os.environ.get('CLIPLOC_RECORDINGS')
+    return Path(named or resolve_cache_dir('') / 'recordings').resolve()
+
+
 def recording_path(map_file: Path) -> Path:
     """Return the file that describes the recording of a map."""
     return map_file.with_suffix('.recording.json')
@@ -72,7 +84,9 @@ def save_recording(map_file: Path, recording: MapRecording, place: Path | None =
     values: dict[str, Any] = asdict(recording) | ({'set': set_digest} if set_digest else {})
     for name in _PATHS:
         if values[name] is not None:
-            values[name] = os.path.relpath(values[name].resolve(), folder)
+            path = values[name].resolve()
+            values[name] = str(path) if path.is_relative_to(recordings_folder()) else (
+                os.path.relpath(path, folder))
     write_text(place or recording_path(map_file), json.dumps(values, indent=1))
 
 

@@ -5,14 +5,10 @@
 This is not in trials, because core tests with few packages import trials.
 """
 
-import logging
-import os
-import tempfile
 from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,17 +23,14 @@ from cliploc_ros.offline.datasets.frames import Frames, undistorted
 from cliploc_ros.offline.datasets.observations import Queries
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.posed_query import PosedQuery
-from cliploc_ros.offline.recording.recorder import RecordingOptions, observation_file, record_once
-
-logger = logging.getLogger(__name__)
+from cliploc_ros.offline.recording.recorder import RecordingOptions, record_once
 
 
 def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: RecordingOptions,
                      map_files: Sequence[str], compare: str) -> Queries:
     """Return the images with ground truth as queries; detector and CLIP run once.
 
-    CliplocError: the networks cannot be loaded, or the recording fails. If the folder cannot be
-    written to, the observations are not kept, with a warning.
+    CliplocError: the networks cannot be loaded, or the recording fails.
 
     Parameters
     ----------
@@ -48,13 +41,7 @@ def recorded_queries(frames: Frames, landmark_map: LandmarkMap, options: Recordi
     """
     labels = (None if options.clip is None
               else embed_map(options.clip, landmark_map, map_files, compare))
-    file = observation_file(frames, options)
-    if file.exists() or os.access(file.parent, os.W_OK):
-        return make_queries_of(record_once(frames, options), landmark_map, labels)
-    logger.warning('the next run has to record again: %s cannot be written to', file.parent)
-    with tempfile.TemporaryDirectory(prefix='cliploc_ros_') as folder:
-        recorded = record_once(frames, options, Path(folder) / file.name)
-    return make_queries_of(recorded, landmark_map, labels)
+    return make_queries_of(record_once(frames, options), landmark_map, labels)
 
 
 def make_queries_of(detections: PosedDetections, landmark_map: LandmarkMap,

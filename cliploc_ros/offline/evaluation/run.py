@@ -174,13 +174,15 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         f'- {name}: {value}' for name, value in facts)]) + '\n')
     lines = ',\n'.join(json.dumps(vars(result)) for result in shown)
     write_text(out / 'results.json', f'[\n{lines}\n]\n')
+    statistics = summary.csv_rows(summaries, summary.relative_errors(
+        shown, {query.number: query.map_from_camera for query in queries}))
     write_text(out / 'table.tex', ''.join(
-        f'% {name}: {value}\n' for name, value in facts) + summary.as_latex(rows))
-    write_text(out / 'summary.csv', summary.as_csv(summaries, summary.relative_errors(
-        shown, {query.number: query.map_from_camera for query in queries})))
+        f'% {name}: {value}\n' for name, value in facts) + summary.as_latex(statistics))
+    write_text(out / 'summary.csv', summary.csv_text(statistics))
     pictures = _draw(out, parts_of(landmark_map)[0].landmark_map, queries, results,
                      summaries, methods) if sweep is not None else []
-    _write_comparison(out, summaries, rows, remarks, pictures, facts)
+    _write_comparison(out, ' of '.join(['Evaluation', *filter(None, [about.get('map')])]),
+                      summaries, rows, remarks, pictures, facts)
     print(f'results: {out.resolve() / COMPARISON}', flush=True)
     return summaries
 
@@ -214,7 +216,7 @@ def _draw(out: Path, landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
         {name: dict(sorted(counts.items())) for name, counts in sweep.items() if len(counts) > 1})
 
 
-def _write_comparison(folder: Path, summaries: Sequence[summary.Summary],
+def _write_comparison(folder: Path, title: str, summaries: Sequence[summary.Summary],
                       rows: Sequence[Sequence[str]], remarks: Sequence[str],
                       pictures: Sequence[Path], about: Sequence[tuple[str, str]]) -> None:
     """Write the page of `evaluate`. It embeds the pictures, which are PNG files.
@@ -236,11 +238,11 @@ def _write_comparison(folder: Path, summaries: Sequence[summary.Summary],
     head, *brief = [[row[column] for column in _BRIEF] for row in rows]
     top_view = drawn.pop(_TOP_VIEW, '')
     write_text(folder / COMPARISON, html.page(
-        'Evaluation',
+        title,
         html.first_screen([said, html.tiles(numbers), html.table(head, brief)], [top_view]),
         html.fold('Complete table', html.table(rows[0], rows[1:]), *map(html.note, remarks)),
         html.fold('Input and options', html.table(('', ''), about)),
-        html.fold('Figures', html.side_by_side(drawn.values()), is_open=True)))
+        html.fold('Figures', html.side_by_side(drawn.values()), is_open=True) if drawn else ''))
 
 
 def write_trajectories(folder: Path, queries: Sequence[PosedQuery], results: Sequence[Result]

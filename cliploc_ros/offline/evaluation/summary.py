@@ -36,6 +36,11 @@ _SOURCES = ('objects', 'keyframes', 'both')
 _OF_SEARCHES = ('mean_search_ms', 'search_ms_std', 'coverage', 'accepted', 'precision_1m',
                 'precision_1m_low', 'precision_1m_high', 'recall_1m', 'wrongly_accepted',
                 'crops_share')
+# Columns of the LaTeX table, with their formats.
+_LATEX = {'method': '', **dict.fromkeys(
+    ('success_0.25m', 'success_0.5m', 'success_1m', 'accepted', 'precision_1m', 'median_error_deg',
+     'mean_error_m'), '.2f'), 'median_error_m': '.3f', 'mean_search_ms': '.1f',
+    'wrongly_accepted': 'g'}
 _OF_LATEX = {'\\': r'\textbackslash{}', '~': r'\textasciitilde{}', '^': r'\textasciicircum{}',
              '±': r'$\pm$', **{char: rf'\{char}' for char in '&%$#_{}'}}
 
@@ -288,13 +293,16 @@ def as_markdown(rows: Sequence[Sequence[str]]) -> str:
     return '\n'.join([lines[0], '|' + '---|' * len(rows[0]), *lines[1:]])
 
 
-def as_latex(rows: Sequence[Sequence[str]]) -> str:
-    """Return a table in LaTeX, for the package booktabs."""
-    head, *body = [' & '.join(''.join(_OF_LATEX.get(char, char) for char in cell) for cell in row)
-                   + r' \\' for row in rows]
-    columns = 'l' * len(rows[0])
-    return '\n'.join([rf'\begin{{tabular}}{{{columns}}}', r'\toprule', head, r'\midrule', *body,
-                      r'\bottomrule', r'\end{tabular}', ''])
+def as_latex(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the main columns of csv_rows in LaTeX, for booktabs, with one number in a cell."""
+    names = [name for name in rows[0] if name in _LATEX or name.startswith('paper_')]
+    lines = [[name.replace('_', ' ') for name in names], *(
+        [f'{float(row[name]):{_LATEX[name]}}' if _LATEX.get(name) and row[name] != ''
+         else str(row[name]) for name in names] for row in rows)]
+    head, *body = [' & '.join(''.join(_OF_LATEX.get(char, char) for char in cell) for cell in line)
+                   + r' \\' for line in lines]
+    return '\n'.join([rf'\begin{{tabular}}{{l{"r" * len(names[1:])}}}', r'\toprule', head,
+                      r'\midrule', *body, r'\bottomrule', r'\end{tabular}', ''])
 
 
 def relative_errors(results: Iterable[Result], truth: Mapping[int, NDArray[np.float64]]
@@ -317,9 +325,9 @@ def relative_errors(results: Iterable[Result], truth: Mapping[int, NDArray[np.fl
     return {method: tuple(np.median(pairs, axis=0).tolist()) for method, pairs in errors.items()}
 
 
-def as_csv(summaries: Sequence[Summary],
-           relative: Mapping[str, tuple[float, float]] | None = None) -> str:
-    """Return CSV with summary row for each method; `relative` comes from relative_errors."""
+def csv_rows(summaries: Sequence[Summary],
+             relative: Mapping[str, tuple[float, float]] | None = None) -> list[dict[str, Any]]:
+    """Return the statistics of each method by name; `relative` comes from relative_errors."""
     best = find_best(summaries)
     rows: list[dict[str, Any]] = []
     for summary in summaries:
@@ -350,7 +358,7 @@ def as_csv(summaries: Sequence[Summary],
                          'keyframes_ms': float(summary.keyframes_ms.mean())}
         if summary.is_given:
             rows[-1] |= dict.fromkeys(_OF_SEARCHES, '')
-    return csv_text(rows)
+    return rows
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:

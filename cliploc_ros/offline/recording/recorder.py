@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Record observations once, in an observation file next to the recording.
+"""Record observations once, in an observation file in the cache folder.
 
 The file is named after a hash of all that determines its content: source, networks, keyframes.
-The outputs of the networks are also kept next to it, in a file named after a hash of images and
-networks. A run takes them from there, whatever the poses, keyframes and depth are, and also after
-an interrupted run.
+Moved and copied recordings have the same name. The outputs of the networks are also kept next to
+it, in a file named after a hash of images and networks. A run takes them from there, whatever the
+poses, keyframes and depth are, and also after an interrupted run.
 """
 
 import base64
@@ -30,12 +30,14 @@ from cliploc_ros.core.geometry.depth import PLAUSIBLE_DEPTH_M, depths_of_boxes
 from cliploc_ros.errors import DatasetError
 from cliploc_ros.files.log import Log
 from cliploc_ros.files.parallel import run_tasks
-from cliploc_ros.files.storage import parse_json, unfinished
+from cliploc_ros.files.storage import make_folder, parse_json, unfinished
+from cliploc_ros.models.files import fingerprint_file
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.onnx_detector import GREY, is_grey, load_detector
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from cliploc_ros.offline.datasets.bags import MOST_LEFT_OUT
 from cliploc_ros.offline.datasets.frames import Frames, RawFrame
+from cliploc_ros.offline.datasets.map_recording import recordings_folder
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.datasets.poses import Poses
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections, group_cameras
@@ -44,8 +46,8 @@ from cliploc_ros.offline.recording.networks import SeenFrame, load_networks
 from cliploc_ros.units import NS_PER_S
 
 logger = logging.getLogger(__name__)
-# Separates the name of the source and the hash in the name of an observation file.
-_BESIDE = '.cliploc-'
+# Suffixes of a bag's files with messages.
+_OF_BAGS = ('.db3', '.mcap', '.zstd')
 # The unit of depth is checked in this number of frames.
 _FRAMES_FOR_UNIT = 10
 # With fewer boxes per image, a detector finds almost nothing. With fewer than the second number,
@@ -74,21 +76,16 @@ class RecordingOptions:
 
 
 def observation_file(frames: Frames, options: RecordingOptions) -> Path:
-    """Return the path of the observation file next to a source; see `describe`."""
-    source = frames.source.resolve()
-    return source.with_name(
-        f'{source.name}{_BESIDE}{_digest(describe(frames, options))}.npz')
+    """Return the observation file of a source in the cache; see `describe`.
+
+    OptionsError: the folder of recordings cannot be written to.
+    """
+    make_folder(folder := recordings_folder())
+    return folder / f'{_digest(describe(frames, options))}.npz'
 
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
-
-
-def source_of(observations: Path) -> Path | None:
-    """Return the source next to an observation file, see observation_file; None if missing."""
-    name, _, digest = observations.name.partition(_BESIDE)
-    source = observations.with_name(name or observations.name)
-    return source if digest and source.exists() else None
 
 
 def describe(frames: Frames, options: RecordingOptions) -> str:
@@ -97,12 +94,13 @@ def describe(frames: Frames, options: RecordingOptions) -> str:
     files = [options.detector.model, options.detector.text_model]
     if clip is not None:
         files += [clip.model, clip.pretrained, clip.checkpoint_path]
+    parts = _content(frames.source, _OF_BAGS)
     return json.dumps({
-        'source': [frames.source.name, _state(frames.source.resolve()), frames.count,
-                   *([frames.digest] if frames.digest else [])],
+        # by content; frames that a program made have a name only
+        'source': [frames.count, frames.digest or (not parts and frames.source.name), *parts],
         'detector': _settings(options.detector), 'clip': None if clip is None else _settings(clip),
         # Path('') is the working folder, whose state changes with every file written there
-        'files': [_state(Path(file)) if file else None for file in files],
+        'files': [_content(Path(file)) if file else None for file in files],
         'keyframes': asdict(options.keyframes), 'reading': options.reading})
 
 
@@ -201,10 +199,10 @@ def outputs_name(frames: Frames, described: str) -> str:
     """
     content = parse_json(described.encode()) | {
         'keyframes': None, 'fields': list(SeenFrame.__dataclass_fields__)}  # of this release
-    if frames.digest:  # of images with cameras, and of poses
-        content |= {'source': [*content['source'][:3], frames.digest.partition(' ')[0]],
-                    'reading': None}
-    return f'.{frames.source.resolve().name}{_BESIDE}{_digest(json.dumps(content))}.outputs'
+    count, digest, *parts = content['source']
+    if frames.digest and not parts:  # a folder: of images with cameras, and of poses
+        content |= {'source': [count, digest.partition(' ')[0]], 'reading': None}
+    return f'.{_digest(json.dumps(content))}.outputs'
 
 
 @contextmanager
@@ -273,7 +271,13 @@ def _record(frames: Frames, options: RecordingOptions, described: str, outputs: 
                     if len(seen) <= _FRAMES_FOR_UNIT:
                         check_depth_unit(np.concatenate([frame.depths for frame in seen]),
                                          str(frames.source))
-    except BaseException:
+        if len(unusable) > MOST_LEFT_OUT * (len(seen) + len(unusable)):
+            raise DatasetError(unusable[0])
+        encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
+        found = _assemble(seen, frames, filters, encoder_key, described)
+    except BaseException as error:
+        # an unusable source fails again; after a change, it has another name
+        is_kept &= not isinstance(error, DatasetError) or isinstance(error.__cause__, OSError)
         if is_kept and lasts:
             logger.warning('the boxes of this run are kept in %s: run again to continue from '
                            'there, or delete it', outputs.path)
@@ -282,12 +286,9 @@ def _record(frames: Frames, options: RecordingOptions, described: str, outputs: 
         if not (is_kept and lasts):
             outputs.remove()
     if unusable:
-        if len(unusable) > MOST_LEFT_OUT * (len(seen) + len(unusable)):
-            raise DatasetError(unusable[0])
         logger.warning('left out: %d images that cannot be used, such as %s', len(unusable),
                        unusable[0])
-    encoder_key = '' if options.clip is None else resolve_clip_weights(options.clip).key
-    return _assemble(seen, frames, filters, encoder_key, described)
+    return found
 
 
 @contextmanager
@@ -372,13 +373,11 @@ def _settings(options: DetectorOptions | ClipOptions) -> dict[str, Any]:
     return {name: value for name, value in asdict(options).items() if name != 'cache_dir'}
 
 
-def _state(path: Path) -> tuple[int, int] | None:
-    """Return size and time of change of a file; None for the name of a published model."""
-    try:
-        stat = path.stat()
-    except OSError:
-        return None
-    return (0, stat.st_mtime_ns) if path.is_dir() else (stat.st_size, stat.st_mtime_ns)
+def _content(path: Path, suffixes: tuple[str, ...] = ('',)) -> list[str]:
+    """Return the fingerprints of a file, or of files in a folder; none for other names."""
+    files = [path] if path.is_file() else sorted(
+        file for file in path.rglob('*') if file.is_file() and file.name.endswith(suffixes))
+    return [fingerprint_file(file) for file in files]
 
 
 def check_depth_unit(depths_m: NDArray[np.float32], where: str) -> None:

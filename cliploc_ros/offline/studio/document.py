@@ -150,7 +150,9 @@ class Document:
         with self.lock:
             if not self._done:
                 return None
+            before = self.landmarks
             self._do('undo', self._done[-1])
+            self.select([key for key in self.landmarks if key not in before] or self.selection)
             return f'undid: {self.to_redo}'
 
     def redo(self) -> str | None:

@@ -71,7 +71,7 @@ class NewLandmark:
         self._set({**self.boxes, view: [*low.tolist(), *high.tolist()]})
         if ious[same] > _SAME_IOU:
             self.class_id = self._recording.detections.detections_of(view).class_ids[same]
-        return f'{what} the box of view {view}; ' + '; '.join(
+        return f'{what} the box of view {view + 1}; ' + '; '.join(
             filter(None, [f'boxes drawn: {len(self.boxes)}', self.doubt]))
 
     def forget(self, view: int | None = None) -> str:

@@ -31,8 +31,8 @@ from cliploc_ros.offline import page as html
 from cliploc_ros.offline.studio import edits, scene, viewpoint
 from cliploc_ros.offline.studio.edits import EditError, Landmark, shape_fields
 from cliploc_ros.offline.studio.room import Cloud, draw_cloud, draw_walls, find_cloud
-from cliploc_ros.offline.studio.studio import Rgb, Studio
-from cliploc_ros.offline.studio.web import Board, Content, Gate
+from cliploc_ros.offline.studio.studio import NO_VIEWS, Rgb, Studio
+from cliploc_ros.offline.studio.web import FILES, Board, Content, Gate
 
 if TYPE_CHECKING:
     from cliploc_ros.offline.studio.live import LiveRelocalizer
@@ -132,7 +132,7 @@ class Desk:
             thread.start()
             return None
         raise EditError(f"the studio has no action '{name:.60}'"
-                        + ('' if studio.new else ': there are no views to draw boxes in'))
+                        + ('' if studio.new else f': {NO_VIEWS}'))
 
     def _run(self, name: str, action: Callable[[], str | None]) -> None:
         self.ask(action)
@@ -184,7 +184,9 @@ class Desk:
     def export(self) -> str:
         """Write the scene as an HTML file that can be opened without a server."""
         path = self.studio.document.path.with_suffix('.html')
-        write_text(path, self.server.scene.as_html())
+        style = (FILES / 'scene.css').read_text()
+        write_text(path, self.server.scene.as_html().replace(
+            '</head>', f'<style>{style}</style></head>', 1))
         return f'wrote {path.name}; open it in a browser'
 
     def extent(self) -> viewpoint.Bounds:
@@ -341,7 +343,7 @@ class Page:
             is_here = state.pose is not None and state.pose.frame_id == document.file.frame_id
             show('Robot', state if is_here else None, scene.draw_robot)
         # before the image of the scene, which takes time
-        self.board.show({**parts_of(self.desk), 'people': self.board.people})
+        self.board.show({**parts_of(self.desk), 'people': len(self.board.pages)})
         if recording is not None:
             show('Image', studio.view, self._draw_image)
 
@@ -375,8 +377,8 @@ def parts_of(desk: Desk) -> dict[str, Any]:
             'name': document.path.name, 'frame': document.file.frame_id,
             'is_saved': document.is_saved, 'notes': document.notes, 'undo': document.to_undo,
             'redo': document.to_redo, 'conflict': document.has_conflict, 'views': studio.views,
-            'has_boxes': review.has_boxes, 'images': studio.recording is not None
-            and studio.recording.images is not None,
+            'has_boxes': review.has_boxes, 'no_views': NO_VIEWS,
+            'images': studio.recording is not None and studio.recording.images is not None,
             'classes': sorted({landmark.class_id for landmark in document.landmarks.values()})},
         'rows': [[key, one.label, one.class_id, one.is_locked, one.is_hidden,
                   review.severity(key), one.decision,
@@ -401,7 +403,7 @@ def _selected_part(studio: Studio) -> dict[str, Any] | None:
     if studio.document.selected is None:
         return None
     key, one = studio.document.selected
-    check, sightings = studio.review.check_of(key), studio.sightings(key)
+    check, sightings = studio.review.checks.get(key), studio.sightings(key)
     return {
         'id': key, 'label': one.label, 'class_id': one.class_id,
         'is_locked': one.is_locked, 'decision': one.decision,

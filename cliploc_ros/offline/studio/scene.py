@@ -185,11 +185,11 @@ def draw_image(scene: viser.SceneApi, picture: NDArray[np.uint8], camera: Camera
 
 
 def draw_floor(scene: viser.SceneApi, extent: Bounds) -> None:
-    """Draw the grid of the floor, with cells of half a metre."""
+    """Draw the grid of the floor, with cells of half a metre, for a light or dark ground."""
     side = 2.0 * float(np.ceil(1.3 * extent.radius_m)) + 2.0
     below = extent.middle - (extent.middle @ extent.up - extent.floor_m) * extent.up
     scene.add_grid('/floor', width=side, height=side, cell_size=0.5, fade_strength=2.0,
-                   cell_color=(225, 225, 225), section_color=(190, 190, 190), position=below,
+                   cell_color=(190, 190, 190), section_color=(150, 150, 150), position=below,
                    wxyz=wxyz_of(extent.upright))
 
 

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.studio.live import LiveRelocalizer
 
 Rgb = tuple[int, int, int]
+#: Answer to actions that need views.
+NO_VIEWS = ('there are no views: start the studio with --images DIR, a folder with poses; a bag '
+            'needs --observations, too')
 # Greatest number of views of a recording in which the relocalizer is tried.
 _MAX_TRIALS = 100
 # Distinct on grey and on photographs. Yellow is used for the selection, magenta for drawn boxes.
@@ -45,6 +48,9 @@ _PALETTE: tuple[Rgb, ...] = (
     (190, 140, 255), (90, 70, 0), (120, 200, 255), (20, 40, 110), (255, 170, 120), (0, 220, 130),
     (110, 110, 110), (180, 70, 0))
 _MAX_PHRASES = 5
+# Past verb of the edit of each field; '': of a text.
+_VERBS = {'label': '', 'class_id': '', 'center': 'moved', 'by': 'moved', 'angles': 'turned',
+          'semi_axes': 'resized'}
 
 
 class ReviewQueue:
@@ -59,7 +65,8 @@ class ReviewQueue:
 
     def __init__(self, document: Document, recording: Recording | None):
         self._document, self._recording = document, recording
-        self._checks: dict[str, findings.LandmarkCheck] = {}
+        #: The last check of each landmark
+        self.checks: dict[str, findings.LandmarkCheck] = {}
         self._duplicates: list[tuple[str, str]] = []
         self._order: tuple[str, ...] = ()
 
@@ -69,10 +76,6 @@ class ReviewQueue:
     def has_boxes(self) -> bool:
         """Return whether landmarks are checked by boxes of a recording, not by the map alone."""
         return self._recording is not None and len(self._recording.detections.classes) > 0
-
-    def check_of(self, landmark_id: str) -> findings.LandmarkCheck | None:
-        """Return the last check of a landmark."""
-        return self._checks.get(landmark_id)
 
     @property
     def order(self) -> list[str]:
@@ -86,7 +89,7 @@ class ReviewQueue:
 
     def severity(self, landmark_id: str) -> float:
         """Return the severity of the faults of a landmark; 0 after a decision on it."""
-        check = self._checks.get(landmark_id)
+        check = self.checks.get(landmark_id)
         return 0.0 if check is None or self.decision(landmark_id) else check.severity
 
     def counts(self) -> dict[str, int]:
@@ -105,8 +108,8 @@ class ReviewQueue:
             begins_anew = self._order and all(self.decision(key) for key in landmarks)
             if begins_anew:
                 self._document.edit(edits.mark, landmarks, 'review', decision='')
-        self._order = tuple(self._checks)
-        serious = sum(check.severity >= SERIOUS for check in self._checks.values())
+        self._order = tuple(self.checks)
+        serious = sum(check.severity >= SERIOUS for check in self.checks.values())
         source = '' if self.has_boxes else ' by the map alone: there are no boxes of a recording'
         what = f'checked {len(self._order)} landmarks{source}: {serious} with a serious fault'
         # keep the selection that the user has made meanwhile
@@ -151,7 +154,7 @@ class ReviewQueue:
         gesture = object()  # one undo reverts both the fix and the decision
         self._document.apply(change, gesture)
         self._judge()
-        left = self._checks[landmark_id]
+        left = self.checks[landmark_id]
         if left.severity >= SERIOUS:
             self._document.select([landmark_id])
             return f'{what}; it still {left.faults[0]}'
@@ -195,7 +198,7 @@ class ReviewQueue:
         overlaps = findings.find_map_overlaps(landmark_map, witness, views)
         found = findings.check_landmarks(landmark_map, witness, overlaps)
         ids = list(landmarks)
-        self._checks = {check.landmark_id: check for check in found}
+        self.checks = {check.landmark_id: check for check in found}
         self._duplicates = [(ids[overlap.first], ids[overlap.second]) for overlap in overlaps
                             if overlap.is_duplicate]
 
@@ -281,8 +284,7 @@ class Studio:
     def seen(self) -> Recording:
         """Return the recording; EditError: there is none."""
         if self.recording is None:
-            raise EditError('there are no views: start the studio with --observations, or with '
-                            '--images and a TUM folder with poses')
+            raise EditError(NO_VIEWS)
         return self.recording
 
     def show_view(self, view: int) -> None:
@@ -339,18 +341,22 @@ class Studio:
     def edit(self, field: str, value: Any, gesture: object = None) -> str | None:
         """Set a field or the angles [deg] of the selected landmark, or move it by metres."""
         key, landmark = self.document.only_chosen()
-        is_text = field in ('label', 'class_id')
-        if not is_text and field not in ('center', 'by', 'angles', 'semi_axes'):
+        verb = _VERBS.get(str(field))
+        if verb is None:
             raise EditError(f"a landmark has no field '{field!s:.60}'")
-        value = str(value) if is_text else edits.numbers(value, 3, field)
+        value = edits.numbers(value, 3, field) if verb else str(value)
         values: dict[str, Any] = {field: value}
         if field == 'angles':
             values = {'orientation': Rotation.from_euler('xyz', value, degrees=True).as_quat()}
         elif field == 'by':
-            values = {'center': np.add(landmark.center, value)}
+            values = {'center': (value := np.add(landmark.center, value))}
         change = self.document.edit(edits.set_fields, [key], **values,
                                     gesture=(field, key, gesture))
-        return f'{key}: {change.what}' if is_text and change.after else None
+        if not change.after:
+            return None
+        return f'{key}: {change.what}' if not verb else (
+            f'{verb} {key} to {" ".join(f"{number:.2f}" for number in value)} '
+            f'{"deg" if field == "angles" else "m"}')
 
     def delete(self) -> str:
         """Delete the selection."""
@@ -423,7 +429,7 @@ class Studio:
         trial, result = answers[view], answers[view].result
         assert result is not None
         return '; '.join(filter(None, [
-            f'view {view}: ' + answer_line(trial.verdict, detail_of(
+            f'view {view + 1}: ' + answer_line(trial.verdict, detail_of(
                 result, self.document.file.frame_id), result.refusal_kind),
             '' if trial.error_m is None else f'off by {trial.error_m:.2f} m',
             'similarities are simulated']))

@@ -15,6 +15,7 @@ import asyncio
 import hmac
 import http
 import json
+import logging
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -25,14 +26,15 @@ from urllib.parse import urlsplit
 
 import websockets.asyncio.server
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.storage import parse_json, unfinished
 
 LOOPBACK_NAMES = ('127.0.0.1', 'localhost', '::1')
-_FILES = Path(__file__).parent / 'web'
+FILES = Path(__file__).parent / 'web'
+_NAMES = ('studio.html', 'studio.css', 'studio.js', 'scene.css')
 _TYPES = {'.html': 'text/html; charset=utf-8', '.css': 'text/css; charset=utf-8',
           '.js': 'text/javascript; charset=utf-8', '.jpg': 'image/jpeg'}
 # The page may only load its own files, and other pages may not embed it in a frame.
@@ -58,12 +60,7 @@ class Board:
         self._on_change = on_change
         self._parts: dict[str, str] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._pages: set[asyncio.Event] = set()
-
-    @property
-    def people(self) -> int:
-        """The number of open pages."""
-        return len(self._pages)
+        self.pages: set[asyncio.Event] = set()  #: An event of each open page
 
     def show(self, parts: dict[str, Any]) -> None:
         """Show the given parts; may be called in any thread."""
@@ -75,13 +72,13 @@ class Board:
             self._loop.call_soon_threadsafe(self._wake)
 
     def _wake(self) -> None:
-        for event in self._pages:
+        for event in self.pages:
             event.set()
 
     async def serve(self, connection: Any, do: Callable[[dict[str, Any]], None]) -> None:
         """Send parts to a page until it closes, and process its messages one by one."""
         self._loop, event, sent = asyncio.get_running_loop(), asyncio.Event(), dict[str, str]()
-        self._pages.add(event)
+        self.pages.add(event)
         event.set()
         self._on_change()
 
@@ -104,7 +101,7 @@ class Board:
         except (ConnectionClosed, ValueError):
             pass
         finally:
-            self._pages.discard(event)
+            self.pages.discard(event)
             sender.cancel()
             self._on_change()
 
@@ -121,7 +118,8 @@ def private_page(url: str, beside: Path) -> Iterator[Path]:
         try:
             page = written.enter_context(unfinished(
                 beside.with_suffix('.html'), partial(Path.touch, mode=0o600)))
-            page.write_text(f'<meta http-equiv="refresh" content="0;url={url}">')
+            page.write_text('<meta name="color-scheme" content="light dark">'
+                            f'<meta http-equiv="refresh" content="0;url={url}">')
         except OSError as error:
             raise OptionsError(f'{beside.parent}: cannot be written to: {error.strerror}; make '
                                'room, or give --no-browser') from error
@@ -166,6 +164,7 @@ class Gate:
         it starts, so that function is replaced while the context is open.
         """
         serve = websockets.asyncio.server.serve
+        logging.getLogger('websockets.server').addFilter(_is_fault)
 
         def guarded(handler: Callable[[Any], Any], *args: Any,
                     process_request: Callable[..., Any], **options: Any) -> Any:
@@ -186,8 +185,10 @@ class Gate:
                     return process_request(connection, request)
                 # pages of other sites must not even find out which pictures exist
                 is_foreign = request.headers.get('Sec-Fetch-Site') == 'cross-site'
-                found = _file(path) or (None if is_foreign else
-                                        await asyncio.to_thread(answer, path))
+                name = path.lstrip('/') or 'studio.html'
+                found = (Content((FILES / name).read_bytes(), Path(name).suffix, False)
+                         if name in _NAMES else None if is_foreign
+                         else await asyncio.to_thread(answer, path))
                 if found is None:
                     return _response(http.HTTPStatus.NOT_FOUND, Content(b'not found\n', '', False))
                 return _response(http.HTTPStatus.OK, found)
@@ -201,12 +202,13 @@ class Gate:
             websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-def _file(path: str) -> Content | None:
-    """Return a file of the page; None for other paths."""
-    name = path.lstrip('/') or 'studio.html'
-    if name not in ('studio.html', 'studio.css', 'studio.js'):
-        return None
-    return Content((_FILES / name).read_bytes(), Path(name).suffix, False)
+def _is_fault(record: logging.LogRecord) -> bool:
+    """Return whether a record of websockets is not of a connection that a browser dropped.
+
+    Chromium opens connections that it may need, and closes them without a request.
+    """
+    return record.exc_info is None or not isinstance(
+        record.exc_info[1], InvalidHandshake | ConnectionError | EOFError)
 
 
 def _response(status: http.HTTPStatus, answer: Content) -> Response:

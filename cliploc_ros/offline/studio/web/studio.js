@@ -73,6 +73,8 @@ function button(text, action, {key = '', kind = '', off = false, hint = ''} = {}
 }
 
 const doing = (name, values) => () => send(name, values);
+// People count from 1.
+const viewName = view => `view ${view + 1}`;
 const capital = text => text[0].toUpperCase() + text.slice(1);
 const buttons = (...children) => el('div', {className: 'buttons'}, ...children);
 const note = text => text ? el('p', {className: 'note'}, text) : null;
@@ -128,7 +130,8 @@ function show(changed) {
       name => `${name.replaceAll('_', ' ')} ...`).join(' ');
     if (wantsCheck && state.rows.length && mode === 'review') {
       wantsCheck = false;
-      if (!state.review.total && !state.review.running.includes('check')) send('check');
+      if (state.review.total) selectNext();
+      else if (!state.review.running.includes('check')) send('check');
     }
   }
 }
@@ -142,7 +145,14 @@ function setMode(name) {
     'aria-pressed': String(one === name), onclick: () => setMode(one),
     title: `${one} (${place + 1})`}, capital(one))));
   if (mode === 'create') { send('select', {id: ''}); send('overview'); }
+  if (mode === 'review') selectNext();
   if (state.file.name) show(new Set(Object.keys(state)));
+}
+
+// The review is about a landmark: without a selection, the first one without a decision.
+function selectNext() {
+  const next = state.rows.find(row => !row[6]);
+  if (next && state.review.total && !state.selection.ids.length) send('select', {id: next[0]});
 }
 
 function resize() {
@@ -267,7 +277,7 @@ const PANELS = {
   },
   create() {
     const made = state.new;
-    if (!made) return [note('There are no views to draw boxes in.')];
+    if (!made) return [note(`${capital(state.file.no_views)}.`)];
     const count = made.boxes.length, hasBox = made.boxes.some(([view]) => view === state.view.view);
     const value = name => typedNew[name] ?? (made.class_id && (name === 'class_id' ? made.class_id : `a ${made.class_id}`));
     const input = (name, text, list) => field(text, [value(name)], typed => { typedNew[name] = typed; showPanel(); }, {isText: true, list});
@@ -277,7 +287,7 @@ const PANELS = {
             'The dashed ellipse is the fit. A third box improves it.'][Math.min(count, 2)]),
       made.doubt ? el('p', {className: 'note', style: 'color:var(--bad)'}, made.doubt) : null,
       el('div', {className: 'chips'}, ...made.boxes.map(([view]) => button(
-        `view ${view}`, doing('show_view', {view}), {hint: 'show it'}))),
+        viewName(view), doing('show_view', {view}), {hint: 'show it'}))),
       input('label', 'Label'), input('class_id', 'Class', 'classes'),
       buttons(button('Create', create, {key: '↵', kind: 'main', off: count < 2}),
               button('Next view', doing('next_view'), {key: 'C', off: !count, hint: 'a view from another side'}),
@@ -296,7 +306,7 @@ const PANELS = {
       is('check_map') ? el('progress', {max: 1, value: test.share}) : null,
       test.is_stale ? note('The check is of the map before the last edits: check again.') : null,
       test.answers.length ? el('div', {className: 'answers'}, ...test.answers.map(([view, verdict, error, reason]) =>
-        button(`view ${view}: ${verdict}${error === null ? '' : `, off by ${error} m`}${reason ? `; ${reason}` : ''}`, doing('show_view', {view})))) : null,
+        button(`${viewName(view)}: ${verdict}${error === null ? '' : `, off by ${error} m`}${reason ? `; ${reason}` : ''}`, doing('show_view', {view})))) : null,
       ...(test.robot ? [el('hr'), ...test.robot.map(note),
         buttons(button('Relocalize the robot', doing('relocalize_robot'), {off: isAsked}),
                 button('Reload the map of the robot', doing('reload_robot'), {off: isAsked}),
@@ -339,8 +349,10 @@ function showRows() {
   }));
   if (found.length > MOST_ROWS) $('rows').append(note(`${found.length - MOST_ROWS} more landmarks: use Find`));
   $('rows').scrollTop = top;
-  $('rows').querySelector('[aria-selected=true]')?.scrollIntoView({block: 'nearest'});
+  showChosen();
 }
+
+const showChosen = () => $('rows').querySelector('[aria-selected=true]')?.scrollIntoView({block: 'nearest'});
 
 // ---- the image
 
@@ -353,7 +365,7 @@ function showView() {
   shownView = view.view;
   applyZoom();
   if (document.activeElement !== $('slider')) $('slider').value = view.view;
-  $('where').textContent = `view ${view.view}${view.camera ? `, camera ${view.camera}` : ''}`;
+  $('where').textContent = `${viewName(view.view)} of ${state.file.views}${view.camera ? `, camera ${view.camera}` : ''}`;
   $('empty').textContent = state.file.images ? '' : 'No images, only boxes: start the studio with --images to show images';
   const colors = Object.fromEntries(state.rows.map(row => [row[0], row[7]]));
   const chosen = new Set(state.selection.ids), scale = pixel();
@@ -502,10 +514,10 @@ function showStrip() {
   const seen = state.selection.one?.sightings || [];
   const isWanted = state.file.images && mode !== 'create' && mode !== 'test';
   fill($('strip'), !isWanted ? [] : seen.map(one => el('button', {
-    className: one[0] === state.view?.view ? 'now' : '', title: `view ${one[0]}${one[5] ? '' : ', not detected'}`,
+    className: one[0] === state.view?.view ? 'now' : '', title: `${viewName(one[0])}${one[5] ? '' : ', not detected'}`,
     onclick: () => lookAt(one)},
     el('img', {src: `crop/${person}/${one[0]}/${one.slice(1, 5).join(',')}`, alt: ''}),
-    el('small', {}, `${one[0]}${one[5] ? '' : ' ?'}`))));
+    el('small', {}, `${one[0] + 1}${one[5] ? '' : ' ?'}`))));
 }
 
 // ---- the panel of the scene: layers, viewpoints, the recording as a film
@@ -640,15 +652,13 @@ $('splitter').onpointermove = event => {
 $('splitter').onpointerup = () => { document.body.classList.remove('dragging'); if (state.view) showView(); };
 document.addEventListener('click', event => { if (!$('menu').contains(event.target)) $('menu').open = false; });
 window.addEventListener('resize', () => { resize(); showView(); });
+new ResizeObserver(showChosen).observe($('rows'));
 window.addEventListener('keydown', keyDown, true);
 // The keys also work in the scene, where they take precedence over viser's keys.
 $('frame').onload = () => {
   const scene = $('frame').contentWindow;
   scene.addEventListener('keydown', keyDown, true);
-  // Hide viser's notices, which repeat the log, and its developer panel: both cover the scene.
-  const style = scene.document.createElement('style');
-  style.textContent = '.mantine-Notifications-root, .mantine-Paper-root { display: none !important }';
-  scene.document.head.append(style);
+  scene.document.head.append(el('link', {rel: 'stylesheet', href: `${base}scene.css`}));
 };
 $('frame').src = `${base}scene/${person}/`;
 setMode('review');
