@@ -47,9 +47,10 @@ class WakeUpMap:
 class DemoOptions:
     """Options of the demo."""
 
-    #: Folder with sequence/ (a TUM folder), map.yaml, yolo.onnx and, unless the method matches
-    #: classes only, clip/ (see export_network)
-    assets: Path
+    assets: Path  #: Folder with sequence/ (a TUM folder) and map.yaml
+    #: Folder with yolo.onnx and, unless the method matches classes only, clip/ (see
+    #: export_network); None: the networks of the default profile
+    networks: Path | None
     out: Path  #: Folder for the pictures
     wake_ups: int = 10  #: Number of wake-ups
     rate: float = 8.0  #: Speed between wake-ups; 1 is as recorded
@@ -58,6 +59,7 @@ class DemoOptions:
     wake_up_map: WakeUpMap | None = None  #: The map to wake up in; None: the assets' map.yaml
     has_rig: bool = False  #: Whether the robot has the cameras of rig/ instead of one
     is_watched: bool = False  #: Whether the localizer is watched and a lost robot is relocalized
+    recording: str = ''  #: Name and licence of a real recording; '' for a rendered room
 
     @property
     def map_file(self) -> Path:
@@ -94,17 +96,32 @@ class DemoOptions:
         if self.is_watched:
             parameters |= {'watch': 'amcl_pose', 'watch_period_s': 1.0, 'on_lost': 'relocalize',
                            'require_localizer': True}
-        if matching != 'class':
-            parameters['clip_pretrained'] = self.assets / 'clip'
+        if clip := self.files_of_networks.get('clip_pretrained'):
+            parameters['clip_pretrained'] = clip
         if self.has_rig:
             # the pose of the first camera
-            parameters |= {**self.of_detector, 'base_frame': 'camera_optical_frame',
+            parameters |= {**self.of_rig, 'base_frame': 'camera_optical_frame',
                            'base_from_camera': list(chain(*self.mounts.values()))}
         return parameters
 
     @property
-    def of_detector(self) -> dict[str, object]:
-        """Return the detector's parameters for a rig; none for a single camera.
+    def files_of_networks(self) -> dict[str, Path]:
+        """Return the parameters that name detector and encoder; none for the default profile."""
+        if self.networks is None:
+            return {}
+        clip = {} if self.method.startswith('class') else {
+            'clip_pretrained': self.networks / 'clip'}
+        return {'model': self.networks / 'yolo.onnx', **clip}
+
+    @property
+    def arguments_of_networks(self) -> list[object]:
+        """Return the options of build_map that name detector and encoder."""
+        return [word for name, file in self.files_of_networks.items()
+                for word in (f'--{name.replace("_", "-")}', file)]
+
+    @property
+    def of_rig(self) -> dict[str, object]:
+        """Return the parameters of both nodes for a rig; none for a single camera.
 
         Fast DDS with its default settings does not deliver the raw images of four cameras at once.
         """
@@ -167,8 +184,7 @@ def prepare(options: DemoOptions) -> None:
     for picture in options.out.glob(page.PICTURES):
         picture.unlink()
     needed = [options.assets / ('rig' if options.has_rig else 'sequence'),
-              options.assets / 'yolo.onnx',
-              *(value for value in options.parameters.values() if isinstance(value, Path))]
+              options.map_file, *options.files_of_networks.values()]
     for path in needed:
         if not path.exists():
             raise DemoError(f'{path} is missing: choose another folder with --assets')
@@ -203,9 +219,9 @@ def nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
     start = time.monotonic()
     print(f'starting detector and relocalizer ({options.method}); to see their topics: export '
           f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', flush=True)
-    with (running(node_command('detector', {'model': options.assets / 'yolo.onnx',
-                                            **options.of_detector}),
-                  options.out / 'detector.log') as detector,
+    of_detector = {name: file for name, file in options.files_of_networks.items()
+                   if name == 'model'} | options.of_rig
+    with (running(node_command('detector', of_detector), options.out / 'detector.log') as detector,
           running(node_command('relocalizer', options.parameters),
                   options.out / 'relocalizer.log') as relocalizer):
         detector.wait_for_output('ready after', _PATIENCE_S)
@@ -240,4 +256,4 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequences: dict[str, 
         print(f'{len(sequences)} cameras; with the first camera alone, {alone} of {len(reviews)} '
               'would be accepted', flush=True)
         section += page.rig_section(list(sequences), alone, len(reviews))
-    return page.write_page(options.out, reviews, options.method, section)
+    return page.write_page(options.out, reviews, options.method, section, options.recording)

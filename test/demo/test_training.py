@@ -9,8 +9,8 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 import yaml
+from without_pytorch import Lazy
 
 from cliploc_ros.models.clip_encoder import ClipEncoder, encode_labels
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
@@ -18,10 +18,11 @@ from cliploc_ros.models.onnx_detector import load_detector
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 from demo import ASSETS
-from demo.world import train_clip, train_detector
 from demo.world.appearance import CLASSES
 
 pytestmark = pytest.mark.full
+torch, train_clip, train_detector = map(Lazy, (
+    'torch', 'demo.world.train_clip', 'demo.world.train_detector'))
 
 PROJECT = ASSETS.parents[1]
 
