@@ -49,7 +49,7 @@ def run_map_demo(options: DemoOptions) -> None:
     objects = read_objects(walk)
     files = {name: options.out / f'built_map.{name}' for name in ('yaml', 'json', 'npz')}
     build_map('--tum', walk, '--out', files['yaml'], '--report', files['json'], '--record-to',
-              files['npz'], *options.arguments_of_networks)
+              files['npz'], '--no-check', *options.arguments_of_networks)
     detections = load_observations(files['npz'])
     review = review_map(
         LandmarkMap.from_file(files['yaml']), objects,

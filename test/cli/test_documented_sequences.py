@@ -113,7 +113,8 @@ FIRST, *ON_PAGE = documented(PAGES[:1])
 ELSEWHERE = [command for command in documented(PAGES) if command not in (FIRST, *ON_PAGE)]
 
 
-@pytest.mark.parametrize('drive', ['short', *WHOLE], indirect=True)
+@pytest.mark.parametrize('drive', [
+    pytest.param('short', marks=pytest.mark.brief), *WHOLE], indirect=True)
 def test_one_command_leads_from_a_bag_to_a_checked_map(built):
     folder, networks, _, printed = built
     assert FIRST == ('build_map', '--bag', 'drive', '--out', 'office.yaml')
