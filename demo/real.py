@@ -55,7 +55,7 @@ def run_real_demo(options: DemoOptions, sources_file: Path, is_asked: bool) -> i
                 staging.rename(world)
         map_file = world / 'map.yaml'
         if not map_file.exists():
-            build_map('--tum', world / 'mapping', '--out', map_file,
+            build_map('--tum', world / 'mapping', '--out', map_file, '--no-check',
                       *options.arguments_of_networks)
         run_demo(replace(options, assets=world,
                          recording=f'{recording.name}, {recording.licence}'))

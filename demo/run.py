@@ -116,8 +116,9 @@ class DemoOptions:
     @property
     def arguments_of_networks(self) -> list[object]:
         """Return the options of build_map that name detector and encoder."""
-        return [word for name, file in self.files_of_networks.items()
-                for word in (f'--{name.replace("_", "-")}', file)]
+        words = [word for name, file in self.files_of_networks.items()
+                 for word in (f'--{name.replace("_", "-")}', file)]
+        return [*words, '--no-clip'] if self.method.startswith('class') else words
 
     @property
     def of_rig(self) -> dict[str, object]:
