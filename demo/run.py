@@ -116,8 +116,8 @@ class DemoOptions:
     @property
     def arguments_of_networks(self) -> list[object]:
         """Return the options of build_map that name detector and encoder."""
-        words = [word for name, file in self.files_of_networks.items()
-                 for word in (f'--{name.replace("_", "-")}', file)]
+        words: list[object] = [word for name, file in self.files_of_networks.items()
+                               for word in (f'--{name.replace("_", "-")}', file)]
         return [*words, '--no-clip'] if self.method.startswith('class') else words
 
     @property
