@@ -30,7 +30,8 @@ CLIP = ('--clip-pretrained', ASSETS / 'clip')
 
 
 def run(main, *arguments):
-    return main([*map(str, arguments), *(['--no-check'] if main is build_map else [])])
+    more = {build_map: ['--no-check'], evaluate: ['--workers', '1']}.get(main, [])
+    return main([*map(str, arguments), *more])
 
 
 def test_a_project_becomes_a_map_in_which_a_phone_is_localized(tmp_path, capsys):
