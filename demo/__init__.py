@@ -10,5 +10,3 @@ from pathlib import Path
 
 #: The shipped room: sequence/ (a TUM folder), map.yaml, and the weights of YOLO and CLIP.
 ASSETS = Path(__file__).parent / 'assets'
-#: Addresses and digests of public recordings, in the form of `studies.reproduce`.
-SOURCES = ASSETS.parents[1] / 'studies' / 'reproduce.yaml'

@@ -11,15 +11,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cliploc_ros.command import needs_ros, option, positive, positive_int, run_main
-from demo import ASSETS, SOURCES
+from demo import ASSETS
 
 EPILOG = """\
 The demo plays a recording to the real detector and relocalizer, each in its own process. At each
 wake-up the robot stops, calls ~/relocalize, and continues after the answer. At the end the demo
 writes a page of pictures to the folder of --out. With --map it first builds a map from a mapping
-walk and compares it with the room; the robot then wakes up in that map. With --real it does the
-same in a real room, after a download of 344 MB; it lists the files and asks first, and the same
-command continues after an interruption.
+walk and compares it with the room; the robot then wakes up in that map.
 """
 
 
@@ -47,7 +45,8 @@ def make_parser() -> argparse.ArgumentParser:
     ways = parser.add_mutually_exclusive_group()
     option(ways, '--map', "build the map from the assets' mapping walk (mapping/), and wake up "
            'in it')
-    option(ways, '--real', 'download a recording of a real room, build its map, and wake up in it')
+    option(ways, '--real', 'download a recording of a real room (344 MB; it asks first, and the '
+           'same command continues later), build its map, and wake up in it')
     option(parser, '--cameras', '4: a robot with cameras in four directions, which does not turn '
            '(default: 1)', int, 1, choices=(1, 4))
     option(ways, '--kidnapped', 'move a driving robot elsewhere: the watch detects it, and the '
@@ -55,7 +54,7 @@ def make_parser() -> argparse.ArgumentParser:
     option(parser, '--rviz', 'show the topics in RViz, where it is installed')
     option(parser, '--yes', 'do not ask before the download of --real')
     option(parser, '--sources YAML', 'file with the address and digest of the recording of --real '
-           '(default: studies/reproduce.yaml)', Path, SOURCES)
+           '(default: studies/reproduce.yaml)', Path)
     return parser
 
 
@@ -66,8 +65,11 @@ def demonstrate(options: argparse.Namespace) -> int:
     from demo.run import DemoOptions, run_demo
 
     assets = options.assets or ASSETS
-    chosen = DemoOptions(assets=assets, networks=options.assets if options.real else assets,
-                         out=options.out, wake_ups=options.wake_ups,
+    own = not options.real or options.assets is not None
+    chosen = DemoOptions(assets=assets, out=options.out, wake_ups=options.wake_ups,
+                         detector={'model': assets / 'yolo.onnx'} if own else {},
+                         encoder={'clip_pretrained': assets / 'clip'}
+                         if own and not options.method.startswith('class') else {},
                          rate=options.rate, method=options.method, rviz=options.rviz,
                          has_rig=options.cameras > 1, is_watched=options.kidnapped)
     if options.real:

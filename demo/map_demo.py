@@ -48,7 +48,7 @@ def run_map_demo(options: DemoOptions) -> None:
     objects = read_objects(walk)
     files = {name: options.out / f'built_map.{name}' for name in ('yaml', 'json', 'npz')}
     build_map('--tum', walk, '--out', files['yaml'], '--report', files['json'], '--record-to',
-              files['npz'], '--no-check', *options.arguments_of_networks)
+              files['npz'], '--no-check', **options.detector, **options.encoder)
     detections = load_observations(files['npz'])
     review = review_map(
         LandmarkMap.from_file(files['yaml']), objects,
@@ -66,12 +66,11 @@ def run_map_demo(options: DemoOptions) -> None:
 
 def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
     """Localize every second image of the wake-ups in the built and the true map."""
-    files = options.files_of_networks
-    clip = ClipOptions(pretrained=str(files['clip_pretrained']))
+    clip = ClipOptions(pretrained=str(options.encoder['clip_pretrained']))
     frames = read_folder(options.assets / 'sequence', FolderOptions(layout='tum'))
     frames = frames.select(range(0, frames.count, 2))
     print(f'localizing {frames.count} images of the wake-ups in both maps', flush=True)
-    look = LoadNetworks(DetectorOptions(model=str(files['model'])), clip)()
+    look = LoadNetworks(DetectorOptions(model=str(options.detector['model'])), clip)()
     recorded = record_every_frame(frames, look)
     method = Method(options.method, options.values.options())
     summaries = {}

@@ -109,9 +109,11 @@ def find_executable(name: str) -> Path:
                     'script/env')
 
 
-def build_map(*arguments: object) -> None:
+def build_map(*arguments: object, **networks: Path) -> None:
     """Build a map with the installed executable, as a user does; DemoError: it fails."""
     command = ['build_map', *map(str, arguments)]
+    for name, file in networks.items():
+        command += [f'--{name.replace("_", "-")}', str(file)]
     print('$ ' + ' '.join(command), flush=True)
     done = subprocess.run([str(find_executable('build_map')), *command[1:]], check=False)
     if done.returncode:

@@ -20,7 +20,7 @@ from cliploc_ros.offline.datasets.tum import TumSequence
 from cliploc_ros.units import NS_PER_S
 from demo.processes import build_map
 from demo.run import DemoOptions, run_demo
-from studies.reproduce import Sources, alone_in, is_agreed, say_downloads, unpacked
+from studies.reproduce import SOURCES, Sources, alone_in, is_agreed, say_downloads, unpacked
 
 # The sequence in studies/reproduce.yaml.
 _SEQUENCE = 'fr1'
@@ -28,7 +28,7 @@ _SEQUENCE = 'fr1'
 _MAPPED = 150
 
 
-def run_real_demo(options: DemoOptions, sources_file: Path, is_asked: bool) -> int:
+def run_real_demo(options: DemoOptions, sources: Path | None, is_asked: bool) -> int:
     """Download a recording, build its map, and wake up in it; return the exit code.
 
     Each stage writes its files when it is complete, so a second run continues. The networks are
@@ -36,13 +36,13 @@ def run_real_demo(options: DemoOptions, sources_file: Path, is_asked: bool) -> i
     """
     if options.has_rig:
         raise OptionsError('the recording of --real has one camera: remove --cameras')
-    recording, out = Sources.of_file(sources_file).recording(_SEQUENCE), options.out / 'real'
+    recording = Sources.of_file(sources or SOURCES).recording(_SEQUENCE)
+    out = options.out / 'real'
     world, archive = out / 'world', out / 'downloads' / recording.file
     make_folder(out)
     say_downloads([] if archive.exists() or world.exists() else [recording], out)
-    if options.networks is None:
-        print("build_map also downloads the default profile's detector and CLIP, unless they are "
-              'on this machine (doc/install.md#networks).')
+    if not options.detector:
+        print("build_map then downloads the default profile's networks (doc/install.md#networks).")
     if is_asked and not is_agreed():
         return 1
     with alone_in(out):
@@ -56,7 +56,8 @@ def run_real_demo(options: DemoOptions, sources_file: Path, is_asked: bool) -> i
         map_file = world / 'map.yaml'
         if not map_file.exists():
             build_map('--tum', world / 'mapping', '--out', map_file, '--no-check',
-                      *options.arguments_of_networks)
+                      *(['--no-clip'] if options.method.startswith('class') else []),
+                      **options.detector, **options.encoder)
         run_demo(replace(options, assets=world,
                          recording=f'{recording.name}, {recording.licence}'))
     return 0

@@ -5,7 +5,7 @@
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import chain
@@ -48,9 +48,10 @@ class DemoOptions:
     """Options of the demo."""
 
     assets: Path  #: Folder with sequence/ (a TUM folder) and map.yaml
-    #: Folder with yolo.onnx and, unless the method matches classes only, clip/ (see
-    #: export_network); None: the networks of the default profile
-    networks: Path | None
+    #: Parameters that name the networks of detector and relocalizer; the relocalizer needs none
+    #: if the method matches classes only. Without them: the networks of the default profile
+    detector: Mapping[str, Path]
+    encoder: Mapping[str, Path]
     out: Path  #: Folder for the pictures
     wake_ups: int = 10  #: Number of wake-ups
     rate: float = 8.0  #: Speed between wake-ups; 1 is as recorded
@@ -92,33 +93,15 @@ class DemoOptions:
                                          'matching': matching, 'algorithm': algorithm,
                                          'require_localizer': False,  # the demo has no AMCL
                                          # a search that ends by time is not reproducible
-                                         'time_budget_ms': 10_000.0}
+                                         'time_budget_ms': 10_000.0, **self.encoder}
         if self.is_watched:
             parameters |= {'watch': 'amcl_pose', 'watch_period_s': 1.0, 'on_lost': 'relocalize',
                            'require_localizer': True}
-        if clip := self.files_of_networks.get('clip_pretrained'):
-            parameters['clip_pretrained'] = clip
         if self.has_rig:
             # the pose of the first camera
             parameters |= {**self.of_rig, 'base_frame': 'camera_optical_frame',
                            'base_from_camera': list(chain(*self.mounts.values()))}
         return parameters
-
-    @property
-    def files_of_networks(self) -> dict[str, Path]:
-        """Return the parameters that name detector and encoder; none for the default profile."""
-        if self.networks is None:
-            return {}
-        clip = {} if self.method.startswith('class') else {
-            'clip_pretrained': self.networks / 'clip'}
-        return {'model': self.networks / 'yolo.onnx', **clip}
-
-    @property
-    def arguments_of_networks(self) -> list[object]:
-        """Return the options of build_map that name detector and encoder."""
-        words: list[object] = [word for name, file in self.files_of_networks.items()
-                               for word in (f'--{name.replace("_", "-")}', file)]
-        return [*words, '--no-clip'] if self.method.startswith('class') else words
 
     @property
     def of_rig(self) -> dict[str, object]:
@@ -185,7 +168,7 @@ def prepare(options: DemoOptions) -> None:
     for picture in options.out.glob(page.PICTURES):
         picture.unlink()
     needed = [options.assets / ('rig' if options.has_rig else 'sequence'),
-              options.map_file, *options.files_of_networks.values()]
+              options.map_file, *options.detector.values(), *options.encoder.values()]
     for path in needed:
         if not path.exists():
             raise DemoError(f'{path} is missing: choose another folder with --assets')
@@ -220,9 +203,8 @@ def nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
     start = time.monotonic()
     print(f'starting detector and relocalizer ({options.method}); to see their topics: export '
           f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', flush=True)
-    of_detector = {name: file for name, file in options.files_of_networks.items()
-                   if name == 'model'} | options.of_rig
-    with (running(node_command('detector', of_detector), options.out / 'detector.log') as detector,
+    with (running(node_command('detector', {**options.detector, **options.of_rig}),
+                  options.out / 'detector.log') as detector,
           running(node_command('relocalizer', options.parameters),
                   options.out / 'relocalizer.log') as relocalizer):
         detector.wait_for_output('ready after', _PATIENCE_S)

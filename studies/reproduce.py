@@ -46,7 +46,8 @@ from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.run import CAPTIONS, COMPARISON
 from cliploc_ros.offline.evaluation.trials import Result
 
-_SOURCES = Path(__file__).with_suffix('.yaml')
+#: Addresses and digests of the downloads.
+SOURCES = Path(__file__).with_suffix('.yaml')
 _NAMES = 'fr2', 'fr3', 'kitchen'
 # Bandwidth of a typical connection, to estimate the time of a download.
 _MEGABYTES_A_S = 10.0
@@ -116,7 +117,7 @@ class Sources:
             networks = [Download(**entry) for entry in content.pop('networks')]
             return cls(networks, recordings, **content)
         except (KeyError, TypeError, AttributeError) as error:
-            raise OptionsError(f'{path} is not like {_SOURCES.name}: {error}') from error
+            raise OptionsError(f'{path} is not like {SOURCES.name}: {error}') from error
 
     def recording(self, name: str) -> Recording:
         """Return a sequence; OptionsError: there is none of this name."""
@@ -143,7 +144,7 @@ def make_parser() -> argparse.ArgumentParser:
                         help='folder for downloads and results (%(default)s)')
     parser.add_argument('--trials', type=positive_int, default=5, metavar='N',
                         help="seeds of the methods that draw samples (the paper's %(default)s)")
-    parser.add_argument('--sources', type=Path, default=_SOURCES, metavar='YAML',
+    parser.add_argument('--sources', type=Path, default=SOURCES, metavar='YAML',
                         help='file with addresses and digests (studies/reproduce.yaml)')
     return parser
 
