@@ -52,26 +52,23 @@ def test_addresses_are_those_of_the_manifest():
         assert all(text in read(name) for name in names)
 
 
-@pytest.mark.parametrize('is_filled', [False, True])
-def test_a_release_with_placeholders_is_refused(is_filled, tmp_path):
+@pytest.mark.parametrize(('address', 'code'), [('//example.org', 1), ('@example.com', 1),
+                                               ('//github.com', 0)])
+def test_a_release_with_placeholders_is_refused(address, code, tmp_path):
     step, = (step['run'] for job in yaml.safe_load(read('.github/workflows/release.yml'))[
         'jobs'].values() for step in job['steps'] if 'package.xml' in step.get('run', ''))
-    (tmp_path / 'package.xml').write_text(read('package.xml').replace('example', (
-        'robots' if is_filled else 'example')))
-    done = subprocess.run(['bash', '-e', '-c', step], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == (0 if is_filled else 1), done.stdout
+    (tmp_path / 'package.xml').write_text(address)
+    assert subprocess.run(['bash', '-e', '-c', step], cwd=tmp_path).returncode == code
 
 
 def test_bibtex_and_cff_cite_the_same():
-    cited = yaml.safe_load(read('CITATION.cff'))
-    paper, text = cited['preferred-citation'], re.sub(r'[{}\\]', '', read('CITATION.bib'))
-    authors = ' and '.join(f'{one["family-names"]}, {one["given-names"]}'
-                           for one in paper['authors'])
-    for name, value in (('title', paper['title']), ('author', authors), ('year', paper['year']),
-                        ('booktitle', paper['collection-title']), ('url', paper['url']),
-                        ('title', cited['title']), ('author', cited['authors'][0]['name']),
-                        ('year', cited['date-released'][:4])):
-        assert re.search(rf'^ +{name} += {re.escape(str(value))},?$', text, re.MULTILINE), name
+    software, text = yaml.safe_load(read('CITATION.cff')), read('CITATION.bib')
+    paper, text = software['preferred-citation'], re.sub(r'[{}\\]', '', text)
+    authors = (f'{one["family-names"]}, {one["given-names"]}' for one in paper['authors'])
+    assert re.findall(r'= (.+?),?$', text, re.MULTILINE) == [
+        paper['title'], ' and '.join(authors), paper['collection-title'], str(paper['year']),
+        paper['url'], software['title'], software['authors'][0]['name'], software['version'],
+        software['date-released'][:4]]
 
 
 def test_rosdep_can_resolve_every_key():
