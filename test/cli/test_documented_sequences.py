@@ -69,7 +69,7 @@ def drive(request, tmp_path_factory):
     else:
         shared = request.getfixturevalue('shared_data')
         write_drive(folder / 'drive', shared / 'seven_scenes_kitchen', 2)
-        found, more = {'model': shared / 'weights/yolov8n_coco.pt'}, ['--no-clip']
+        found, more = {'model': shared / 'weights/yolov8n_coco.onnx'}, ['--no-clip']
     arguments = [word for name, file in found.items()
                  for word in (f'--{name.replace("_", "-")}', str(file))]
     return folder, [*arguments, *more], found
@@ -77,16 +77,12 @@ def drive(request, tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def built(drive, tmp_path_factory):
-    """Return the drive, and the output of the page's first command.
-
-    With ONNX networks, PyTorch cannot be imported.
-    """
+    """Return the drive, and the output of the page's first command; PyTorch cannot be imported."""
     folder, networks, _ = drive
-    has_onnx = any(each.endswith('.onnx') for each in networks)
     done = subprocess.run(
         [sys.executable, '-m', 'cliploc_ros.cli.build_map', '--bag', 'drive', '--out',
          'office.yaml', *networks], cwd=folder, capture_output=True, text=True, check=False,
-        timeout=600.0, env=hide_pytorch(tmp_path_factory.mktemp('hidden')) if has_onnx else None)
+        timeout=600.0, env=hide_pytorch(tmp_path_factory.mktemp('hidden')))
     assert done.returncode == 0, done.stderr
     return *drive, done.stdout
 
