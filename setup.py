@@ -3,6 +3,7 @@
 """Build and install the package, with colcon or with pip; script/setup uses colcon."""
 
 import sys
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from setuptools import find_packages, setup
@@ -41,8 +42,8 @@ EXTRAS['all'] = sorted({name for extra in EXTRAS.values() for name in extra})
 EXTRAS['test'] = ['hypothesis>=6.100,<7', 'onnx>=1.17,<2', 'pytest>=7.4,<10',
                   'pytest-rerunfailures>=14,<17', 'pytest-xdist>=3.5,<4']
 EXTRAS['docs'] = ['myst-parser>=4,<6', 'sphinx>=8,<10', 'sphinx-rtd-theme>=3,<4']
-# A placeholder, like the maintainers' address: the project has no public repository yet.
-REPOSITORY = 'https://example.org/cliploc_ros'
+MANIFEST = ElementTree.parse(Path(__file__).with_name('package.xml')).getroot()
+URLS = {url.get('type'): url.text for url in MANIFEST.iter('url')}
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -61,7 +62,7 @@ def console_scripts() -> list[str]:
 
 setup(
     name=PACKAGE,
-    version='0.2.0',
+    version=MANIFEST.findtext('version'),
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={
         f'{PACKAGE}.offline.datasets': ['vision_msgs/msg/*.msg'],
@@ -81,13 +82,13 @@ setup(
     extras_require=EXTRAS,
     zip_safe=False,
     maintainer='the cliploc_ros authors',
-    maintainer_email='cliploc-ros@example.org',
+    maintainer_email=MANIFEST.find('maintainer').get('email'),
     description='Global localization from one image in a map of labelled objects (CLIP-Loc).',
     long_description=(Path(__file__).parent / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
-    url=REPOSITORY,
-    project_urls={'Changelog': f'{REPOSITORY}/blob/main/CHANGELOG.rst',
-                  'Issues': f'{REPOSITORY}/issues'},
+    url=URLS['website'],
+    project_urls={'Changelog': f'{URLS["repository"]}/blob/main/CHANGELOG.rst',
+                  'Issues': URLS['bugtracker']},
     license='Apache-2.0',
     entry_points={'console_scripts': console_scripts()},
 )

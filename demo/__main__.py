@@ -41,14 +41,20 @@ def make_parser() -> argparse.ArgumentParser:
            'clip_prosac (default: %(default)s)', default='hybrid_auto')
     option(parser, '--assets DIR', 'world to use instead of the shipped one: sequence/ (a TUM '
            'folder), map.yaml, yolo.onnx, mapping/ for --map, and clip/ for all methods but '
-           'class_*', default=ASSETS)
-    option(parser, '--map', "build the map from the assets' mapping walk (mapping/), and wake up "
+           "class_*; with --real only the networks, instead of the default profile's")
+    ways = parser.add_mutually_exclusive_group()
+    option(ways, '--map', "build the map from the assets' mapping walk (mapping/), and wake up "
            'in it')
+    option(ways, '--real', 'download a recording of a real room (344 MB; it asks first, and the '
+           'same command continues later), build its map, and wake up in it')
     option(parser, '--cameras', '4: a robot with cameras in four directions, which does not turn '
            '(default: 1)', int, 1, choices=(1, 4))
-    option(parser, '--kidnapped', 'move a driving robot elsewhere: the watch detects it, and the '
+    option(ways, '--kidnapped', 'move a driving robot elsewhere: the watch detects it, and the '
            'robot relocalizes')
     option(parser, '--rviz', 'show the topics in RViz, where it is installed')
+    option(parser, '--yes', 'do not ask before the download of --real')
+    option(parser, '--sources YAML', 'file with the address and digest of the recording of --real '
+           '(default: studies/reproduce.yaml)', Path)
     return parser
 
 
@@ -58,9 +64,18 @@ def demonstrate(options: argparse.Namespace) -> int:
         import rclpy  # noqa: F401
     from demo.run import DemoOptions, run_demo
 
-    chosen = DemoOptions(assets=options.assets, out=options.out, wake_ups=options.wake_ups,
+    assets = options.assets or ASSETS
+    own = not options.real or options.assets is not None
+    chosen = DemoOptions(assets=assets, out=options.out, wake_ups=options.wake_ups,
+                         detector={'model': assets / 'yolo.onnx'} if own else {},
+                         encoder={'clip_pretrained': assets / 'clip'}
+                         if own and not options.method.startswith('class') else {},
                          rate=options.rate, method=options.method, rviz=options.rviz,
                          has_rig=options.cameras > 1, is_watched=options.kidnapped)
+    if options.real:
+        from demo.real import run_real_demo
+
+        return run_real_demo(chosen, options.sources, is_asked=not options.yes)
     if options.kidnapped:
         from demo.kidnapped import run_kidnapped
 

@@ -59,7 +59,7 @@ _STANDS_ON_S = 2.0
 _FRAME = 'camera'
 # Images of the walk that the robot drives backwards, and of the other walk, 3 m away, to which it
 # is moved.
-_BEFORE, _AFTER = slice(14, 1, -1), slice(1, 14)
+_BEFORE, _AFTER = slice(8, 1, -1), slice(1, 14)
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,6 @@
 """Run the demo with a map that it builds from the mapping walk and compares with the room."""
 
 import json
-import subprocess
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.datasets.observations import load_observations
-from cliploc_ros.offline.datasets.tum import read_tum
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.offline.evaluation.recorded_queries import make_queries_of
 from cliploc_ros.offline.evaluation.run import run_methods
@@ -31,7 +28,7 @@ from demo.map_review import (
     section,
     success_lines,
 )
-from demo.processes import DemoError, find_executable
+from demo.processes import DemoError, build_map
 from demo.run import DemoOptions, WakeUpMap, prepare, run_demo
 from demo.truth import read_frames, read_objects
 
@@ -50,7 +47,8 @@ def run_map_demo(options: DemoOptions) -> None:
         raise DemoError(f'{walk} is missing: choose another folder with --assets')
     objects = read_objects(walk)
     files = {name: options.out / f'built_map.{name}' for name in ('yaml', 'json', 'npz')}
-    _build(options, walk, files)
+    build_map('--tum', walk, '--out', files['yaml'], '--report', files['json'], '--record-to',
+              files['npz'], '--no-check', **options.detector, **options.encoder)
     detections = load_observations(files['npz'])
     review = review_map(
         LandmarkMap.from_file(files['yaml']), objects,
@@ -66,26 +64,14 @@ def run_map_demo(options: DemoOptions) -> None:
         section(review, successes, len(detections)))))
 
 
-def _build(options: DemoOptions, walk: Path, files: Mapping[str, Path]) -> None:
-    """Write map, report and detections with the installed executable, as a user does."""
-    arguments = ['build_map', '--tum', walk, '--out', files['yaml'], '--report', files['json'],
-                 '--record-to', files['npz'], '--model', options.assets / 'yolo.onnx',
-                 '--clip-pretrained', options.assets / 'clip']
-    print('$ ' + ' '.join(map(str, arguments)), flush=True)
-    done = subprocess.run([str(find_executable('build_map')), *map(str, arguments[1:])],
-                          check=False)
-    if done.returncode:
-        raise DemoError(f'build_map ended with exit code {done.returncode}; its message is above')
-
-
 def _judge(options: DemoOptions, built_map_file: Path) -> dict[str, Summary]:
-    """Localize each image of the wake-ups once in the built and the true map."""
-    clip = ClipOptions(pretrained=str(options.assets / 'clip'))
-    sequence = read_tum(options.assets / 'sequence')
-    print(f'localizing all {len(sequence)} images of the wake-ups in both maps', flush=True)
-    look = load_networks(DetectorOptions(model=str(options.assets / 'yolo.onnx')), clip)
-    recorded = record_every_frame(
-        read_folder(sequence.folder, FolderOptions(layout='tum')), look)
+    """Localize every second image of the wake-ups in the built and the true map."""
+    clip = ClipOptions(pretrained=str(options.encoder['clip_pretrained']))
+    frames = read_folder(options.assets / 'sequence', FolderOptions(layout='tum'))
+    frames = frames.select(range(0, frames.count, 2))
+    print(f'localizing {frames.count} images of the wake-ups in both maps', flush=True)
+    look = load_networks(DetectorOptions(model=str(options.detector['model'])), clip)
+    recorded = record_every_frame(frames, look)
     method = Method(options.method, options.values.options())
     summaries = {}
     for name, file in (('built map', built_map_file), ('true map', options.assets / 'map.yaml')):

@@ -30,6 +30,10 @@ and search are the same as on a robot. The page shows that the system works end 
 <em>not</em> show how well the system recognizes real objects in real light. To measure that, run
 the nodes on your own recordings.</p>"""
 
+_REAL = """\
+<p class="note"><b>These images are real:</b> {recording}. The map was built from other images of
+the same recording, by the detector and CLIP that also run here.</p>"""
+
 _HOW = """\
 <p class="note">The two nodes published the boxes, the hypotheses and the numbers in the table. The
 errors are relative to the recording's ground truth, which the nodes do not receive. The nodes do
@@ -79,10 +83,11 @@ def summary(judged: Sequence[Judged]) -> str:
         '(median)'
 
 
-def write_page(folder: Path, reviews: Sequence[Review], method: str, section: str = '') -> Path:
+def write_page(folder: Path, reviews: Sequence[Review], method: str, section: str = '',
+               recording: str = '') -> Path:
     """Write the page that shows all pictures; return its file.
 
-    The section is HTML to put before the wake-ups.
+    The section is HTML to put before the wake-ups. ``recording`` names a real recording.
     """
     judged = [review.judged for review in reviews]
     accepted = [case for case in judged if case.wake_up.accepted]
@@ -101,7 +106,8 @@ def write_page(folder: Path, reviews: Sequence[Review], method: str, section: st
     page_file = folder / 'index.html'
     write_text(page_file, page(
         'cliploc_ros: a robot wakes up', first_screen(
-            [verdict(f'{summary(judged)}.', not wrong), tiles(numbers), _SYNTHETIC,
+            [verdict(f'{summary(judged)}.', not wrong), tiles(numbers),
+             _REAL.format(recording=escape(recording)) if recording else _SYNTHETIC,
              '<h2>Wake-ups</h2>', table(_BRIEF, ([row[column] for column in _BRIEF_COLUMNS]
                                                  for row in rows))],
             [figure(TOP_VIEW, 'Top view of the map. A line joins each estimate to its ground '

@@ -109,6 +109,17 @@ def find_executable(name: str) -> Path:
                     'script/env')
 
 
+def build_map(*arguments: object, **networks: Path) -> None:
+    """Build a map with the installed executable, as a user does; DemoError: it fails."""
+    command = ['build_map', *map(str, arguments)]
+    for name, file in networks.items():
+        command += [f'--{name.replace("_", "-")}', str(file)]
+    print('$ ' + ' '.join(command), flush=True)
+    done = subprocess.run([str(find_executable('build_map')), *command[1:]], check=False)
+    if done.returncode:
+        raise DemoError(f'build_map ended with exit code {done.returncode}; its message is above')
+
+
 @contextmanager
 def own_ros_domain() -> Iterator[int]:
     """Move this process and its children to a ROS domain of their own; yield the domain.

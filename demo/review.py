@@ -17,9 +17,10 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer
-from cliploc_ros.models.protocols import ClipOptions
+from cliploc_ros.models.protocols import ClipOptions, with_encoder
 from cliploc_ros.offline.datasets.parsing import find_camera, parse_stamp_ns
 from cliploc_ros.offline.datasets.tum import TumSequence
+from cliploc_ros.ros.frame_localizer import load_keyframes
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.units import NS_PER_S
 from demo.robot import WakeUp
@@ -113,13 +114,16 @@ class Reviewer:
         self._options = values.options()
         self._relocalizer = Relocalizer(landmark_map, self._options)
         # its estimate of the camera's height and tilt decides how many crops a request compares
-        self._localizer = Localizer(self._relocalizer)
+        keyframes = load_keyframes(values, landmark_map)
+        self._keyframes = None if keyframes is None else keyframes.localizer
+        self._localizer = Localizer(self._relocalizer, self._keyframes)
         self._observer = None
         if self._options.needs_similarities:
             from cliploc_ros.models.clip_encoder import load_encoder_for_map
             from cliploc_ros.models.observer import Observer
             self._observer = Observer(*load_encoder_for_map(
-                ClipOptions(model=values.clip_model, pretrained=values.clip_pretrained),
+                with_encoder(ClipOptions(model=values.clip_model,
+                                         pretrained=values.clip_pretrained), values.profile),
                 landmark_map, [values.map_file], values.landmark_embeddings))
         # the true boxes of each image, if the recording has them
         self._true_boxes = {
@@ -131,8 +135,8 @@ class Reviewer:
     def review(self, judged: Judged) -> Review:
         """Repeat the search of a wake-up."""
         seen = {name: self._observed(name, judged.wake_up) for name in self._sequences}
-        (_, first), *others = seen.values()
-        found = self._search(self._localizer, first, [observation for _, observation in others])
+        first, *others = seen.values()
+        found = self._search(self._localizer, [*others, first])
         if found.map_from_camera is None or judged.pose is None:
             repeated = found.map_from_camera is judged.pose
         else:
@@ -145,7 +149,8 @@ class Reviewer:
                    for (name, observed), camera_matches in zip(seen.items(), matches, strict=True)}
         first_review, *_ = reviews.values()
         return replace(first_review, beside=dict(list(reviews.items())[1:]), accepted_alone=(
-            self._search(Localizer(self._relocalizer), first, []) if others else found).accepted)
+            self._search(Localizer(self._relocalizer, self._keyframes), [first])
+            if others else found).accepted)
 
     def _observed(self, name: str, wake_up: WakeUp) -> tuple[NDArray[np.uint8], Observation]:
         """Return the image (h, w, 3) of a camera, and the observation made in it."""
@@ -162,10 +167,11 @@ class Reviewer:
         return image_rgb, Observation(camera, detections, similarities, stamp_ns, name,
                                       odom_from_camera=self._mounts[name])
 
-    def _search(self, localizer: Localizer, first: Observation, others: Sequence[Observation]
-                ) -> Relocalization:
-        """Localize the first camera as the relocalizer does."""
-        return localizer.answer(Query((*others, first), run=None))
+    def _search(self, localizer: Localizer,
+                seen: Sequence[tuple[NDArray[np.uint8], Observation]]) -> Relocalization:
+        """Localize the last camera as the relocalizer does."""
+        images, observations = zip(*seen, strict=True)
+        return localizer.answer(Query(observations, images, run=None))
 
     def _review(self, name: str, judged: Judged, image_rgb: NDArray[np.uint8],
                 observation: Observation, matches: tuple[Match, ...], repeated: bool) -> Review:

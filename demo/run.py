@@ -5,7 +5,7 @@
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import chain
@@ -47,9 +47,11 @@ class WakeUpMap:
 class DemoOptions:
     """Options of the demo."""
 
-    #: Folder with sequence/ (a TUM folder), map.yaml, yolo.onnx and, unless the method matches
-    #: classes only, clip/ (see export_network)
-    assets: Path
+    assets: Path  #: Folder with sequence/ (a TUM folder) and map.yaml
+    #: Parameters that name the networks of detector and relocalizer; the relocalizer needs none
+    #: if the method matches classes only. Without them: the networks of the default profile
+    detector: Mapping[str, Path]
+    encoder: Mapping[str, Path]
     out: Path  #: Folder for the pictures
     wake_ups: int = 10  #: Number of wake-ups
     rate: float = 8.0  #: Speed between wake-ups; 1 is as recorded
@@ -58,6 +60,7 @@ class DemoOptions:
     wake_up_map: WakeUpMap | None = None  #: The map to wake up in; None: the assets' map.yaml
     has_rig: bool = False  #: Whether the robot has the cameras of rig/ instead of one
     is_watched: bool = False  #: Whether the localizer is watched and a lost robot is relocalized
+    recording: str = ''  #: Name and licence of a real recording; '' for a rendered room
 
     @property
     def map_file(self) -> Path:
@@ -90,21 +93,19 @@ class DemoOptions:
                                          'matching': matching, 'algorithm': algorithm,
                                          'require_localizer': False,  # the demo has no AMCL
                                          # a search that ends by time is not reproducible
-                                         'time_budget_ms': 10_000.0}
+                                         'time_budget_ms': 10_000.0, **self.encoder}
         if self.is_watched:
             parameters |= {'watch': 'amcl_pose', 'watch_period_s': 1.0, 'on_lost': 'relocalize',
                            'require_localizer': True}
-        if matching != 'class':
-            parameters['clip_pretrained'] = self.assets / 'clip'
         if self.has_rig:
             # the pose of the first camera
-            parameters |= {**self.of_detector, 'base_frame': 'camera_optical_frame',
+            parameters |= {**self.of_rig, 'base_frame': 'camera_optical_frame',
                            'base_from_camera': list(chain(*self.mounts.values()))}
         return parameters
 
     @property
-    def of_detector(self) -> dict[str, object]:
-        """Return the detector's parameters for a rig; none for a single camera.
+    def of_rig(self) -> dict[str, object]:
+        """Return the parameters of both nodes for a rig; none for a single camera.
 
         Fast DDS with its default settings does not deliver the raw images of four cameras at once.
         """
@@ -167,8 +168,7 @@ def prepare(options: DemoOptions) -> None:
     for picture in options.out.glob(page.PICTURES):
         picture.unlink()
     needed = [options.assets / ('rig' if options.has_rig else 'sequence'),
-              options.assets / 'yolo.onnx',
-              *(value for value in options.parameters.values() if isinstance(value, Path))]
+              options.map_file, *options.detector.values(), *options.encoder.values()]
     for path in needed:
         if not path.exists():
             raise DemoError(f'{path} is missing: choose another folder with --assets')
@@ -203,8 +203,7 @@ def nodes(options: DemoOptions, domain: int) -> Iterator[Callable[[], None]]:
     start = time.monotonic()
     print(f'starting detector and relocalizer ({options.method}); to see their topics: export '
           f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST', flush=True)
-    with (running(node_command('detector', {'model': options.assets / 'yolo.onnx',
-                                            **options.of_detector}),
+    with (running(node_command('detector', {**options.detector, **options.of_rig}),
                   options.out / 'detector.log') as detector,
           running(node_command('relocalizer', options.parameters),
                   options.out / 'relocalizer.log') as relocalizer):
@@ -240,4 +239,4 @@ def _draw(options: DemoOptions, landmark_map: LandmarkMap, sequences: dict[str, 
         print(f'{len(sequences)} cameras; with the first camera alone, {alone} of {len(reviews)} '
               'would be accepted', flush=True)
         section += page.rig_section(list(sequences), alone, len(reviews))
-    return page.write_page(options.out, reviews, options.method, section)
+    return page.write_page(options.out, reviews, options.method, section, options.recording)

@@ -44,7 +44,8 @@ from cliploc_ros.offline.evaluation import summary
 from cliploc_ros.offline.evaluation.run import CAPTIONS, COMPARISON
 from cliploc_ros.offline.evaluation.trials import Result
 
-_SOURCES = Path(__file__).with_suffix('.yaml')
+#: Addresses and digests of the downloads.
+SOURCES = Path(__file__).with_suffix('.yaml')
 _NAMES = 'fr2', 'fr3', 'kitchen'
 # Bandwidth of a typical connection, to estimate the time of a download.
 _MEGABYTES_A_S = 10.0
@@ -114,7 +115,13 @@ class Sources:
             networks = [Download(**entry) for entry in content.pop('networks')]
             return cls(networks, recordings, **content)
         except (KeyError, TypeError, AttributeError) as error:
-            raise OptionsError(f'{path} is not like {_SOURCES.name}: {error}') from error
+            raise OptionsError(f'{path} is not like {SOURCES.name}: {error}') from error
+
+    def recording(self, name: str) -> Recording:
+        """Return a sequence; OptionsError: there is none of this name."""
+        if name not in self.recordings:
+            raise OptionsError(f'--sources has no sequence {name}: see studies/reproduce.yaml')
+        return self.recordings[name]
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -135,7 +142,7 @@ def make_parser() -> argparse.ArgumentParser:
                         help='folder for downloads and results (%(default)s)')
     parser.add_argument('--trials', type=positive_int, default=5, metavar='N',
                         help="seeds of the methods that draw samples (the paper's %(default)s)")
-    parser.add_argument('--sources', type=Path, default=_SOURCES, metavar='YAML',
+    parser.add_argument('--sources', type=Path, default=SOURCES, metavar='YAML',
                         help='file with addresses and digests (studies/reproduce.yaml)')
     return parser
 
@@ -144,19 +151,18 @@ def run(options: argparse.Namespace) -> int:
     """Reproduce with the given options; return the exit code."""
     sources, out = Sources.of_file(options.sources), options.out
     names = _NAMES if options.sequence == 'all' else (options.sequence,)
-    if missing := [name for name in names if name not in sources.recordings]:
-        raise OptionsError(f'{options.sources} has no sequence {missing[0]}')
+    for name in names:
+        sources.recording(name)
     if not options.plan:
         make_folder(out)
     _say_plan(names, sources, out)
     if options.plan:
         return 0
-    if not options.yes and not _is_agreed():
-        print('nothing was downloaded')
+    if not options.yes and not is_agreed():
         return 1
     if options.ask:
         return 0
-    with _alone_in(out):
+    with alone_in(out):
         networks = list(sources.options)
         for network in sources.networks:
             networks += [network.option, str(_downloaded(network, out))]
@@ -167,7 +173,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _alone_in(out: Path) -> Iterator[None]:
+def alone_in(out: Path) -> Iterator[None]:
     """Lock a folder against other runs; OptionsError: another run has locked it."""
     with (out / '.lock').open('w') as lock:
         try:
@@ -187,36 +193,43 @@ def _missing(names: Sequence[str], sources: Sources, out: Path) -> list[Download
 
 def _say_plan(names: Sequence[str], sources: Sources, out: Path) -> None:
     """Print the plan; OptionsError: the disk does not have enough space."""
-    missing = _missing(names, sources, out)
     print('\n'.join(f'{name}: {sources.recordings[name].name}' for name in names))
+    if find_spec('torch') is None:
+        print('script/setup models will first install PyTorch: up to 7 GB.')
+    slow, fast = (sum(sources.recordings[name].minutes[column] for name in names)
+                  for column in (1, 0))
+    print(f'The computation takes about {slow} minutes on two cores, {fast} with a GPU (a guess).')
+    print('Differences from the paper:', *(f'\n  {line}' for line in sources.remarks))
+    say_downloads(_missing(names, sources, out), out)
+
+
+def say_downloads(missing: Sequence[Download], out: Path) -> None:
+    """List files to download and the room they need; OptionsError: the disk lacks it."""
+    total = sum(download.megabytes for download in missing)
+    room = total + sum(download.unpacked for download in missing
+                       if isinstance(download, Recording))
     if missing:
         print(summary.as_text([('to download', 'MB', 'licence', 'from'), *(
             (download.name, f'{download.megabytes:.0f}', download.licence, download.url)
             for download in missing)]))
         print('Their licences apply to you and to the results. By continuing you accept them.')
-    total = sum(download.megabytes for download in missing)
-    room = total + sum(download.unpacked for download in missing
-                       if isinstance(download, Recording))
-    there = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
-    free = shutil.disk_usage(there).free / 1e6
-    slow, fast = (sum(sources.recordings[name].minutes[column] for name in names)
-                  for column in (1, 0))
     print(f'{total:.0f} MB to download, {total / _MEGABYTES_A_S / 60:.0f} minutes at '
-          f'{_MEGABYTES_A_S:g} MB/s; then about {slow} minutes on two cores, {fast} with a GPU (a '
-          f'guess). {out} will need {room / 1e3:.1f} GB more.')
-    if find_spec('torch') is None:
-        print('script/setup models will first install PyTorch: up to 7 GB.')
-    print('Differences from the paper:', *(f'\n  {line}' for line in sources.remarks), flush=True)
-    if free < room:
+          f'{_MEGABYTES_A_S:g} MB/s. {out} will need {room / 1e3:.1f} GB more.', flush=True)
+    there = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
+    if (free := shutil.disk_usage(there).free / 1e6) < room:
         raise OptionsError(f'the disk of {out} has {free / 1e3:.1f} GB left, {room / 1e3:.1f} GB '
                            'are needed: make room, or set --out to another disk')
 
 
-def _is_agreed() -> bool:
+def is_agreed() -> bool:
+    """Ask whether to download; OptionsError: nobody can answer."""
     try:
-        return input('Continue? [y/N] ').strip().lower() in ('y', 'yes')
+        agreed = input('Continue? [y/N] ').strip().lower() in ('y', 'yes')
     except EOFError:
         raise OptionsError('standard input is closed, so nobody can confirm: give --yes') from None
+    if not agreed:
+        print('nothing was downloaded')
+    return agreed
 
 
 def _download_file(url: str, file: Path, remedy: str, setting: str) -> Path:

@@ -58,6 +58,8 @@ def pytest_addoption(parser):
     parser.addoption('--quick', action='store_true',
                      help='leave out the tests that are marked full or clock, and do not import '
                           'the files that are marked full')
+    parser.addoption('--first-cases', action='store_true',
+                     help='run only the first case of each parametrized test')
 
 
 def pytest_ignore_collect(collection_path, config):
@@ -88,11 +90,13 @@ def pytest_configure(config):
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
     """Deselect tests that need a missing module; sort the others by expected duration."""
-    if config.getoption('--quick'):
-        slow = [item for item in items
-                if item.get_closest_marker('full') or item.get_closest_marker('clock')]
-        config.hook.pytest_deselected(items=slow)
-        items[:] = [item for item in items if item not in slow]
+    others = {'full', 'clock'} if config.getoption('--quick') else {'brief'}
+    wanted = [item for item in items if not others & {mark.name for mark in item.iter_markers()}]
+    if config.getoption('--first-cases'):
+        first = {item.nodeid.partition('[')[0]: item for item in wanted[::-1]}
+        wanted = [*first.values()][::-1]
+    config.hook.pytest_deselected(items=[item for item in items if item not in wanted])
+    items[:] = wanted
     left_out = [item for item in items if missing_module(item)]
     for item in left_out:
         config.stash[NOT_RUN].setdefault(missing_module(item), []).append(item.nodeid)

@@ -45,3 +45,13 @@ def write_tower(file: Path, embed_dim: int = 512) -> Path:
     """Write a small text tower as TorchScript."""
     torch.jit.script(TextTower(embed_dim)).save(file)
     return file
+
+
+class OnlyResults(torch.nn.Module):
+    def __init__(self, network: torch.nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, pixel_values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        found = self.network(pixel_values)
+        return found.logits, found.pred_boxes

@@ -97,9 +97,13 @@ def texts(node):
 def test_the_messages_that_are_looked_up_exist():
     sources = (PROJECT / 'cliploc_ros').rglob('*.py')
     known = [text for path in sources for text in texts(ast.parse(path.read_text()))]
-    page = (PROJECT / 'doc/your_robot.md').read_text().split('\n### There is no')[1]
-    quoted = re.findall(r'^\| `([^`|]+ [^`|]+)` \|', page, re.MULTILINE)
-    assert len(quoted) > 8
+    page = (PROJECT / 'doc/your_robot.md').read_text().split('\n## Troubleshooting')[1]
+    rows = [line.strip('| ').split(' | ') for line in page.split('\n## ')[0].splitlines()
+            if line.startswith('| ')]
+    assert len(rows) > 25 and all(len(row) == 3 and all(row) for row in rows)
+    quoted = [message for symptom, *_ in rows for message in re.findall('`([^`]+ [^`]+)`', symptom)
+              if not message.startswith('ros2 ')]
+    assert len(quoted) > 12
     for message in quoted:
         for part in message.split('...'):
             part = part.strip('; ')

@@ -4,6 +4,7 @@
 
 import re
 import runpy
+import subprocess
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 PROJECT = Path(__file__).resolve().parents[1]
+MANIFEST = ElementTree.parse(PROJECT / 'package.xml').getroot()
 # Rosdep keys that name an apt package on Ubuntu 24.04. The build farm accepts no others.
 OF_UBUNTU = {'python3-matplotlib', 'python3-numba', 'python3-numpy', 'python3-opencv',
              'python3-pytest', 'python3-scipy', 'python3-tqdm', 'python3-yaml'}
@@ -24,15 +26,53 @@ def read(name: str) -> str:
 
 def test_versions_are_equal():
     found = {re.search(pattern, read(name), re.MULTILINE).group(1) for name, pattern in {
-        'package.xml': '<version>(.+)</version>', 'setup.py': "version='(.+)'",
+        'package.xml': '<version>(.+)</version>', 'CITATION.bib': 'version = {(.+)}',
         'CITATION.cff': '^version: (.+)$', 'doc/conf.py': "version = '(.+)'",
         'CHANGELOG.rst': r'^(\d+\.\d+\.\d+) '}.items()}
     assert len(found) == 1, found
 
 
+def test_addresses_are_those_of_the_manifest():
+    """The owner fills package.xml, and this test lists the pages to change."""
+    email = MANIFEST.find('maintainer').get('email')
+    urls = {url.get('type'): url.text for url in MANIFEST.iter('url')}
+    pages = [*PROJECT.glob('*.*'), *(file for folder in ('doc', 'docker', '.github', 'script')
+                                     for file in (PROJECT / folder).rglob('*.*'))]
+    found = {(address, page.name) for page in pages
+             if page.suffix in ('.cff', '.md', '.rst', '.py', '.xml', '.yml')
+             for address in re.findall(r'(?:https?://|[\w.-]+@)[\w.-]*\w(?:/[\w./-]*\w)?',
+                                       page.read_text())
+             if 'cliploc' in address}
+    assert not {one for one in found if one[0] not in (email, *urls.values())}
+    for text, names in (
+            (f'git clone {urls["repository"]}\n', (
+                'README.md', 'doc/install.md', 'doc/first_relocalization.md')),
+            (f']({urls["bugtracker"]})', ('README.md', 'CONTRIBUTING.md')),
+            (f' {email},', ('SECURITY.md',))):
+        assert all(text in read(name) for name in names)
+
+
+@pytest.mark.parametrize(('address', 'code'), [('//example.org', 1), ('@example.com', 1),
+                                               ('//github.com', 0)])
+def test_a_release_with_placeholders_is_refused(address, code, tmp_path):
+    step, = (step['run'] for job in yaml.safe_load(read('.github/workflows/release.yml'))[
+        'jobs'].values() for step in job['steps'] if 'package.xml' in step.get('run', ''))
+    (tmp_path / 'package.xml').write_text(address)
+    assert subprocess.run(['bash', '-e', '-c', step], cwd=tmp_path).returncode == code
+
+
+def test_bibtex_and_cff_cite_the_same():
+    software, text = yaml.safe_load(read('CITATION.cff')), read('CITATION.bib')
+    paper, text = software['preferred-citation'], re.sub(r'[{}\\]', '', text)
+    authors = (f'{one["family-names"]}, {one["given-names"]}' for one in paper['authors'])
+    assert re.findall(r'= (.+?),?$', text, re.MULTILINE) == [
+        paper['title'], ' and '.join(authors), paper['collection-title'], str(paper['year']),
+        paper['url'], software['title'], software['authors'][0]['name'], software['version'],
+        software['date-released'][:4]]
+
+
 def test_rosdep_can_resolve_every_key():
-    manifest = ElementTree.parse(PROJECT / 'package.xml').getroot()
-    keys = {entry.text for entry in manifest if entry.tag.endswith('depend')}
+    keys = {entry.text for entry in MANIFEST if entry.tag.endswith('depend')}
     assert {key for key in keys if key.startswith('python3-')} == OF_UBUNTU
     assert not [key for key in keys if key.endswith('-pip')]
 

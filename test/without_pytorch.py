@@ -1,11 +1,27 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""An environment without PyTorch, for processes of tests."""
+"""An environment without PyTorch, for processes of tests, and imports of it at the first use."""
 
+import importlib
 import os
 from pathlib import Path
 
 PROJECT = Path(__file__).resolve().parents[1]
+
+
+class Lazy:
+    """A module that is imported at its first use, and not by each worker of the tests.
+
+    In a new environment, PyTorch and open_clip take 13 s.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __getattr__(self, attribute: str) -> object:
+        if attribute.startswith('_') or attribute == 'pytestmark':  # pytest looks at all objects
+            raise AttributeError(attribute)
+        return getattr(importlib.import_module(self.name), attribute)
 
 
 def hide_pytorch(folder: Path) -> dict[str, str]:

@@ -41,7 +41,8 @@ def run(*arguments, within=()):
     return process.returncode, output, errors
 
 
-@pytest.fixture(scope='module', params=[2, pytest.param(WAKE_UPS, marks=pytest.mark.full)])
+@pytest.fixture(scope='module', params=[
+    pytest.param(2, marks=pytest.mark.brief), pytest.param(WAKE_UPS, marks=pytest.mark.full)])
 def finished(request, tmp_path_factory):
     """Run the demo to its end; return the folder of its pictures, its output, and its wake-ups."""
     out = tmp_path_factory.mktemp('demo') / 'pictures'

@@ -23,6 +23,9 @@ def room():
 
 @pytest.fixture(scope='module')
 def renderer(room):
+    # PyTorch's Triton and Mesa's software renderer each load an LLVM; the opposite order crashes
+    import torchvision  # noqa: F401
+
     return Renderer(room, CAMERA, Light())
 
 

@@ -104,8 +104,10 @@ def test_joint_refinement_corrects_poses_and_landmarks():
      'poses and stamps|good enough'),
 ])
 def test_input_without_a_map_says_what_to_correct(change, message):
-    with pytest.raises(MappingError, match=message):
-        build_map(change(walk.see(TABLE, walk.walk_around())))
+    for errors in (None, PoseErrors(0.05, 1.0, 3.0)):
+        with pytest.raises(MappingError, match=message):
+            build_map(change(walk.see(TABLE, walk.walk_around())), MappingOptions(
+                pose_errors=errors))
 
 
 def test_doubtful_input_is_noted():

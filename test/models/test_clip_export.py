@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import open_clip
 import pytest
-import torch
 from PIL import Image
-from safetensors.torch import save_file
+from without_pytorch import Lazy
 
 from cliploc_ros.cli.export_network import main as export_network
 from cliploc_ros.errors import ModelError
@@ -26,6 +24,7 @@ from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 from demo import ASSETS
 
 pytestmark = pytest.mark.full
+open_clip, safetensors, torch = map(Lazy, ('open_clip', 'safetensors.torch', 'torch'))
 
 LABELS = ['a red mug', 'Dining-table, 2.5m wide!!', "the dog's bowls, don't", 'Büro', 'very ' * 90]
 BBOXES = np.array([[100.0, 50, 300, 250], [0, 0, 640, 480], [-40, -30, 90.5, 60.2],
@@ -121,7 +120,7 @@ def write_torchscript(model, file):
 @pytest.mark.parametrize(('write', 'suffix'), [
     (lambda model, file: torch.save({'epoch': 3, 'state_dict': {
         f'module.{name}': tensor for name, tensor in model.state_dict().items()}}, file), '.pt'),
-    (lambda model, file: save_file({
+    (lambda model, file: safetensors.save_file({
         name: tensor.contiguous() for name, tensor in model.state_dict().items()}, file),
      '.safetensors'),
     (write_torchscript, '.ts')], ids=['training', 'safetensors', 'openai'])

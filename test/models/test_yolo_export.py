@@ -13,13 +13,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import open_clip
 import pytest
-import torch
-from open_weights import TextTower, write_open_yolo, write_tower
 from scene import make_room
-from torchvision.ops import box_iou
-from without_pytorch import hide_pytorch
+from without_pytorch import Lazy, hide_pytorch
 
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models import protocols
@@ -31,6 +27,8 @@ from cliploc_ros.offline.recording.recorder import EVERY_FRAME, RecordingOptions
 from demo import ASSETS
 
 pytestmark = pytest.mark.full
+open_clip, open_weights, ops, torch = map(Lazy, (
+    'open_clip', 'open_weights', 'torchvision.ops', 'torch'))
 
 PROJECT = Path(__file__).resolve().parents[2]
 
@@ -94,16 +92,6 @@ SMALL = {'encoder_hidden_dim': 32, 'encoder_ffn_dim': 32, 'd_model': 32, 'num_qu
          'encoder_in_channels': [24, 32, 40], 'decoder_in_channels': [32] * 3}
 
 
-class OnlyResults(torch.nn.Module):
-    def __init__(self, network: torch.nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, pixel_values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        found = self.network(pixel_values)
-        return found.logits, found.pred_boxes
-
-
 @pytest.mark.needs('transformers')
 def test_boxes_of_d_fine_equal_those_of_the_library(tmp_path, cache):
     """The published file cannot be downloaded here: the network has random weights."""
@@ -131,7 +119,8 @@ def test_boxes_of_d_fine_equal_those_of_the_library(tmp_path, cache):
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter('ignore')
         # The exporter leaves all submodules of a module in its training mode.
-        torch.onnx.export(OnlyResults(network).eval(), (given,), tmp_path / 'onnx/model.onnx',
+        torch.onnx.export(open_weights.OnlyResults(network).eval(), (given,),
+                          tmp_path / 'onnx/model.onnx',
                           input_names=['pixel_values'], output_names=['logits', 'pred_boxes'],
                           dynamo=False, opset_version=17)
         outputs = network(given)
@@ -200,9 +189,9 @@ THREE = protocols.prompts_of_names('mug, office chair, potted plant')
 @pytest.fixture(scope='session')
 def folder(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp('open_vocabulary')
-    write_open_yolo(path / 'world.pt', 'yolov8n-worldv2.yaml')
-    write_open_yolo(path / 'yoloe.pt', 'yoloe-v8n-seg.yaml', 'segment')
-    write_tower(path / 'tower.ts')
+    open_weights.write_open_yolo(path / 'world.pt', 'yolov8n-worldv2.yaml')
+    open_weights.write_open_yolo(path / 'yoloe.pt', 'yoloe-v8n-seg.yaml', 'segment')
+    open_weights.write_tower(path / 'tower.ts')
     return path
 
 
@@ -219,7 +208,7 @@ def test_it_detects_the_texts_as_ultralytics_does(folder, name):
     texts = [text for text, _ in THREE]
     assert exported.class_names == tuple(texts)
     with torch.no_grad():
-        rows = TextTower(512)(open_clip.get_tokenizer('ViT-B-32')(texts))
+        rows = open_weights.TextTower(512)(open_clip.get_tokenizer('ViT-B-32')(texts))
         rows = torch.nn.functional.normalize(rows, dim=-1)[None]
         if name == 'yoloe.pt':
             model.set_classes(texts, model.model.model[-1].get_tpe(rows))
@@ -242,9 +231,9 @@ def test_two_texts_of_a_class_find_an_object_once(folder):
     assert joined.class_names == ('mug',)
     both, once = apart.detect(NOISE_RGB), joined.detect(NOISE_RGB)
     assert set(both.class_ids) == {'mug', 'red'} and set(once.class_ids) == {'mug'}
-    overlaps = box_iou(*(torch.from_numpy(one.bboxes_xyxy) for one in (both, once))).numpy()
+    overlaps = ops.box_iou(*(torch.from_numpy(one.bboxes_xyxy) for one in (both, once))).numpy()
     assert (overlaps.max(axis=1) > 0.7).all(), 'each is represented'
-    among = box_iou(*[torch.from_numpy(once.bboxes_xyxy)] * 2).fill_diagonal_(0.0)
+    among = ops.box_iou(*[torch.from_numpy(once.bboxes_xyxy)] * 2).fill_diagonal_(0.0)
     assert among.max() <= 0.7 and (np.diff(once.scores) <= 0.0).all()
 
 

@@ -20,10 +20,10 @@ from cliploc_ros.ros.conversions import stamp_ns
 pytestmark = pytest.mark.full
 
 #: Default number of requests.
-REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '200'))
+REQUESTS = int(os.environ.get('CLIPLOC_SOAK_REQUESTS', '100'))
 #: Growth in the second half. A short run is still warming up: pools of the middleware grow with
 #: the first thousand subscriptions.
-GROWTH = 0.01 if REQUESTS >= 10_000 else 0.03
+GROWTH = 0.01 if REQUESTS >= 10_000 else 0.015
 #: Threads of the middleware and of Python, and 24 for waiting callbacks, whose pool never shrinks.
 MAX_THREADS = 45
 FRAMES, PERIOD_S = 60, 0.025

@@ -7,6 +7,7 @@ import fcntl
 import io
 import json
 import re
+import subprocess
 import sys
 import tarfile
 import threading
@@ -23,6 +24,7 @@ from cliploc_ros.offline.datasets.bag_frames import BagTopics, bag_frames
 from cliploc_ros.offline.datasets.bag_poses import PoseSource
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 from demo import ASSETS
+from demo import __main__ as demo
 from studies import reproduce
 
 pytestmark = pytest.mark.full
@@ -184,6 +186,27 @@ def test_a_disk_that_is_too_small_and_another_run(write_sources, refused, tmp_pa
         assert 'another run is at work' in refused(*given, write_sources())
 
 
+def test_the_demo_wakes_up_in_a_recording_that_it_downloads(server, write_sources, run_here,
+                                                            tmp_path, monkeypatch):
+    given = ('--real', '--assets', ASSETS, '--sources', write_sources(), '--out', tmp_path / 'out',
+             '--method', 'class_auto', '--wake-ups', '1')
+    monkeypatch.setattr(sys, 'stdin', io.StringIO('n\n'))
+    done = run_here(demo.main, *given)
+    assert done.returncode == 1 and 'nothing was downloaded' in done.stdout and not server.asked
+    assert f'/{ARCHIVE}' in done.stdout and 'Apache-2.0' in done.stdout
+    archive = server.files.pop(ARCHIVE)
+    done = run_here(demo.main, *given, '--yes')  # the file to bring is named
+    file = tmp_path / 'out/real/downloads' / ARCHIVE
+    assert done.returncode == 1 and f'put the file there yourself, as {file}' in done.stderr
+    file.write_bytes(archive)
+    done = subprocess.run([sys.executable, '-m', 'demo', *given, '--yes'], cwd=PROJECT,
+                          capture_output=True, text=True)
+    assert done.returncode == 0 and '1 wake-ups: 1 accepted, 0 refused, none wrong' in done.stdout
+    page = (tmp_path / 'out/index.html').read_text()
+    assert 'These images are real:</b> the demo, Apache-2.0.' in page
+    assert 'synthetic' not in page and 'equal in 1 of 1 cases' in page
+
+
 def test_sources_that_lack_something(write_sources, refused):
     file = write_sources()
     file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {'sequences': {}}))
@@ -254,7 +277,7 @@ def test_an_archive_without_sound_members_or_of_any_size_is_named(file, content,
 def test_the_form_of_the_shipped_sources():
     """The addresses cannot be opened here."""
     sources = reproduce.Sources.of_file(PROJECT / 'studies/reproduce.yaml')
-    assert (*sources.recordings,) == ('fr2', 'fr3', 'kitchen')
+    assert (*sources.recordings,) == ('fr2', 'fr3', 'kitchen', 'fr1')
     for download in (*sources.networks, *sources.recordings.values()):
         assert download.url.startswith('https://')
         assert re.fullmatch('([0-9a-f]{64})?', download.sha256)

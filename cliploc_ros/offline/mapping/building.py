@@ -294,7 +294,7 @@ class _Builder(NamedTuple):
         if is_estimated:
             self.tell('estimating pose errors', 0.0)
             errors = joint.significant_pose_errors(given, draft.landmarks, draft.shown)
-        if errors is None:
+        if errors is None or not len(draft.landmarks.centers):
             return views, draft, None, [] if odometry is None else [
                 'odometry is not used: the poses are taken as they are']
         for number in range(_REBUILDS + 1):
