@@ -46,7 +46,7 @@ _COMPARED = 6
 # Poses jump by more than this against the images [m] and this many times the median. Chosen: the
 # kitchen's poses differ by up to 0.04 m. An image is compared with this number of later images;
 # this share of the measurements across a jump agrees with their median up to this share of it.
-_JUMP_M, _UNUSUAL, _ACROSS, _AGREE, _JUMP_SPREAD = 0.12, 8.0, 3, 0.6, 0.3
+_JUMP_M, _UNUSUAL, _ACROSS, _AGREE, _JUMP_SPREAD = 0.12, 8.0, 3, 0.6, 0.5
 # Least number of points that locate an image.
 _LEAST_SEEN = 12
 # Number of words. 1,024 words find the keyframes of the kitchen as well as comparing all
