@@ -331,7 +331,8 @@ class Comparison:
                                   self.poses[~self.leading])
         turned = turned_about_axis(landmark_map, best.pose, best.landmarks)
         found = np.concatenate([twins, turned])
-        rooms = np.append(alike.are_rooms, np.zeros(len(turned), dtype=np.bool_))
+        rooms, copies = (np.append(alike.are_rooms(least), np.zeros(len(turned), dtype=np.bool_))
+                         for least in (0.0, CALIBRATION.twins.least_copied))
         inside = np.nonzero((low <= found[:, 2, 3]) & (found[:, 2, 3] <= high))[0]
         places = [joined.refined(unrefined(found[row])) for row in inside]
         poses = np.array([best.pose, *(place.map_from_camera for place in places)])
@@ -344,7 +345,7 @@ class Comparison:
             return 1.0, None
         rows = inside[others - 1]
         rivals = joined.contenders([places[row - 1] for row in others], [True] * len(others))
-        leads = self._leads_of_points(poses[others], rooms[rows])
+        leads = self._leads_of_points(poses[others], copies[rows])
         for number, (rival, row) in enumerate(zip(rivals, rows, strict=True)):
             if row < len(twins):
                 by_objects = lead_over_twin(best.support, rival.support, float(alike.shares[row]),
@@ -360,7 +361,8 @@ class Comparison:
         """Return the log odds (m,) by which keyframes prefer the leading place to each twin.
 
         They are no evidence against a twin in another room that they do not cover: it may show the
-        same points. The odds are infinite if points alone are enough to accept the leading place
+        same points. Between halves of a room with few objects, which are alike by chance, they are
+        evidence. The odds are infinite if points alone are enough to accept the leading place
         against the twin: objects have no say then.
         """
         leading = self._by_keyframes

@@ -69,9 +69,10 @@ class Alike(NamedTuple):
         """Return the share (m,) of the given place's landmarks that are found at each place."""
         return np.asarray(self.found.sum(axis=1) / max(1, len(self.landmarks)))
 
-    @property
-    def are_rooms(self) -> NDArray[np.bool_]:
+    def are_rooms(self, least_half: float = 0.0) -> NDArray[np.bool_]:
         """Return which places (m,) are rooms of their own, or the other half of a symmetric room.
+
+        Another half has at least `least_half` common landmarks.
 
         Many of their common landmarks lie beyond the given place. If the places are so near that
         it has the landmarks of both, a move takes each landmark to another one. Moves that fit by
@@ -84,7 +85,7 @@ class Alike(NamedTuple):
         distinct = np.array([len({*others[found]})
                              for others, found in zip(self.others, moved, strict=True)])
         return np.asarray((beyond.sum(axis=1) >= _TERMS.least_share * common)
-                          | (distinct >= _TERMS.one_to_one * common))
+                          | ((distinct >= _TERMS.one_to_one * common) & (common >= least_half)))
 
 
 def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
