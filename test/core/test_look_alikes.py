@@ -59,10 +59,11 @@ def test_a_room_nearby_and_the_other_half_of_a_symmetric_hall_are_places_of_thei
     between = rigid((min(distance_m, 5.0) / 2.0, 0.0, 1.0))
     alike = find_twins(map_of(classes * 2, np.concatenate([room, twin]), 0.1), between,
                        np.arange(12), NOWHERE)[1]
-    assert alike.are_rooms[0]
+    assert alike.are_rooms()[0]
     count = len(alike.landmarks)
+    assert alike.are_rooms(count + 1.0)[0] == (distance_m == 9.0), 'a half with too few landmarks'
     chance = np.where(np.arange(count) < count // 2, alike.landmarks[0], alike.landmarks)
-    assert not alike._replace(others=chance[None], found=alike.found[:1]).are_rooms[0], \
+    assert not alike._replace(others=chance[None], found=alike.found[:1]).are_rooms()[0], \
         'the move takes half of the landmarks to one'
 
 

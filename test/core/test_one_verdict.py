@@ -264,6 +264,22 @@ def test_keyframes_tell_a_twin_that_they_cover_as_well_apart(covers):
     assert weak.source == 'both' and weak.evidence.distinct < 0.6, 'chance points give no evidence'
 
 
+@pytest.mark.parametrize(('objects', 'accepted'), [(3, True), (12, False)])
+def test_keyframes_tell_a_place_apart_that_a_turn_repeats_by_chance(objects, accepted):
+    """A place of few objects has such a twin by chance, a symmetric hall by design."""
+    eye, turn = MAP_FROM_CAMERA[:3, 3], Rotation.from_euler('z', np.pi)
+    half = ROOM.select(range(objects))
+    half = replace(half, centers=eye + 0.7 * (half.centers - eye), semi_axes=0.7 * half.semi_axes)
+    axis = half.centers.mean(axis=0) * [1.0, 1.0, 0.0]
+    other = replace(half, centers=turn.apply(half.centers - axis) + axis,
+                    quats_xyzw=(turn * Rotation.from_quat(half.quats_xyzw)).as_quat(),
+                    landmark_ids=tuple(f'{name}_2' for name in half.landmark_ids))
+    found = ask(Says(place(), covers=lambda pose: float(pose_error(pose, MAP_FROM_CAMERA)[0] < 1)),
+                objects=objects, room=half.with_more(other))
+    assert found.evidence.twin is not None
+    assert found.accepted == accepted and (found.evidence.distinct > 0.99) == accepted
+
+
 def test_fusing_takes_the_better_pose_of_each_direction():
     level, upright = np.diag([0.01, 0.01, 1.0, 1.0, 1.0, 1.0]), np.diag([1.0] * 2 + [0.01] * 4)
     pose, covariance = fuse(moved(0.0), level, moved(0.1), upright)
