@@ -365,6 +365,9 @@ def time_request(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,
         np.concatenate([found.scores, np.full(len(drawn), 0.5)]))
     # The time does not depend on the field of view: 53 degrees.
     camera = Camera(width, height, width, width, width / 2, height / 2)
+    if localizer.keyframes is not None:  # it warns of another field of view
+        own = localizer.keyframes.localizer.layer.cameras[0]
+        camera = replace(camera, fx=own.fx * width / own.width, fy=own.fy * width / own.width)
     # the options of the most expensive request
     localizer.answer(Query((Observation(camera, boxes),), (image_rgb,), None),
                      replace(parameters.options(), crops='all'), times)
