@@ -7,7 +7,7 @@ It replaces `ros2 bag play`, which is missing in ROS from PyPI and in the base i
 
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import chain, islice
@@ -247,29 +247,34 @@ def with_stands(messages: Iterable[BagMessage], topics: Mapping[str, BagTopic],
             if pair[0].stamp_ns > message.stamp_ns + _STAND_NS:
                 break
         waiting.extend(later)
-        repeated, ends_ns = [], stands_ns + _STAND_NS
-        for number, ((topic, _child), part) in enumerate(newest.items()):
-            # cameras are synchronized; the stamps of transforms may be in the future
-            kind, at_ns, period_ns, pace = topics[topic].msgtype, image_ns + late_ns, _STAND_NS, \
-                paces[topic]
-            if kind == ODOMETRY:
-                at_ns = max(at_ns, stamp_ns(part))
-                period_ns = max((pace[-1] - pace[0]) // max(len(pace) - 1, 1), _LEAST_PACE_NS)
-                for speed in (part.twist.twist.linear, part.twist.twist.angular):
-                    speed.x = speed.y = speed.z = 0.0
-            elif hasattr(part, 'transform'):
-                at_ns = stamp_ns(part)
-            repeated += [(step, kind != ODOMETRY, number, topic, part, at_ns + step)
-                         for step in range(period_ns, (ends_ns if kind == ODOMETRY else stands_ns)
-                                           + 1, period_ns)]
-        for step, _, _, topic, part, at_ns in sorted(repeated, key=itemgetter(0, 1, 2)):
-            _set_stamp(part, at_ns)
+        ends_ns = stands_ns + _STAND_NS
+        for step, topic, part in _repeated(newest, topics, paces, image_ns + late_ns, stands_ns):
             kind = topics[topic].msgtype
-            yield BagMessage(topic, min(last.stamp_ns + step, message.stamp_ns + late_ns + ends_ns
-                                        ), bytes(store.serialize_cdr(store.types[kind](
-                                            transforms=[part]) if hasattr(part, 'transform')
-                                            else part, kind)))
+            whole = store.types[kind](transforms=[part]) if hasattr(part, 'transform') else part
+            yield BagMessage(topic, min(last.stamp_ns + step, message.stamp_ns + late_ns
+                                        + ends_ns), bytes(store.serialize_cdr(whole, kind)))
         late_ns, stop_ns = late_ns + ends_ns, message.stamp_ns + DRIVE_NS
+
+
+def _repeated(newest: Mapping[tuple[str, str], Any], topics: Mapping[str, BagTopic],
+              paces: Mapping[str, Sequence[int]], image_ns: int, stands_ns: int
+              ) -> Iterator[tuple[int, str, Any]]:
+    """Stamp the newest messages for a stand after an image; return time in it, topic, message."""
+    steps = []
+    for number, ((topic, _child), part) in enumerate(newest.items()):
+        # cameras are synchronized; the stamps of transforms may be in the future
+        at_ns, period_ns = stamp_ns(part) if hasattr(part, 'transform') else image_ns, _STAND_NS
+        is_odometry, pace = topics[topic].msgtype == ODOMETRY, paces[topic]
+        if is_odometry:
+            at_ns = max(at_ns, stamp_ns(part))
+            period_ns = max((pace[-1] - pace[0]) // max(len(pace) - 1, 1), _LEAST_PACE_NS)
+            for speed in (part.twist.twist.linear, part.twist.twist.angular):
+                speed.x = speed.y = speed.z = 0.0
+        steps += [(step, not is_odometry, number, topic, part, at_ns + step) for step in range(
+            period_ns, stands_ns + is_odometry * _STAND_NS + 1, period_ns)]
+    for step, _, _, topic, part, at_ns in sorted(steps, key=itemgetter(0, 1, 2)):
+        _set_stamp(part, at_ns)
+        yield step, topic, part
 
 
 def _set_stamp(message: Any, stamp_ns: int) -> None:

@@ -258,7 +258,7 @@ def test_a_robot_stands_on_its_way(tmp_path):
     # the image that the stand begins with keeps the camera_info that follows it
     assert stamps['/image', ''] == stamps['/camera_info', '']
     # odometry keeps its rate, and comes before the image of its time
-    assert {*np.diff([at for at in stamps['/odom', 'base_footprint']])} == {50 * MS}
+    assert {*np.diff(stamps['/odom', 'base_footprint'])} == {50 * MS}
     order = [(message.topic, bag_messages.stamp_ns(reader.deserialize(message)) - START_NS)
              for message in played if message.topic in ('/odom', '/image')]
     assert order.index(('/odom', 4 * second)) < order.index(('/image', 4 * second))
