@@ -246,7 +246,7 @@ def with_stands(messages: Iterable[BagMessage], topics: Mapping[str, BagTopic],
                 later.append(pair)
             if pair[0].stamp_ns > message.stamp_ns + _STAND_NS:
                 break
-        waiting.extend(later)
+        waiting.extendleft(reversed(later))
         ends_ns = stands_ns + _STAND_NS
         for step, topic, part in _repeated(newest, topics, paces, image_ns + late_ns, stands_ns):
             kind = topics[topic].msgtype
