@@ -71,8 +71,9 @@ def run(options: argparse.Namespace) -> int:
         f'{what:<12} {state:<12} {printable(text)}', flush=True))
     with running_ros(arguments):
         if options.prepare:
-            print(*make_ready(options.image, options.cache_dir, not options.without_detector,
-                              report), sep='\n')
+            for line in make_ready(options.image, options.cache_dir, not options.without_detector,
+                                   report):
+                print(line)
         else:
             doctor(options.params_file, options.relocalizer, options.timeout, report)
     failed = [what for what, state in report.findings if state is State.FAIL]

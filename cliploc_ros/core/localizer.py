@@ -405,6 +405,11 @@ class Localizer:
             elif seen is not None and query.is_thorough and not seen.is_thorough:
                 found = replace(found, reason=f'{found.reason}; thorough search of keyframes: '
                                               'time was up' + _RAISE)
+        if seen is not None and seen.outside_m is not None and not found.accepted:
+            found = replace(found, reason=(
+                f'keyframes give z {seen.outside_m:.2f} m, outside height_range_m '
+                f'{list(self._relocalizer.options.height_range_m)}: correct or remove it; '
+                f'{found.reason}'))
         if is_alone:
             return found
         while earlier and sum(len(instant.searched) for instant in earlier) + len(beside) \

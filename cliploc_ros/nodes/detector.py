@@ -148,6 +148,8 @@ class _Camera:
         silent_s = time.monotonic() - self._heard_at
         if self._node.count_publishers(topic) == 0:
             own.warn(f'no image: nobody publishes {topic}; remap it, or start its publisher')
+            if self.subscription is not None and silent_s > stale_after_s:
+                self._node.get_logger().warning(own.message, once=True)
         elif self.subscription is not None and silent_s > stale_after_s:
             own.warn(f'no image on {topic} for {silent_s:.1f} s')
         own.values |= {f'{name} rate [Hz]': f'{rate:.1f}'

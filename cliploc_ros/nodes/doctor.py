@@ -321,9 +321,12 @@ def make_ready(picture: Path | None, cache_dir: Path | None, has_detector: bool,
             report.add('request', State.PASS, f'{picture or "a drawn picture"}: first {first}; '
                                               f'later {later}'
                                               f'{"; " + GREY if is_grey(image_rgb) else ""}')
+    if any(state is State.FAIL for _, state in report.findings):
+        report.add('cache', State.NOT_CHECKED, 'correct the failures first')
+        return []
     report.judge('cache', f'not ready: {NOT_KEPT[0]}' if NOT_KEPT else '',
                  'with these parameters, start and requests need neither network nor compiler')
-    return [] if cache_dir is None else carrying(cache_dir, used)
+    return [] if cache_dir is None or NOT_KEPT else carrying(cache_dir, used)
 
 
 def read_picture(picture: Path | None) -> NDArray[np.uint8]:
@@ -362,6 +365,9 @@ def time_request(image_rgb: NDArray[np.uint8], detector: ObjectDetector | None,
         np.concatenate([found.scores, np.full(len(drawn), 0.5)]))
     # The time does not depend on the field of view: 53 degrees.
     camera = Camera(width, height, width, width, width / 2, height / 2)
+    if localizer.keyframes is not None:  # it warns of another field of view
+        own = localizer.keyframes.localizer.layer.cameras[0]
+        camera = replace(camera, fx=own.fx * width / own.width, fy=own.fy * width / own.width)
     # the options of the most expensive request
     localizer.answer(Query((Observation(camera, boxes),), (image_rgb,), None),
                      replace(parameters.options(), crops='all'), times)
@@ -376,11 +382,12 @@ def carrying(cache_dir: Path, used: Sequence[CommonParameters]) -> list[str]:
     names = {getattr(parameters, name, '') for parameters in used for name in _FILES} - {''}
     maps = {name for parameters in used if isinstance(parameters, RelocalizerParameters)
             for name in map_files(parameters)}
-    names |= maps | {str(beside(name)) for name in maps
-                     for beside in (embeddings_path, layer_path)}
-    files = sorted({Path(name).expanduser().absolute() for name in names})
+    files = {Path(name).expanduser().absolute(): 'a parameter names it' for name in names | maps}
+    for beside in (embeddings_path, layer_path):
+        files = {Path(beside(name)).expanduser().absolute(): f'the map {name} needs it'
+                 for name in maps} | files
     return [f'copy {cache_dir} ({size / 1e6:.0f} MB) to the robot, and set cache_dir to its path '
             f"there; its kernels are for processors like this one ('{get_host_cpu_name()}'), "
             'another one compiles them at its first start',
-            *(f'copy this file, too, as a parameter names it: {file}' for file in files
+            *(f'copy this file, too, as {why}: {file}' for file, why in sorted(files.items())
               if file.exists())]

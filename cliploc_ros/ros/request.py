@@ -39,9 +39,6 @@ _MAX_UNLINKED = 3
 # The current request ends at its own deadline, shortly before that of the waiting requests.
 _GRACE_S = 0.2
 
-# Refusals of images without objects of the map.
-_WITHOUT_OBJECTS = (RefusalKind.TOO_FEW_OBJECTS, RefusalKind.WRONG_DETECTIONS)
-
 # The name of each stage in messages, and how to make it faster.
 _STAGES = {
     'image': ('waiting for an image with detections',
@@ -253,9 +250,9 @@ class Requests:
             unlinked += answer.query is None or answer.query.run is None  # by odometry
             stages_ms.update(answer.stages_ms)
         assert last is not None
-        # further images do not help if no objects of the map are visible
+        # a refusal of another kind needs other remedies
         if is_up and last.verdict is Verdict.REFUSED and (
-                last.is_cut or last.kind not in _WITHOUT_OBJECTS):
+                last.is_cut or last.kind is RefusalKind.TIME_UP):
             last = replace(last, detail=f'{last.detail}; {time_is_up(stages_ms)}')
         return replace(last, time_s=time.monotonic() - arrived_at)
 
@@ -282,5 +279,5 @@ def time_is_up(stages_ms: Mapping[str, float]) -> str:
     """Return a message with the slowest stage of a request and its remedy."""
     stage = max(stages_ms, key=lambda name: stages_ms[name])
     (name, remedy), total_s = _STAGES[stage], sum(stages_ms.values()) / 1e3
-    return (f'time is up: {name} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; {remedy}, '
-            'or raise timeout_s')
+    return (f'time is up: {name} took {stages_ms[stage] / 1e3:.1f} of {total_s:.1f} s; '
+            f'raise timeout_s, or {remedy}')

@@ -91,6 +91,8 @@ def test_a_keyframe_is_found_though_others_look_more_like_the_image(corridor, mi
     seen = features_of(np.concatenate([own.pixels, others]), descriptors)
     localizer = KeyframeLocalizer(corridor)
     fast = localizer.localize_features(seen, CAMERA)
+    too_low = localizer.localize_features(seen, CAMERA, constraint=Constraint(min_height=1.0))
+    assert (too_low.places, too_low.outside_m) == ((), pytest.approx(0.0, abs=1e-3))
     # the thorough pass finds it too, although its pooled matches are less clear
     for place, in (fast.places, localizer.localize_features(seen, CAMERA, fast=fast).places):
         assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
@@ -298,7 +300,7 @@ def places_of(bearings, features, points, counts):
                                     np.arange(len(points)), np.zeros(len(points), np.float32))
     look_at = localization._Look(features_of(bearings * LENS.fx + (LENS.cx, LENS.cy)), bearings,
                                  LENS)
-    return localization._places(localization._place(matched, look_at), matched, look_at)
+    return localization._places(localization._place(matched, look_at), matched, look_at)[0]
 
 
 def test_the_place_in_more_parts_of_the_image_leads_before_a_poster_with_more_points():

@@ -125,3 +125,12 @@ def test_a_folder_that_does_not_take_it_all_is_not_ready(prepared, robot, tmp_pa
                    within=(*READ_ONLY, str(carried)))
     assert done.returncode == 1 and 'Traceback' not in done.stderr
     assert re.search(f'^cache +fail +not ready: .*{named}.*{tmp_path}', done.stdout, re.MULTILINE)
+    assert 'copy ' not in done.stdout
+
+
+def test_nothing_is_promised_after_a_failure(robot, tmp_path):
+    broken = tmp_path / 'robot.yaml'
+    broken.write_text(robot.read_text().replace('yolo.onnx', 'nowhere.onnx'))
+    output = prepare('--params-file', broken, '--cache-dir', tmp_path / 'carry').stdout
+    assert re.search('^detector +fail ', output) and re.search('\ncache +not checked ', output)
+    assert 'neither network' not in output and 'copy ' not in output

@@ -203,16 +203,17 @@ class KeyframeLocalizer:
         descriptors = kind.units(features.descriptors)
         look = _Look(features, bearings[known], camera, constraint, kind.least_inliers)
         if fast is None:
-            places = _places(*self._search_fast(descriptors, look, guesses, deadline), look)
+            places, outside_m = _places(
+                *self._search_fast(descriptors, look, guesses, deadline), look)
         else:
-            places = _places(*self._search_thoroughly(
+            places, outside_m = _places(*self._search_thoroughly(
                 descriptors, look, guesses, [place.map_from_camera for place in fast.places],
                 deadline), look)
             places[:1] = [self._guided(place, look, descriptors) for place in places[:1]]
         if time.monotonic() > deadline:
             return Recognition(is_complete=False, is_thorough=is_thorough)
         return Recognition(tuple(self._recognized(place, look, is_thorough) for place in places),
-                           is_thorough=is_thorough)
+                           is_thorough=is_thorough, outside_m=outside_m)
 
     def _search_fast(self, descriptors: NDArray[np.float32], look: _Look,
                      guesses: Sequence[NDArray[np.float64]], deadline: float
@@ -383,26 +384,30 @@ class KeyframeLocalizer:
         return np.diag(np.repeat([position, rotation], 3))
 
 
-def _places(first: _Place | None, matched: _Matched, look: _Look) -> list[_Place]:
-    """Return the first place and its rivals, the best places elsewhere.
+def _places(first: _Place | None, matched: _Matched, look: _Look
+            ) -> tuple[list[_Place], float | None]:
+    """Return the first place and its rivals, the best places elsewhere; see also outside_m.
 
     The place whose points lie in the most cells of the image comes first: a poster has many
     points, but shows only a part of its place.
     """
-    place, found, places = first, 0, list[_Place]()
+    place, found, places, outside_m = first, 0, list[_Place](), None
     while place is not None and (not places or place.agreed >= LEAST_INLIERS):
         if look.constraint.allows(place.map_from_camera):
             found += 1
             if not any(SAME_ANSWER.agree(place.map_from_camera, other.map_from_camera)
                        for other in places):
                 places.append(place)
+        elif outside_m is None and place.agreed >= LEAST_INLIERS:
+            outside_m = look.constraint.outside_m(place.map_from_camera)
         if found == MOST_PLACES:
             break
         taken = agreeing(matched.points, look.bearings[matched.features],
                          invert_transform(place.map_from_camera), _RIVAL_TOLERANCE)
         matched = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
         place = _place(matched, look, _RIVAL_ITERATIONS)
-    return sorted(places, key=lambda place: -np.count_nonzero(place.cells))
+    return (sorted(places, key=lambda place: -np.count_nonzero(place.cells)),
+            None if places else outside_m)
 
 
 def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,

@@ -57,3 +57,5 @@ class Recognition(NamedTuple):
     #: places: it may have missed rivals.
     is_complete: bool = True
     is_thorough: bool = False  #: Whether the thorough pass found the places, see ImageRecognizer
+    #: Height of the best place, if it is outside the range of heights and no place is inside [m]
+    outside_m: float | None = None

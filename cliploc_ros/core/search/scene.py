@@ -119,10 +119,14 @@ class Constraint(NamedTuple):
 
     def allows(self, map_from_camera: NDArray[np.float64]) -> bool:
         """Check whether the height range and max_tilt allow a pose (4, 4)."""
-        height = float(np.dot(self.up_in_map, map_from_camera[:3, 3]))
         up = map_from_camera[:3, :3] @ self.up_in_camera
-        return self.min_height <= height <= self.max_height and (
+        return self.outside_m(map_from_camera) is None and (
             self.max_tilt >= pi or float(up @ self.up_in_map) >= cos(self.max_tilt))
+
+    def outside_m(self, map_from_camera: NDArray[np.float64]) -> float | None:
+        """Return the height of a pose (4, 4) that is outside the height range [m]; else None."""
+        height = float(np.dot(self.up_in_map, map_from_camera[:3, 3]))
+        return None if self.min_height <= height <= self.max_height else height
 
     def tilt_error(self, map_from_camera: NDArray[np.float64], covariance: NDArray[np.float64]
                    ) -> float:

@@ -358,17 +358,18 @@ class FrameSource:
         stamps = ', '.join(f'{self._resolved(name)} {stamp / NS_PER_S:.6f}'
                            for name, stamp in self._pairing.last_stamp_ns.items())
         return (f'stamps never match (last: {stamps}): camera_info and detections must have '
-                "their image's header, and arrive within timeout_s")
+                "their image's header, and arrive within timeout_s; or a replay is slow")
 
     def _silence(self, name: str) -> str:
         topic = self._resolved(name)
         publishers = self._node.count_publishers(topic)
         if publishers and name == 'detections':
-            return (f'no detections on {topic} from its {publishers} publisher(s): see its log, '
+            return (f'no detections on {topic} from its {publishers} publisher(s): give '
+                    f'the detector the same image topic, {self._resolved("image")}; see its log, '
                     'choose a faster profile or a smaller detector, or raise timeout_s')
         if publishers:
             return (f'no {name} on {topic} from its {publishers} publisher(s): check that it '
-                    'publishes, and that its QoS is compatible')
+                    'publishes, and that its QoS is compatible; or it is slow')
         return f'no {name}: nobody publishes {topic}; remap it, or start its publisher'
 
     def _resolved(self, name: str) -> str:
