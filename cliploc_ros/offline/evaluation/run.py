@@ -237,9 +237,9 @@ def _write_comparison(folder: Path, title: str, summaries: Sequence[summary.Summ
         numbers += [
             (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
             (str(wrong), 'accepted, but wrong by more than 1 m', not wrong),
-            *[(f'{errors.max():.2f} m', 'worst error of an accepted pose', not wrong),
-              (f'{inside} of {errors.size}', 'accepted poses in their 95 % ellipsoid', True)
-              ] * bool(errors.size)]
+            *([(f'{errors.max():.2f} m', 'worst error of an accepted pose', not wrong),
+               (f'{inside} of {errors.size}', 'accepted poses in their 95 % ellipsoid', True)
+               ] if errors.size else ())]
     drawn = {picture.stem: html.figure(picture.read_bytes(), CAPTIONS[picture.stem], picture.stem)
              for picture in pictures}
     head, *brief = [[row[column] for column in _BRIEF] for row in rows]

@@ -233,8 +233,9 @@ def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str
             numbers = [*move[:3, 3], *transforms.quaternion_from_transform(move)]
             transform = name and f'{name} x y z qx qy qz qw ' + ' '.join(
                 f'{each:.4f}' for each in numbers)
+            misread = ', '.join(filter(None, (reading, transform)))
             return (f'note: {results[0].method}: poses would fit after one transform (not '
-                    f'applied): {", ".join(filter(None, (reading, transform)))}; give poses of the camera '
+                    f'applied): {misread}; give poses of the camera '
                     '(z forward) in the map, x y z qx qy qz qw')
     return ''
 
