@@ -235,8 +235,8 @@ def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str
                 f'{each:.4f}' for each in numbers)
             misread = ', '.join(filter(None, (reading, transform)))
             return (f'note: {results[0].method}: poses would fit after one transform (not '
-                    f'applied): {misread}; give poses of the camera '
-                    '(z forward) in the map, x y z qx qy qz qw')
+                    f'applied): {misread}; give poses of the camera (z forward) in the map, '
+                    'x y z qx qy qz qw')
     return ''
 
 

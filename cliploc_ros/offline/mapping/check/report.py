@@ -32,16 +32,15 @@ VERDICTS = {
         ('max_misled', 'max_systematic'),
         'objects alone localize too few views; keyframes need the images of the recording'),
     'failed': ((), 'a robot is mostly refused, or misled')}
-# What misses a threshold, as a clause about a part of the views, and what it means for a robot
-# where the verdict is 'failed'.
+# What misses a threshold, as a clause about a part of the views.
 _CLAUSES = {
-    'min_localized': ('{} views are localized', 'a robot is mostly refused'),
-    'min_by_objects': ('objects alone localize {} views', 'a robot is mostly refused'),
-    'min_by_keyframes': ('keyframes alone localize {} views', 'a robot is mostly refused'),
-    'max_misled': ('a wrong pose is accepted in {} recorded and simulated views',
-                   'a robot is misled'),
-    'max_systematic': ('a wrong camera, mount or clock explains errors of boxes',
-                       'poses are biased')}
+    'min_localized': '{} views are localized', 'min_by_objects': 'objects alone localize {} views',
+    'min_by_keyframes': 'keyframes alone localize {} views',
+    'max_misled': 'a wrong pose is accepted in {} recorded and simulated views',
+    'max_systematic': 'a wrong camera, mount or clock explains errors of boxes'}
+# What a missed threshold means for a robot, where the verdict is 'failed'.
+_FAILED = {'min_localized': 'mostly refused', 'max_misled': 'misled',
+           'max_systematic': 'localized with a bias'}
 
 
 class Advice(NamedTuple):
@@ -80,7 +79,7 @@ class Measure(NamedTuple):
     def clause(self) -> str:
         """Describe what misses the threshold, in a clause."""
         most = ' at most' * self.key.startswith('max')
-        text = _CLAUSES[self.key][0].format(f'{self.part:.0f} of {self.total:.0f}')
+        text = _CLAUSES[self.key].format(f'{self.part:.0f} of {self.total:.0f}')
         return (f'{text} ({self._percent(self.share)};{most} {self._percent(self.limit)} '
                 f'{"allowed" if most else "needed"})')
 
@@ -160,12 +159,11 @@ class CheckReport:
     @property
     def summary(self) -> tuple[str, ...]:
         """Return the verdict and the figures behind it, as sentences."""
-        name, missed = self.verdict, [
-            measure for measure in self.measures if measure.is_missed]
-        meaning = VERDICTS[name][1]
-        if name == 'failed' and missed:
-            causes = [_CLAUSES[measure.key][1] for measure in missed]
-            meaning = ', and '.join(dict.fromkeys(causes))
+        name, meaning = self.verdict, VERDICTS[self.verdict][1]
+        if name == 'failed':
+            missed = [_FAILED[measure.key] for measure in self.measures
+                      if measure.is_missed and measure.key in _FAILED]
+            meaning = f'a robot is {" and ".join(missed or ["mostly refused"])}'
         why = '; not `passed`: ' + ', '.join(self.failures) if self.failures else ''
         return f'{name}: {meaning}{why}', *self.localized
 
