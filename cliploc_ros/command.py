@@ -20,6 +20,8 @@ from cliploc_ros.errors import CliplocError, MapError, OptionsError
 
 #: The shell's exit code of a command that Ctrl-C ended.
 EXIT_INTERRUPTED = 130
+#: The shell's exit code of a command whose reader ended.
+EXIT_BROKEN_PIPE = 141
 # poll() counts milliseconds in 32 bits.
 _LONGEST_WAIT_S = 2e6
 # Options of the commands that have another name than the parameters of the nodes.
@@ -59,11 +61,17 @@ def run_command(command: Callable[[], int], failure: int = 1) -> int:
     Returns
     -------
     int
-        The exit code: `failure` after a CliplocError or a missing library, 130 when interrupted.
+        The exit code: `failure` after a CliplocError or a missing library, 130 when interrupted,
+        141 when the reader of its output ended.
         The error is printed in one line on stderr. Other exceptions keep their traceback.
     """
     try:
-        return command()
+        code = command()
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # the reader of the output ended, such as head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_BROKEN_PIPE
     except CliplocError as error:
         # messages name `parameters` of the library; show the option of the command instead
         text = re.sub('`([a-z_: ]+)`', lambda name: '--' + _OPTIONS.get(name[1], name[1]).replace(

@@ -28,7 +28,8 @@ examples:
   check_map office.yaml --observations office.npz --gravity --out office_check
   check_map hand_written.yaml --out check --min-localized 0.2
 
-exit code: 0 the verdict is "passed", 1 it is not or the input is invalid
+exit code: 0 the verdict is "passed"; 1 it is another one, such as "keyframes only" or "failed",
+or the input is invalid
 """
 
 

@@ -4,6 +4,9 @@
 
 import argparse
 import contextlib
+import os
+import subprocess
+import sys
 from importlib import import_module
 
 import pytest
@@ -69,3 +72,13 @@ def test_an_option_is_given_once(program, capsys):
                 parser.parse_args(words)
             assert ('given twice' in capsys.readouterr().err) == (
                 is_refused and again[0] not in REPEATED), words
+
+
+def test_a_program_ends_quietly_with_the_reader_of_its_output():
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([sys.executable, '-c', 'import sys; from cliploc_ros.command import '
+                           'run_command; sys.exit(run_command(lambda: print("x") or 0))'],
+                          stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, b'')

@@ -157,7 +157,8 @@ def test_the_files_say_what_was_compared(files, recording, tmp_path, evaluate_he
                         ('theirs=missing.txt', 'missing.txt')):
         assert_error(evaluate_here(*given, '--poses', word, '--out', tmp_path / 'none'), named)
     done = evaluate_here(*given, '--poses', f'w={tmp_path}/w.txt', '--out', tmp_path / 'w_first')
-    assert 'note: w: poses fit after one transform: quaternions are w first' in done.stdout
+    assert ('note: w: poses would fit after one transform (not applied): quaternions are w first '
+            '(add this first line') in done.stdout
 
 
 def test_options_without_effect_are_refused(files, tmp_path, evaluate_here):

@@ -197,7 +197,7 @@ def make_summary(errors, method='auto', accepted=None, confidence=None):
         np.zeros(shape, bool) if accepted is None else np.atleast_2d(accepted),
         np.zeros(shape) if confidence is None else np.atleast_2d(confidence), np.full(shape, 2.0),
         np.ones(shape), np.full(shape, 'objects'), np.zeros(shape, int),
-        np.zeros(shape))
+        np.zeros(shape), np.full(shape, 3.0))
 
 
 def make_result(**changes):
@@ -255,7 +255,7 @@ def test_the_table_marks_noise():
     assert summary.as_markdown(rows).splitlines()[2].startswith('| hybrid | bf | 1.00')
     assert all(len(line) <= 160 for line in summary.as_text(rows).splitlines())
     assert rows[0][-1] == 'false accepts', 'all queries are solved'
-    assert rows[1][-2:] == ('1.00 (.00 to 1.00)', '0 of 0')
+    assert rows[1][-2:] == ('-', '0 of 0')
     assert 'hybrid_bf' in summary.notes([good, near])[2]
 
 
@@ -292,8 +292,8 @@ def misread(pose):
     (lambda pose: SHIFT @ pose, 'map from their frame x y z qx qy qz qw -2.0000 0.0000 1.0000 '),
     (lambda pose: pose @ SHIFT, 'their body from camera x y z qx qy qz qw -2.0000 '),
     (misread, 'quaternions are w first'),
-    (lambda pose: misread(SHIFT @ pose), 'quaternions are w first (first line of the file: # '
-     'timestamp tx ty tz qw qx qy qz), map from their frame x y z'),
+    (lambda pose: misread(SHIFT @ pose), 'quaternions are w first (add this first line to the '
+     'file: # timestamp tx ty tz qw qx qy qz), map from their frame x y z'),
     (np.linalg.inv, 'poses are inverse (map in camera)'),
     (lambda pose: pose, ''),
     (lambda pose: pose @ make_transform(np.eye(3), np.random.default_rng(
@@ -309,8 +309,11 @@ def test_poses_of_another_program_that_fit_after_one_transform(questions, change
     poses = TimedPoses.from_samples(
         [query.observation.stamp_ns for query in queries],
         [[*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in given], 'here')
+    with pytest.raises(DatasetError, match=r'the nearest is 50 ms later .*constant offset'):
+        given_results('theirs', replace(poses, stamps_ns=poses.stamps_ns + 50_000_000), queries)
     found = find_misfit(given_results('theirs', poses, queries), queries)
-    assert found.startswith(said and f'note: theirs: poses fit after one transform: {said}')
+    assert found.startswith(said and 'note: theirs: poses would fit after one transform (not '
+                            f'applied): {said}')
     assert bool(found) == bool(said)
     if 'frame' in said:
         assert not find_misfit(given_results('theirs', poses, questions), questions)
@@ -319,13 +322,14 @@ def test_poses_of_another_program_that_fit_after_one_transform(questions, change
 def test_the_table_in_latex():
     """A cell holds one number, also of rows that were read from CSV; an empty cell stays empty."""
     rows = summary.csv_rows([make_summary([[0.1, 0.4]] * 2, 'my_own{}')])
-    cells = r'my\_own\{\} & 0.50 & 1.00 & 1.00 & 0.250 & 2.50 & 0.25 & 2.0 & 0.00 & 1.00 & 0 & \%'
+    cells = r'my\_own\{\} & 0.50 & 1.00 & 1.00 & 0.250 & 2.50 & 0.25 & 2.0 & 0.00 &  & 0 & \%'
     for again in (rows, [*csv.DictReader(summary.csv_text(rows).splitlines())]):
         text = summary.as_latex([{**again[0], 'paper_success': '%'}])
         assert text.splitlines() == [
-            rf'\begin{{tabular}}{{l{"r" * 11}}}', r'\toprule',
-            'method & success 0.25m & success 0.5m & success 1m & median error m & median error '
-            r'deg & mean error m & mean search ms & accepted & precision 1m & wrongly accepted & '
+            r'% needs \usepackage{booktabs}', rf'\begin{{tabular}}{{l{"r" * 11}}}', r'\toprule',
+            'method & success 0.25m & success 0.5m & success 1m & median error [m] & median error '
+            r'[deg] & mean error [m] & mean search [ms] & accepted & precision 1m & '
+            'wrongly accepted & '
             r'paper success \\', r'\midrule', rf'{cells} \\', r'\bottomrule', r'\end{tabular}']
     assert '& &' in summary.as_latex([rows[0] | {'accepted': ''}]).replace('  ', ' ')
 

@@ -160,8 +160,8 @@ def test_identical_rooms_fail_the_check(rooms_report):
 def test_limits_decide(least):
     report = check_map(TABLE, options=QUICK, thresholds=Thresholds(
         min_localized=least, min_by_objects=0.0))
-    assert [text.partition(':')[0] for text in report.failures] == [
-        'views that are localized'] * (least > 0.0)
+    assert [text.partition(' (')[0] for text in report.failures] == [
+        '4 of 9 views are localized'] * (least > 0.0)
     assert report.passed == (least == 0.0)
 
 
@@ -283,7 +283,7 @@ def test_page_escapes_hostile_names_and_asks_for_nothing(tmp_path, detections):
     assert kinds.keys() == {'data:image/png;', 'data:image/jpeg'}
     assert kinds['data:image/png;'] == 2
     assert kinds['data:image/jpeg'] >= 5, 'five duplicates are shown'
-    assert page.count('<u style') == len(report.measures) == 5, 'each threshold has a bar'
+    assert page.count('<u style') == len(report.measures) == 4, 'one bar each; no keyframes'
     assert json.loads((tmp_path / CHECK_DATA).read_text())['landmarks'][0]['faults']
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([CHECK, CHECK_DATA])
 
@@ -322,6 +322,9 @@ def test_a_map_without_landmarks_is_judged_by_its_keyframes(tmp_path, detections
     # boxes without images cannot try keyframes
     report = check_map(empty, detections, options=QUICK, layer=layer)
     assert 'keyframes not tried' in report.localized[0]
+    assert report.verdict == 'not judged by keyframes' and 'without the images' in report.advice[0]
+    assert report.localized[2] == (
+        f'0 of {len(report.recording.trials)} recorded and 0 of 36 simulated views misled')
     with pytest.raises(MappingError, match='neither landmarks nor keyframes'):
         check_map(empty, options=QUICK)
 
@@ -413,7 +416,9 @@ def test_one_table_gives_the_verdict(office_report, missed, verdict):
                      for key in MEASURES)
     told = replace(office_report, measures=measures)
     assert told.verdict == verdict and told.passed == (verdict == 'passed')
-    assert told.summary[0].startswith(f'{verdict}: {VERDICTS[verdict][1]}')
+    meaning = VERDICTS[verdict][1] if verdict != 'failed' else {
+        'max_misled': 'a robot is misled'}.get(missed[0], 'a robot is ')
+    assert told.summary[0].startswith(f'{verdict}: {meaning}')
     assert len(told.failures) == len({*missed} - {'min_by_keyframes'})
 
 
@@ -432,6 +437,7 @@ def test_the_page_has_this_table():
 
 def test_a_figure_is_told_apart_from_its_limit():
     assert str(Measure('min_localized', 199, 500, 0.4)) == '199 of 500 (39.8%, at least 40.0%)'
+    assert str(Measure('max_misled', 1, 1497, 0.01)) == '1 of 1497 (0.1%, at most 1.0%)'
     assert str(Measure('max_systematic', 0.5, 1.0, 0.25)) == '50%, at most 25%'
     assert str(Measure('max_misled', 0, 0, 0.01)) == '0 of 0 (0%, at most 1%)'
 

@@ -161,17 +161,16 @@ def figures_of(report: CheckReport) -> list[tuple[str, str]]:
 def _landmarks(landmarks: Sequence[LandmarkCheck]) -> str:
     rows: list[list[str | tuple[str, str]]] = []
     for check in landmarks[:_MOST_LANDMARKS]:
-        frames = '' if check.support is None else str(check.support)
-        if check.expected is not None:
-            frames += f' of {check.expected}'
+        frames = (f'{check.seen} of {check.expected}' if check.expected is not None else
+                  '' if check.support is None else str(check.support))
         label = (check.class_id if check.label == check.class_id
                  else f'{check.label} ({check.class_id})')
         faults = '; '.join(check.faults) if check.faults else _GRADES['sound'][0]
         rows.append([(check.landmark_id, _grade(check)), (label, 'text'), (faults, 'text'),
                      frames])
     return html.table(('landmark', 'label', 'faults', '#frames'), rows) + html.note(
-        'frames: number of frames with a detection of the landmark, of the frames that should '
-        f'show it. {CHECK_DATA} has all figures of all {len(landmarks)} landmarks.')
+        'frames: how many of the frames that should show the landmark have a detection of it. '
+        f' {CHECK_DATA} has all figures of all {len(landmarks)} landmarks.')
 
 
 # ---- the map from above -------------------------------------------------------------------------
@@ -213,7 +212,7 @@ def _drawn(draw: Callable[[Axes, LandmarkMap, CheckReport], None], landmark_map:
 def _draw_grid(axes: Axes, landmark_map: LandmarkMap, report: CheckReport) -> None:
     grid, side = report.grid, report.grid.spacing_m
     height = grid.positions[0, 2] if len(grid.positions) else 0.0
-    axes.set_title(f'Where a robot is localized, camera {height:.2f} m high', fontsize=12)
+    axes.set_title(f'Where a robot is localized, camera {height:z.2f} m high', fontsize=12)
     cells = PatchCollection(
         [Rectangle(position[:2] - 0.48 * side, 0.96 * side, 0.96 * side)
          for position in grid.positions], cmap=_HEAT, norm=Normalize(0, 100), zorder=1)

@@ -225,14 +225,21 @@ def _write_comparison(folder: Path, title: str, summaries: Sequence[summary.Summ
     """
     best = summary.find_best(summaries)
     wrong, count = best.false_accepts(), best.errors_m.size
-    said = html.verdict(f'{best.method} is the best of {len(summaries)} methods on '
-                        f'{len(best.queries)} images' if len(summaries) > 1 else
-                        f'{best.method} on {len(best.queries)} images', not wrong)
-    numbers = [(f'{100 * best.success(1.0):.0f} %', 'of the poses within 1 m of the truth', True)]
+    equal = [each.method for each in summaries
+             if each is not best and summary.compare(each, best).is_noise]
+    of = f'has the highest success of {len(summaries)} methods ' if len(summaries) > 1 else ''
+    said = html.verdict(f'{best.method} {of}on {len(best.queries)} images' + (
+        f'; {", ".join(equal)} cannot be told apart' if equal else ''), not wrong)
+    share = f'{100 * best.success(1.0):.0f} %'
+    numbers = [(share, 'of the queries within 1 m of the truth', True)]
     if not best.is_given:
+        errors, inside = best.of_accepted
         numbers += [
             (f'{int(best.accepted.sum())} of {count}', 'accepted', bool(best.accepted.any())),
-            (str(wrong), 'accepted, but wrong by more than 1 m', not wrong)]
+            (str(wrong), 'accepted, but wrong by more than 1 m', not wrong),
+            *([(f'{errors.max():.2f} m', 'worst error of an accepted pose', not wrong),
+               (f'{inside} of {errors.size}', 'accepted poses in their 95 % ellipsoid', True)
+               ] if errors.size else ())]
     drawn = {picture.stem: html.figure(picture.read_bytes(), CAPTIONS[picture.stem], picture.stem)
              for picture in pictures}
     head, *brief = [[row[column] for column in _BRIEF] for row in rows]

@@ -4,6 +4,7 @@
 
 import csv
 import io
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
@@ -63,6 +65,7 @@ class Summary:
     sources: NDArray[np.str_]  #: (t, q): source of each pose, see Result
     keyframe_inliers: NDArray[np.int64]  #: (t, q)
     keyframes_ms: NDArray[np.float64]  #: (t, q)
+    nees: NDArray[np.float64]  #: (t, q): see Result; infinite if unknown
 
     @property
     def has_keyframes(self) -> bool:
@@ -107,6 +110,12 @@ class Summary:
     def false_accepts(self) -> int:
         """Return the number of accepted poses that are wrong."""
         return int((self.accepted & ~(self.errors_m < SUCCESS_M)).sum())
+
+    @property
+    def of_accepted(self) -> tuple[NDArray[np.float64], int]:
+        """Return the errors [m] of accepted poses, and how many are in their 95 % ellipsoid."""
+        inside = self.accepted & (self.nees < chi2.ppf(0.95, 6))
+        return self.errors_m[self.accepted], int(inside.sum())
 
     def precision(self) -> float:
         """Return the share of accepted poses that are correct; 1 if no pose is accepted."""
@@ -157,7 +166,7 @@ def _summary(method: str, results: Sequence[Result]) -> Summary:
     return Summary(
         method, queries, float(column('crops_share').mean()), dict(kinds.most_common()),
         *map(column, ('error_m', 'error_deg', 'accepted', 'confidence', 'search_ms', 'coverage',
-                      'source', 'keyframe_inliers', 'keyframes_ms')))
+                      'source', 'keyframe_inliers', 'keyframes_ms', 'nees')))
 
 
 class Difference(NamedTuple):
@@ -238,7 +247,7 @@ def _row(summary: Summary, best: Summary) -> tuple[str, ...]:
     return (matching, algorithm, rates, errors,
             f'{summary.search_ms.mean():.1f}±{summary.search_ms.std():.1f}{cut}',
             _rate(float(summary.accepted.mean())),
-            f'{_rate(summary.precision())} ({interval})',
+            f'{_rate(summary.precision())} ({interval})' if summary.accepted.any() else '-',
             f'{summary.false_accepts()} of {int(summary.accepted.sum())}')
 
 
@@ -258,6 +267,11 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     lines += [f'{summary.method}: poses of another program; {np.isinf(summary.errors_m).sum()} of '
               f'{len(summary.queries)} queries have none within {GIVEN_TOLERANCE_MS} ms.'
               for summary in summaries if summary.is_given]
+    for summary in summaries:
+        errors, inside = summary.of_accepted
+        if errors.size:
+            lines.append(f'{summary.method} accepted: worst error {errors.max():.2f} m; {inside} '
+                         f'of {errors.size} poses in their 95 % ellipsoid.')
     lines += [f'{summary.method} refused: {_kinds(summary)}.'
               for summary in summaries if summary.refusals]
     lines += [f'{summary.method} compared {summary.crops_share:.0%} of the crops of a query with '
@@ -296,12 +310,13 @@ def as_markdown(rows: Sequence[Sequence[str]]) -> str:
 def as_latex(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the main columns of csv_rows in LaTeX, for booktabs, with one number in a cell."""
     names = [name for name in rows[0] if name in _LATEX or name.startswith('paper_')]
-    lines = [[name.replace('_', ' ') for name in names], *(
+    lines = [[re.sub(' (m|deg|ms)$', r' [\1]', name.replace('_', ' ')) for name in names], *(
         [f'{float(row[name]):{_LATEX[name]}}' if _LATEX.get(name) and row[name] != ''
          else str(row[name]) for name in names] for row in rows)]
     head, *body = [' & '.join(''.join(_OF_LATEX.get(char, char) for char in cell) for cell in line)
                    + r' \\' for line in lines]
-    return '\n'.join([rf'\begin{{tabular}}{{l{"r" * len(names[1:])}}}', r'\toprule', head,
+    return '\n'.join([r'% needs \usepackage{booktabs}',
+                      rf'\begin{{tabular}}{{l{"r" * len(names[1:])}}}', r'\toprule', head,
                       r'\midrule', *body, r'\bottomrule', r'\end{tabular}', ''])
 
 
@@ -356,6 +371,8 @@ def csv_rows(summaries: Sequence[Summary],
                          for source in _SOURCES}
             rows[-1] |= {'keyframe_inliers': float(np.median(summary.keyframe_inliers)),
                          'keyframes_ms': float(summary.keyframes_ms.mean())}
+        if not summary.accepted.any():
+            rows[-1] |= dict.fromkeys([name for name in rows[-1] if 'precision' in name], '')
         if summary.is_given:
             rows[-1] |= dict.fromkeys(_OF_SEARCHES, '')
     return rows

@@ -174,7 +174,7 @@ def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -
     tolerance_ns = GIVEN_TOLERANCE_MS * 1_000_000
     check_clock(poses, min(stamps_ns) - tolerance_ns, max(stamps_ns) + tolerance_ns,
                 f'poses of {name}')
-    results = []
+    results, late_ms = [], list[float]()
     for query, stamp_ns in zip(queries, stamps_ns, strict=True):
         gaps_ns = np.abs(poses.stamps_ns - stamp_ns)
         row = int(gaps_ns.argmin())
@@ -183,6 +183,13 @@ def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -
         results.append(Result(
             name, 0, query.number, stamp_ns / NS_PER_S, len(query.observation.detections),
             solved=pose is not None, accepted=False, source=GIVEN, **_error(pose, query)))
+        late_ms.append((poses.stamps_ns[row] - stamp_ns) / 1e6)
+    if not any(result.solved for result in results):
+        late = float(np.median(late_ms))
+        raise DatasetError(
+            f'poses of {name}: no query has a pose within {GIVEN_TOLERANCE_MS} ms; the nearest is '
+            f'{abs(late):.0f} ms {"later" if late > 0.0 else "earlier"} (median): do the stamps '
+            'have a constant offset?')
     return results
 
 
@@ -208,8 +215,8 @@ def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str
     before = errors_of(given[None]).max()
     # any transform fits poses of one place
     moving = min(before, errors_of(truth[:, None]).max(axis=1).min())
-    readings = {'': given, 'quaternions are w first (first line of the file: # timestamp tx ty tz '
-                'qw qx qy qz)': np.array([*map(w_first, given)]),
+    readings = {'': given, 'quaternions are w first (add this first line to the file: # timestamp '
+                'tx ty tz qw qx qy qz)': np.array([*map(w_first, given)]),
                 'poses are inverse (map in camera)': np.linalg.inv(given)}
     candidates: list[tuple[str, str, NDArray[np.float64], NDArray[np.float64]]] = []
     for reading, poses in readings.items():
@@ -226,9 +233,10 @@ def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str
             numbers = [*move[:3, 3], *transforms.quaternion_from_transform(move)]
             transform = name and f'{name} x y z qx qy qz qw ' + ' '.join(
                 f'{each:.4f}' for each in numbers)
-            return (f'note: {results[0].method}: poses fit after one transform: '
-                    f'{", ".join(filter(None, (reading, transform)))}; give poses of the camera '
-                    '(z forward) in the map, x y z qx qy qz qw')
+            misread = ', '.join(filter(None, (reading, transform)))
+            return (f'note: {results[0].method}: poses would fit after one transform (not '
+                    f'applied): {misread}; give poses of the camera (z forward) in the map, '
+                    'x y z qx qy qz qw')
     return ''
 
 

@@ -54,6 +54,7 @@ class Evidence(NamedTuple):
     position_sigma: NDArray[np.float64]
     median_iou: NDArray[np.float64]  #: (L,): of its boxes; 0 without any
     last_seen: NDArray[np.float64]  #: (L,): [s]; NaN without any box
+    seen: NDArray[np.float64]  #: (L,): those of the expected frames that show it
 
     @property
     def seen_ratio(self) -> NDArray[np.float64]:
@@ -75,18 +76,19 @@ def gather_evidence(views: Views, landmarks: Landmarks, shown: NDArray[np.int64]
     for center, basis, rows in zip(landmarks.centers, landmarks.bases,
                                    group_boxes(shown, len(landmarks.centers)), strict=True):
         if len(rows) == 0:
-            columns.append((0, 0, 0, 0.0, np.inf, 0.0, np.nan))
+            columns.append((0, 0, 0, 0.0, np.inf, 0.0, np.nan, 0))
             continue
         frames = views.frames[rows]
         offsets = center - cameras[frames]
         distances = np.linalg.norm(offsets, axis=1)
+        expected = is_expected(views, cameras, center, basis, REACH * distances.max())
         columns.append((
-            len(rows), len(np.unique(views.viewpoints[frames])),
-            is_expected(views, cameras, center, basis, REACH * distances.max()).sum(),
+            len(rows), len(np.unique(views.viewpoints[frames])), expected.sum(),
             widest_angle_deg(offsets / distances[:, None]),
             np.sqrt(np.linalg.eigvalsh(centre_covariance(views, rows, center, basis))[-1]),
-            np.median(ious_with(views, rows, center, basis)), views.stamps_s[frames].max()))
-    values = np.array(columns, dtype=np.float64).reshape(-1, 7).T
+            np.median(ious_with(views, rows, center, basis)), views.stamps_s[frames].max(),
+            expected[np.unique(frames)].sum()))
+    values = np.array(columns, dtype=np.float64).reshape(-1, 8).T
     return Evidence(*values[:3].astype(np.int64), *values[3:])
 
 
@@ -140,9 +142,9 @@ def _reason(evidence: Evidence, number: int, size_m: float, options: MappingOpti
         return f'seen from one side only: {_floor(baseline)} degrees, less than ' \
                f'{options.min_baseline_deg:g}'
     if sigma > max(options.max_position_sigma_m, MAX_SIGMA_SHARE * size_m):
-        return f'its position is uncertain: {sigma:.2f} m'
+        return f'uncertain position: {sigma:.2f} m'
     if evidence.median_iou[number] < MIN_MEDIAN_IOU:
-        return f'its boxes do not fit one ellipsoid: median IoU {evidence.median_iou[number]:.2f}'
+        return f'boxes do not fit one ellipsoid: median IoU {evidence.median_iou[number]:.2f}'
     return None
 
 

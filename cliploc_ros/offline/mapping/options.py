@@ -133,6 +133,7 @@ class Thresholds:
     min_localized: Annotated[float, 'views that are localized'] = 0.4
     min_by_objects: Annotated[float, 'views that objects alone localize'] = 0.25
     min_by_keyframes: Annotated[float, 'views that keyframes alone localize'] = 0.4
-    max_misled: Annotated[float, 'views in which a wrong pose is accepted'] = 0.01
+    max_misled: Annotated[
+        float, 'recorded and simulated views in which a wrong pose is accepted'] = 0.01
     max_systematic: Annotated[
         float, 'errors of boxes that a wrong camera, mount or clock explains'] = 0.25

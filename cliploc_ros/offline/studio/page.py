@@ -413,7 +413,8 @@ def _selected_part(studio: Studio) -> dict[str, Any] | None:
         'phrases': studio.phrases(key), 'is_checked': check is not None,
         'faults': () if check is None else check.faults,
         'support': None if check is None else check.support,
-        'ratio': None if check is None else check.seen_ratio,
+        'seen': None if check is None else check.seen,
+        'expected': None if check is None else check.expected,
         'sightings': sightings and [
             [one.view, *one.bbox_xyxy.round(1).tolist(), one.is_detected] for one in sightings]}
 

@@ -210,7 +210,11 @@ def give_advice(report: CheckReport, of_folder: bool = False) -> list[Advice]:
     recorded = report.recording.trials if report.recording else ()
     misled = [trial for trial in (*recorded, *report.grid.trials)
               if trial.verdict == 'misled']
-    advice = [Advice(report.tilt)] * bool(report.tilt)
+    advice = [Advice('this map has no keyframes: build it again from all images')] * (
+        report.recording is not None and not (report.keyframes or report.passed))
+    advice += [Advice(report.tilt)] * bool(report.tilt)
+    advice += [Advice('keyframes cannot be tried without the images of the recording: give them '
+                      'to check_map with --images')] * report.lacks_images
     if report.scale is not None:
         advice.append(Advice(
             f'the map is about {max(report.scale, 1.0 / report.scale):.1f} times too '

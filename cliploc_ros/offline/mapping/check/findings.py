@@ -65,9 +65,10 @@ class LandmarkCheck:
     label: str
     class_id: str
     center: tuple[float, float, float]  #: [m]
-    #: Frames that show it, and frames that should
+    #: Frames that show it, frames that should, and those of the latter that show it
     support: int | None = None
     expected: int | None = None
+    seen: int | None = None
     seen_ratio: float | None = None  #: Share of the latter in which it was detected
     #: Greatest angle between two directions from which it was seen [deg]
     baseline_deg: float | None = None
@@ -184,11 +185,12 @@ def _support(landmark_map: LandmarkMap, row: int, witness: Witness | None) -> di
                 'baseline_deg': given.baseline_deg, 'position_sigma_m': given.position_sigma}
     gathered, expected = witness.gathered, int(witness.expected[row])
     if gathered.support[row] == 0:
-        return {'support': 0, 'expected': expected, 'seen_ratio': 0.0 if expected else None}
+        return {'support': 0, 'expected': expected, 'seen': 0,
+                'seen_ratio': 0.0 if expected else None}
     offset = float(np.linalg.norm(witness.fitted.centers[row] - witness.landmarks.centers[row]))
     is_told = offset > _OFFSET_SIGMAS * witness.fitted_sigmas[row] or offset < _MIN_OFFSET_M
     return {'support': int(gathered.support[row]), 'expected': expected,
-            'seen_ratio': float(gathered.seen_ratio[row]),
+            'seen': int(gathered.seen[row]), 'seen_ratio': float(gathered.seen_ratio[row]),
             'baseline_deg': float(gathered.baseline_deg[row]),
             # localization uses the map's own value
             'position_sigma_m': float(gathered.position_sigma[row])

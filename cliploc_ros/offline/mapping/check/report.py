@@ -28,7 +28,19 @@ VERDICTS = {
                'a robot is localized, by objects also in other light or among moved furniture'),
     'keyframes only': (('min_by_keyframes', 'max_misled', 'max_systematic'),
                        'a robot is localized while light and furniture are as recorded'),
+    'not judged by keyframes': (
+        ('max_misled', 'max_systematic'),
+        'objects alone localize too few views; keyframes need the images of the recording'),
     'failed': ((), 'a robot is mostly refused, or misled')}
+# What misses a threshold, as a clause about a part of the views.
+_CLAUSES = {
+    'min_localized': '{} views are localized', 'min_by_objects': 'objects alone localize {} views',
+    'min_by_keyframes': 'keyframes alone localize {} views',
+    'max_misled': 'a wrong pose is accepted in {} recorded and simulated views',
+    'max_systematic': 'a wrong camera, mount or clock explains errors of boxes'}
+# What a missed threshold means for a robot, where the verdict is 'failed'.
+_FAILED = {'min_localized': 'mostly refused', 'max_misled': 'misled',
+           'max_systematic': 'localized with a bias'}
 
 
 class Advice(NamedTuple):
@@ -60,9 +72,23 @@ class Measure(NamedTuple):
     def __str__(self) -> str:
         """Describe the figure and its threshold, with the digits that tell them apart."""
         word = 'at most' if self.key.startswith('max') else 'at least'
-        digits = int(self.is_missed and f'{self.share:.0%}' == f'{self.limit:.0%}')
-        text = f'{self.share:.{digits}%}, {word} {self.limit:.{digits}%}'
+        text = f'{self._percent(self.share)}, {word} {self._percent(self.limit)}'
         return text if self.total == 1.0 else f'{self.part:.0f} of {self.total:.0f} ({text})'
+
+    @property
+    def clause(self) -> str:
+        """Describe what misses the threshold, in a clause."""
+        most = ' at most' * self.key.startswith('max')
+        text = _CLAUSES[self.key].format(f'{self.part:.0f} of {self.total:.0f}')
+        return (f'{text} ({self._percent(self.share)};{most} {self._percent(self.limit)} '
+                f'{"allowed" if most else "needed"})')
+
+    def _percent(self, share: float) -> str:
+        """Return a share with the digits that tell it from 0 and the share from its limit."""
+        digits = next(digits for digits in (0, 1, 2, 3) if digits == 3 or ((
+            float(f'{self.share:.{digits + 2}f}') or not self.part) and not (
+                self.is_missed and f'{self.share:.{digits}%}' == f'{self.limit:.{digits}%}')))
+        return f'{share:.{digits}%}'
 
 
 @dataclass(frozen=True)
@@ -121,32 +147,45 @@ class CheckReport:
     @property
     def verdict(self) -> str:
         """Return the first of VERDICTS whose thresholds are reached."""
-        missed = {measure.key for measure in self.measures if measure.is_missed}
-        return next(name for name, (needed, _) in VERDICTS.items() if not missed & {*needed})
+        reached = {measure.key for measure in self.measures if not measure.is_missed}
+        return next(name for name, (needed, _) in VERDICTS.items() if reached >= {*needed} and (
+            self.lacks_images or name != 'not judged by keyframes'))
+
+    @property
+    def lacks_images(self) -> bool:
+        """Return whether recorded views are judged by objects only, for want of images."""
+        return bool(self.keyframes and self.recording and not self.recording.has_images)
 
     @property
     def summary(self) -> tuple[str, ...]:
         """Return the verdict and the figures behind it, as sentences."""
-        why = '; '.join(self.failures)
-        return (f'{self.verdict}: {VERDICTS[self.verdict][1]}' + (f' ({why})' if why else ''),
-                *self.localized)
+        name, meaning = self.verdict, VERDICTS[self.verdict][1]
+        if name == 'failed':
+            missed = [_FAILED[measure.key] for measure in self.measures
+                      if measure.is_missed and measure.key in _FAILED]
+            meaning = f'a robot is {" and ".join(missed or ["mostly refused"])}'
+        why = '; not `passed`: ' + ', '.join(self.failures) if self.failures else ''
+        return f'{name}: {meaning}{why}', *self.localized
 
     @property
     def localized(self) -> tuple[str, ...]:
         """Return how many recorded views and grid positions localize a robot, as sentences."""
-        near, found = self.grid.is_near, []
+        near, found, misled = self.grid.is_near, [], ''
         if self.recording is not None:
             trials = self.recording.trials
             counts = relocalization.count_verdicts(trials)
             alone = f'{sum(trial.by_objects for trial in trials)} by objects alone'
             if self.keyframes:
+                both = sum(trial.verdict == 'accepted' and not (
+                    trial.by_objects or trial.by_keyframes) for trial in trials)
                 alone += (f', {sum(trial.by_keyframes for trial in trials)} by keyframes alone'
+                          + f', {both} only by both' * bool(both)
                           if self.recording.has_images else
                           ', keyframes not tried without images')
             found.append(
                 f'{counted(len(trials), "recorded view")}, each in a map of the other views: '
-                f'{counts["accepted"]} localized ({alone}), {counts["refused"]} refused, '
-                f'{counts["misled"]} misled')
+                f'{counts["accepted"]} localized ({alone}), {counts["refused"]} refused')
+            misled = f'{counts["misled"]} of {len(trials)} recorded and '
         of_objects, of_keyframes = (int(headings.any(axis=1)[near].sum()) for headings in (
             self.grid.by_objects, self.grid.by_keyframes))
         where = '' if near.all() else ' near the recorded views'
@@ -155,12 +194,15 @@ class CheckReport:
             f'{int((self.grid.localized[near] > 0).sum())} with a heading that localizes '
             f'({of_objects} by simulated objects'
             + (f', {of_keyframes} within reach of a keyframe)' if self.keyframes else ')'))
+        simulated = relocalization.count_verdicts(self.grid.trials)['misled']
+        found.append(
+            f'{misled}{simulated} of {len(self.grid.trials)} simulated views misled')
         return tuple(found)
 
     @property
     def failures(self) -> tuple[str, ...]:
         """Return the thresholds that the map misses; empty if it is good enough."""
-        return tuple(f'{MEASURES[measure.key]}: {measure}' for measure in self.measures
+        return tuple(measure.clause for measure in self.measures
                      if measure.is_missed and measure.key in VERDICTS['passed'][0])
 
     @property
@@ -182,11 +224,11 @@ class CheckReport:
 def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
     """Return the figures of a report that have a threshold.
 
-    Without a recording, or with keyframes but without its images, the positions near the recording
-    are counted in place of recorded views.
+    Without a recording, the positions near the keyframes are counted in place of recorded views.
+    Views by keyframes are left out where there are no keyframes, or no images to try them.
     """
     grid, recording = report.grid, report.recording
-    if recording is None or (report.keyframes and not recording.has_images):
+    if recording is None:
         columns = (grid.localized, grid.by_objects.any(axis=1), grid.by_keyframes.any(axis=1))
         total, counts = int(grid.is_near.sum()), [
             int((column[grid.is_near] > 0).sum()) for column in columns]
@@ -202,7 +244,8 @@ def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
              (float(sum(trial.verdict == 'misled' for trial in views)), float(len(views))),
              (systematic, 1.0)]
     return [Measure(key, part, whole, getattr(limits, key))
-            for key, (part, whole) in zip(MEASURES, parts, strict=True)]
+            for key, (part, whole) in zip(MEASURES, parts, strict=True)
+            if key != 'min_by_keyframes' or (report.keyframes and not report.lacks_images)]
 
 
 def in_reach(layer: KeyframeLayer, poses: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -256,7 +256,7 @@ const PANELS = {
         ? el('ul', {className: 'faults'}, ...one.faults.map(text => el('li', {}, text)))
         : el('p', {className: 'note done'}, 'no fault found')) : note(one && 'added after the check'),
       one?.support != null ? note(`detected in ${one.support} ${one.support === 1 ? 'frame' : 'frames'}`
-        + (one.ratio === null ? '' : `, ${Math.round(100 * one.ratio)} % of the frames that should show it`)) : null,
+        + (one.seen === null ? '' : `, in ${one.seen} of the ${one.expected} that should show it`)) : null,
       done === total ? buttons(button('Check again', doing('check'), {off: busy})) : null];
   },
   edit() {
