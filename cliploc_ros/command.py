@@ -20,8 +20,6 @@ from cliploc_ros.errors import CliplocError, MapError, OptionsError
 
 #: The shell's exit code of a command that Ctrl-C ended.
 EXIT_INTERRUPTED = 130
-#: The shell's exit code of a command whose reader ended.
-EXIT_BROKEN_PIPE = 141
 # poll() counts milliseconds in 32 bits.
 _LONGEST_WAIT_S = 2e6
 # Options of the commands that have another name than the parameters of the nodes.
@@ -71,7 +69,7 @@ def run_command(command: Callable[[], int], failure: int = 1) -> int:
         return code
     except BrokenPipeError:  # the reader of the output ended, such as head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_BROKEN_PIPE
+        return 141  # as a shell says of a program that SIGPIPE ended
     except CliplocError as error:
         # messages name `parameters` of the library; show the option of the command instead
         text = re.sub('`([a-z_: ]+)`', lambda name: '--' + _OPTIONS.get(name[1], name[1]).replace(

@@ -3,7 +3,6 @@
 """The executable ``evaluate``: the paper's table and figures for your own data."""
 
 import argparse
-import hashlib
 import logging
 import math
 import os
@@ -156,10 +155,9 @@ def evaluate(options: argparse.Namespace) -> int:
                  if method.options.needs_similarities]
     comparing += ['--save-queries'] if options.save_queries else []
     if len(landmark_map) and comparing and not options.clip:
-        if comparing[0] == '--save-queries':
-            raise OptionsError('--no-clip: --save-queries needs CLIP: omit one of both')
-        raise OptionsError(f'--no-clip: {comparing[0]} compares crops with labels; give --methods '
-                           f"class_bf or {AUTO}, or 'matching: class' in a file of methods")
+        raise OptionsError(f'--no-clip: {comparing[0]} compares crops with labels: omit one of '
+                           f"both, or give --methods class_bf or {AUTO}, or 'matching: class' in "
+                           'a file of methods')
     options.clip = options.clip and len(landmark_map) > 0 and bool(comparing)
     layer = _read_layer(options, landmark_map, methods)
     if not len(landmark_map) and layer is None:
@@ -223,6 +221,7 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
     from cliploc_ros.cli.sources import clip_options, detector_options, source_of
     from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_embeddings import embeddings_path
+    from cliploc_ros.models.files import digest_file
     from cliploc_ros.models.onnx_clip import names_onnx
 
     files = [options.queries or source_of(options), *options.map,
@@ -236,8 +235,7 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
     else:
         detector, clip = detector_options(options).model, clip_options(options)
         architecture = '' if names_onnx(clip) else f'{clip.model} '
-        similarities = (f'CLIP {architecture}{clip.pretrained}' if options.clip else
-                        'none: objects are matched by class')
+        similarities = f'CLIP {architecture}{clip.pretrained}' if options.clip else 'by class'
         files += [options.trajectory, options.model, options.clip_pretrained]
         if options.clip and options.landmark_embeddings != 'text':
             files += map(embeddings_path, options.map)
@@ -245,21 +243,10 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
     for name, value in given.items():
         values = value if isinstance(value, list) else [value]
         words += [name, *(str(each) for each in values if not isinstance(each, bool))]
-    hashes = {str(file): _digest(Path(file))[:12]
-              for file in files if file and Path(file).exists()}
+    hashes = {str(file): digest_file(Path(file))[:12] for file in files
+              if file and Path(file).is_file()}
     return {'map': ' '.join(file.name for file in options.map), 'sha256': hashes,
             'detector': detector, 'similarities': similarities, 'options': shlex.join(words)}
-
-
-def _digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of the names and sizes of the files of a folder."""
-    from cliploc_ros.models.files import digest_file
-
-    if path.is_file():
-        return digest_file(path)
-    return hashlib.sha256(repr([
-        (str(file.relative_to(path)), file.stat().st_size)
-        for file in sorted(path.rglob('*')) if file.is_file()]).encode()).hexdigest()
 
 
 def _notes(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',

@@ -80,26 +80,21 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     damaged, or the download or export failed.
     """
     named = options.checkpoint_path or options.pretrained
-    try:
-        if names_onnx(options):
-            name, folder = named, resolve_folder(named, [IMAGE_TOWERS, TEXT_TOWERS], BESIDE,
-                                                 options.cache_dir, 'clip_pretrained')
-        else:
-            given, config = Path(named).expanduser().absolute(), ''
-            name = options.model.replace('/', '-')  # OpenAI's spelling is ViT-L/14
-            if name.endswith('.json') and (file := Path(options.model).expanduser()).is_file():
-                name, config = file.stem, digest_file(file)
-            tag = options.pretrained if options.checkpoint_path or not given.is_file() else ''
+    if names_onnx(options):
+        name, folder = named, resolve_folder(named, [IMAGE_TOWERS, TEXT_TOWERS], BESIDE,
+                                             options.cache_dir, 'clip_pretrained')
+    else:
+        given, config = Path(named).expanduser().absolute(), ''
+        name = options.model.replace('/', '-')  # OpenAI's spelling is ViT-L/14
+        if name.endswith('.json') and (file := Path(options.model).expanduser()).is_file():
+            name, config = file.stem, digest_file(file)
+        tag = options.pretrained if options.checkpoint_path or not given.is_file() else ''
 
-            from cliploc_ros.models.export import export_clip
-            folder = exported(options.cache_dir, name, f'CLIP {name}', (
-                'CLIP', name, config, tag,
-                digest_file(given, options.cache_dir) if given.is_file() else ''),
-                partial(export_clip, options), WITHOUT_CLIP)
-    except ModelError as error:
-        if not str(error).startswith('cannot download'):
-            raise
-        raise ModelError(f'{error}{WITHOUT_CLIP}') from error
+        from cliploc_ros.models.export import export_clip
+        folder = exported(options.cache_dir, name, f'CLIP {name}', (
+            'CLIP', name, config, tag,
+            digest_file(given, options.cache_dir) if given.is_file() else ''),
+            partial(export_clip, options), WITHOUT_CLIP)
     image_tower = find_network(folder, named, IMAGE_TOWERS)
     text_tower = find_network(folder, '', TEXT_TOWERS)
     about = read_config(folder / CONFIG, 'it has the length of an embedding')

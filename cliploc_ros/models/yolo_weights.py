@@ -26,13 +26,7 @@ from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import encode_labels, encoded_once
 from cliploc_ros.models.export import OPSET, compare, halve, quiet_export
-from cliploc_ros.models.exports import (
-    CHECKPOINT,
-    DETECTOR,
-    WITHOUT_CLIP,
-    describe_export,
-    needs_pytorch,
-)
+from cliploc_ros.models.exports import CHECKPOINT, DETECTOR, describe_export, needs_pytorch
 from cliploc_ros.models.files import check_weights_file, digest_file, download, first_line
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
@@ -206,8 +200,7 @@ def _tower(name: str, options: DetectorOptions
                                cache_dir=options.cache_dir)
             weights = resolve_clip_weights(clip)
         except ModelError as error:
-            remedy = str(error).replace(CHECKPOINT, '`text_model` to the file').replace(
-                WITHOUT_CLIP, '')
+            remedy = str(error).replace(CHECKPOINT, '`text_model` to the file')
             raise ModelError(f'text tower of {options.model}: {remedy}') from error
         return weights.text_key, lambda texts: encode_labels(weights, texts, clip)
     if name not in ('clip', *_TOWERS):

@@ -6,12 +6,11 @@ It replaces `ros2 bag play`, which is missing in ROS from PyPI and in the base i
 """
 
 import time
-from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import chain, islice
-from operator import itemgetter
 from typing import Any
 
 from rclpy import qos
@@ -38,8 +37,6 @@ CLOCK_TOPIC = '/clock'
 DRIVE_NS = 3 * NS_PER_S
 # Period of the messages while the robot stands.
 _STAND_NS = NS_PER_S // 5
-# Number of messages that give the rate of odometry, and its least period.
-_PACE, _LEAST_PACE_NS = 50, NS_PER_S // 200
 _POLL_S = 0.02
 # Pause between the passes of a loop.
 _GAP_S = 0.1
@@ -194,87 +191,39 @@ def with_stands(messages: Iterable[BagMessage], topics: Mapping[str, BagTopic],
     """Let the robot of a recording stand for a time, at an image after every DRIVE_NS.
 
     A robot that drives is not relocalized. While it stands, the newest message of each topic with
-    a header, and the newest transform of each coordinate frame, are repeated with new stamps.
-    Odometry has no speed, keeps the rate of the drive, and comes before the images of its time:
-    messages that follow a large image may be lost. All later messages are later by the time of
-    the stands.
+    a header, and the newest transform of each coordinate frame, are repeated with new stamps, and
+    odometry has no speed. All later messages are later by the time of the stands.
 
     DatasetError: a message does not fit its type.
     """
     newest: dict[tuple[str, str], Any] = {}
-    paces: defaultdict[str, deque[int]] = defaultdict(lambda: deque(maxlen=_PACE))
     late_ns, stop_ns, store = 0, 0, typestore()
-    stands_ns = max(round(stand_s * NS_PER_S / _STAND_NS), 1) * _STAND_NS
-    source, waiting = iter(messages), deque[tuple[BagMessage, Any]]()
-
-    def following() -> Iterator[tuple[BagMessage, Any]]:
-        while waiting:
-            yield waiting.popleft()
-        for message in source:
-            kind = topics[message.topic].msgtype
-            yield message, (deserialize(message.data, kind, message.topic)
-                            if kind in store.types else None)
-
-    def parts(content: Any) -> list[Any]:
-        return list(getattr(content, 'transforms',
-                            [content] if hasattr(content, 'header') else []))
-
-    def moved(message: BagMessage, content: Any) -> BagMessage:
-        for part in parts(content):
-            paces[message.topic].append(stamp_ns(part))
+    for message in messages:
+        kind = topics[message.topic].msgtype
+        stop_ns = stop_ns or message.stamp_ns + DRIVE_NS
+        content = deserialize(message.data, kind, message.topic) if kind in store.types else None
+        stamped = getattr(content, 'transforms', [content] if hasattr(content, 'header') else [])
+        for part in stamped:
             _set_stamp(part, stamp_ns(part) + late_ns)
             newest[message.topic, getattr(part, 'child_frame_id', '')] = part
-        kind = topics[message.topic].msgtype
-        return BagMessage(message.topic, message.stamp_ns + late_ns, bytes(
-            store.serialize_cdr(content, kind)) if parts(content) else message.data)
-
-    while (pair := next(following(), None)) is not None:
-        message, content = pair
-        image_ns = stamp_ns(content) if hasattr(content, 'header') else 0
-        yield (last := moved(message, content))
-        stop_ns = stop_ns or message.stamp_ns + DRIVE_NS
-        if message.stamp_ns < stop_ns or topics[message.topic].msgtype not in (
-                IMAGE, COMPRESSED_IMAGE):
+        yield BagMessage(message.topic, message.stamp_ns + late_ns,
+                         bytes(store.serialize_cdr(content, kind)) if stamped else message.data)
+        if message.stamp_ns < stop_ns or kind not in (IMAGE, COMPRESSED_IMAGE):
             continue
-        later = list[tuple[BagMessage, Any]]()
-        for pair in following():
-            # messages of the time of the image, such as its camera_info, may follow
-            if pair[0].stamp_ns <= message.stamp_ns + _STAND_NS and parts(pair[1]) and all(
-                    stamp_ns(part) <= image_ns for part in parts(pair[1])):
-                yield (last := moved(*pair))
-            else:
-                later.append(pair)
-            if pair[0].stamp_ns > message.stamp_ns + _STAND_NS:
-                break
-        waiting.extendleft(reversed(later))
-        ends_ns = stands_ns + _STAND_NS
-        for step, topic, part in _repeated(newest, topics, paces, image_ns + late_ns, stands_ns):
-            kind = topics[topic].msgtype
-            whole = store.types[kind](transforms=[part]) if hasattr(part, 'transform') else part
-            yield BagMessage(topic, min(last.stamp_ns + step, message.stamp_ns + late_ns
-                                        + ends_ns), bytes(store.serialize_cdr(whole, kind)))
-        late_ns, stop_ns = late_ns + ends_ns, message.stamp_ns + DRIVE_NS
-
-
-def _repeated(newest: Mapping[tuple[str, str], Any], topics: Mapping[str, BagTopic],
-              paces: Mapping[str, Sequence[int]], image_ns: int, stands_ns: int
-              ) -> Iterator[tuple[int, str, Any]]:
-    """Stamp the newest messages for a stand after an image; return time in it, topic, message."""
-    steps = []
-    for number, ((topic, _child), part) in enumerate(newest.items()):
-        # cameras are synchronized; the stamps of transforms may be in the future
-        at_ns, period_ns = stamp_ns(part) if hasattr(part, 'transform') else image_ns, _STAND_NS
-        is_odometry, pace = topics[topic].msgtype == ODOMETRY, paces[topic]
-        if is_odometry:
-            at_ns = max(at_ns, stamp_ns(part))
-            period_ns = max((pace[-1] - pace[0]) // max(len(pace) - 1, 1), _LEAST_PACE_NS)
-            for speed in (part.twist.twist.linear, part.twist.twist.angular):
-                speed.x = speed.y = speed.z = 0.0
-        steps += [(step, not is_odometry, number, topic, part, at_ns + step) for step in range(
-            period_ns, stands_ns + is_odometry * _STAND_NS + 1, period_ns)]
-    for step, _, _, topic, part, at_ns in sorted(steps, key=itemgetter(0, 1, 2)):
-        _set_stamp(part, at_ns)
-        yield step, topic, part
+        for _ in range(max(round(stand_s * NS_PER_S / _STAND_NS), 1)):
+            late_ns, now_ns = late_ns + _STAND_NS, stamp_ns(content) + _STAND_NS
+            for (topic, _child), part in newest.items():
+                # cameras are synchronized; the stamps of transforms may be in the future
+                kind, is_transform = topics[topic].msgtype, hasattr(part, 'transform')
+                _set_stamp(part, stamp_ns(part) + _STAND_NS if is_transform else now_ns)
+                if kind == ODOMETRY:
+                    for speed in (part.twist.twist.linear, part.twist.twist.angular):
+                        speed.x = speed.y = speed.z = 0.0
+                whole = store.types[kind](transforms=[part]) if is_transform else part
+                yield BagMessage(topic, message.stamp_ns + late_ns,
+                                 bytes(store.serialize_cdr(whole, kind)))
+        # messages of the time of the image may still follow
+        late_ns, stop_ns = late_ns + _STAND_NS, message.stamp_ns + DRIVE_NS
 
 
 def _set_stamp(message: Any, stamp_ns: int) -> None:

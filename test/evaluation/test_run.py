@@ -309,8 +309,6 @@ def test_poses_of_another_program_that_fit_after_one_transform(questions, change
     poses = TimedPoses.from_samples(
         [query.observation.stamp_ns for query in queries],
         [[*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in given], 'here')
-    with pytest.raises(DatasetError, match=r'the nearest is 50 ms later .*constant offset'):
-        given_results('theirs', replace(poses, stamps_ns=poses.stamps_ns + 50_000_000), queries)
     found = find_misfit(given_results('theirs', poses, queries), queries)
     assert found.startswith(said and 'note: theirs: poses would fit after one transform (not '
                             f'applied): {said}')
@@ -327,9 +325,8 @@ def test_the_table_in_latex():
         text = summary.as_latex([{**again[0], 'paper_success': '%'}])
         assert text.splitlines() == [
             r'% needs \usepackage{booktabs}', rf'\begin{{tabular}}{{l{"r" * 11}}}', r'\toprule',
-            'method & success 0.25m & success 0.5m & success 1m & median error [m] & median error '
-            r'[deg] & mean error [m] & mean search [ms] & accepted & precision 1m & '
-            'wrongly accepted & '
+            'method & success 0.25m & success 0.5m & success 1m & median error m & median error '
+            'deg & mean error m & mean search ms & accepted & precision 1m & wrongly accepted & '
             r'paper success \\', r'\midrule', rf'{cells} \\', r'\bottomrule', r'\end{tabular}']
     assert '& &' in summary.as_latex([rows[0] | {'accepted': ''}]).replace('  ', ' ')
 

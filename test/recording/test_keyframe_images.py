@@ -65,7 +65,7 @@ def test_at_the_edge_of_a_depth_image_a_pixel_without_depth_has_none(frame):
 
 @pytest.mark.parametrize(('unit_m', 'jump_m', 'moved', 'expected'), [
     (0.001, 0.6, 1, None),
-    (0.0002, 0.0, 0, r'is 0\.2.* triangulated points .*`depth_unit` 0\.001 would fit'),
+    (0.0002, 0.0, 0, r'is 0\.2.* triangulated points .*multiply `depth_unit` by 4\.'),
     (0.001, 0.6, 99, r'jump by 0\.(5[6-9]|6[0-4]) m at 1040\.[048]'),
     (None, 0.25, 99, r'jump by 0\.2[3-7] m at 1040\.[048]')])
 def test_images_that_contradict_depth_or_poses(shared_data, unit_m, jump_m, moved, expected):

@@ -3,7 +3,7 @@
 """Draw the paper's figures and others, as PNG and SVG, and maps from above with names."""
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -218,19 +218,14 @@ def new_top_view(points: NDArray[np.float64], frame_id: str) -> tuple[Figure, Ax
     return figure, axes
 
 
-def _styles(methods: Iterable[str]) -> dict[str, tuple[str, object, str | None]]:
-    """Return the colour, line style and marker of each method, all different up to 20 methods."""
-    found: dict[str, tuple[str, object, str | None]] = {}
-    others = [(color, *style) for style in _STYLES.values() for color in _OTHER_COLORS]
-    for method in methods:
-        if method in PAPER_METHODS:
-            matching, algorithm = method.split('_')
-            found[method] = _COLORS[matching], *_STYLES[algorithm]
-        else:  # by its name where that is free, so that it looks alike in all figures
-            number = sum(method.encode()) % len(others)
-            free = [one for one in others[number:] + others[:number] if one not in found.values()]
-            found[method] = (free or others)[0]
-    return found
+def _style(method: str) -> tuple[str, object, str | None]:
+    """Return the colour, line style and marker of a method."""
+    if method in PAPER_METHODS:
+        matching, algorithm = method.split('_')
+        return _COLORS[matching], *_STYLES[algorithm]
+    number = sum(method.encode())
+    return (_OTHER_COLORS[number % len(_OTHER_COLORS)],
+            *tuple(_STYLES.values())[number // len(_OTHER_COLORS) % len(_STYLES)])
 
 
 def add_legend(figure: Figure) -> None:
@@ -240,9 +235,8 @@ def add_legend(figure: Figure) -> None:
 
 def _success_over_threshold(axes: Axes, summaries: Sequence[Summary]) -> None:
     limits = np.linspace(0.0, _MAX_ERROR_M, 401)
-    styles = _styles(summary.method for summary in summaries)
     for summary in summaries:
-        color, line, _ = styles[summary.method]
+        color, line, _ = _style(summary.method)
         errors = np.sort(summary.errors_m.ravel())
         axes.plot(limits, np.searchsorted(errors, limits) / errors.size, color=color,
                   linestyle=line, linewidth=1.4, label=summary.method)
@@ -250,9 +244,8 @@ def _success_over_threshold(axes: Axes, summaries: Sequence[Summary]) -> None:
 
 
 def _success_over_iterations(axes: Axes, sweep: Mapping[str, Mapping[int, Summary]]) -> None:
-    styles = _styles(sweep)
     for method, by_count in sweep.items():
-        color, line, marker = styles[method]
+        color, line, marker = _style(method)
         rates = [summary.success(SUCCESS_M) for summary in by_count.values()]
         axes.plot([*by_count], rates, color=color, linestyle=line, marker=marker, markersize=4,
                   linewidth=1.2, label=method)
@@ -264,9 +257,8 @@ def _success_over_iterations(axes: Axes, sweep: Mapping[str, Mapping[int, Summar
 
 
 def _precision_over_recall(axes: Axes, summaries: Sequence[Summary]) -> None:
-    styles = _styles(summary.method for summary in summaries)
     for summary in summaries:
-        color, line, marker = styles[summary.method]
+        color, line, marker = _style(summary.method)
         recall, precision = precision_recall(summary)
         if not len(recall):
             continue
@@ -276,8 +268,7 @@ def _precision_over_recall(axes: Axes, summaries: Sequence[Summary]) -> None:
         if summary.accepted.any():
             axes.plot(summary.recall(), summary.precision(), color=color, marker=marker,
                       markersize=6, markeredgecolor='black', linestyle='none')
-    axes.set(xlim=(-0.02, 1.02))
-    axes.set_ylim(top=1.02)
+    axes.set(xlim=(-0.02, 1.02), ylim=(None, 1.02))
     axes.set_title('lines: all thresholds; markers: the threshold of the run', fontsize=9)
 
 
@@ -305,14 +296,12 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results:
     truth = {query.number: query.map_from_camera for query in queries}
     first = [result for result in results if result.trial == 0]
     positions = np.array([pose[:2, 3] for pose in truth.values()])
-    missing = sum(not result.solved for result in first)
     figure, axes = new_top_view(np.concatenate([landmark_map.centers[:, :2], positions]),
                                 landmark_map.frame_id)
     axes.set_title(f'{method}: estimates joined to the true poses', parse_math=False)
     draw_map(axes, landmark_map)
     axes.plot(positions[:, 0], positions[:, 1], 'o', markersize=6, markerfacecolor='none',
-              color='#222222', zorder=6,
-              label=f'true pose ({missing} without an estimate)' if missing else 'true pose')
+              color='#222222', label='true pose', zorder=6)
     for label, color, marker, verdict in (('accepted', '#0072B2', 'o', True),
                                           ('refused', '#D55E00', 'X', False)):
         chosen = [result for result in first

@@ -4,7 +4,6 @@
 
 import csv
 import io
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
@@ -114,8 +113,8 @@ class Summary:
     @property
     def of_accepted(self) -> tuple[NDArray[np.float64], int]:
         """Return the errors [m] of accepted poses, and how many are in their 95 % ellipsoid."""
-        inside = self.accepted & (self.nees < chi2.ppf(0.95, 6))
-        return self.errors_m[self.accepted], int(inside.sum())
+        return self.errors_m[self.accepted], int(
+            (self.nees[self.accepted] < chdtri(6, 0.05)).sum())
 
     def precision(self) -> float:
         """Return the share of accepted poses that are correct; 1 if no pose is accepted."""
@@ -310,7 +309,7 @@ def as_markdown(rows: Sequence[Sequence[str]]) -> str:
 def as_latex(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the main columns of csv_rows in LaTeX, for booktabs, with one number in a cell."""
     names = [name for name in rows[0] if name in _LATEX or name.startswith('paper_')]
-    lines = [[re.sub(' (m|deg|ms)$', r' [\1]', name.replace('_', ' ')) for name in names], *(
+    lines = [[name.replace('_', ' ') for name in names], *(
         [f'{float(row[name]):{_LATEX[name]}}' if _LATEX.get(name) and row[name] != ''
          else str(row[name]) for name in names] for row in rows)]
     head, *body = [' & '.join(''.join(_OF_LATEX.get(char, char) for char in cell) for cell in line)

@@ -9,8 +9,6 @@ continues. Every box is the seed of some hypotheses, so that rarely detected obj
 too.
 """
 
-from itertools import permutations
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,8 +32,6 @@ _LEAST_BASELINE_DEG = 20.0
 _LEAST_LANDMARKS = 3
 # A scale this far from 1 is a wrong unit, not an error of calibration.
 _UNIT_FACTOR = 1.6
-# Units of depth images that are often confused [m]; factor within which one fits. Chosen.
-_UNITS_M, _SAME_UNIT = (0.0002, 0.001, 1.0), 1.2
 # Smaller errors of scale are within the error of this estimate.
 _LEAST_CORRECTION = 0.02
 
@@ -139,13 +135,9 @@ def check_scale(scale: float, of: str, by: str) -> None:
     DatasetError: the scale is so far off that the unit of depth must be wrong.
     """
     if not 1.0 / _UNIT_FACTOR < scale < _UNIT_FACTOR:
-        fits = next((f'`depth_unit` {right:g} would fit if it is {unit:g} now'
-                     for unit, right in permutations(_UNITS_M, 2)
-                     if 1.0 / _SAME_UNIT < right / unit / scale < _SAME_UNIT),
-                    f'multiply `depth_unit` by {scale:.3g}')
         raise DatasetError(
             f'measured depth{of} is {1.0 / scale:.3g} times the depth by {by} and poses: wrong '
-            f'unit? {fits} (default: 0.001, of TUM 0.0002), or give poses in metres')
+            f'unit? multiply `depth_unit` by {scale:.3g}, or give poses in metres')
 
 
 def _depth_scale(views: Views, landmarks: Landmarks, shown: NDArray[np.int64],

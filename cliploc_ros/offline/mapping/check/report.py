@@ -31,16 +31,13 @@ VERDICTS = {
     'not judged by keyframes': (
         ('max_misled', 'max_systematic'),
         'objects alone localize too few views; keyframes need the images of the recording'),
-    'failed': ((), 'a robot is mostly refused, or misled')}
+    'failed': ((), 'a robot is mostly refused, misled, or localized with a bias')}
 # What misses a threshold, as a clause about a part of the views.
 _CLAUSES = {
     'min_localized': '{} views are localized', 'min_by_objects': 'objects alone localize {} views',
     'min_by_keyframes': 'keyframes alone localize {} views',
     'max_misled': 'a wrong pose is accepted in {} recorded and simulated views',
     'max_systematic': 'a wrong camera, mount or clock explains errors of boxes'}
-# What a missed threshold means for a robot, where the verdict is 'failed'.
-_FAILED = {'min_localized': 'mostly refused', 'max_misled': 'misled',
-           'max_systematic': 'localized with a bias'}
 
 
 class Advice(NamedTuple):
@@ -78,16 +75,14 @@ class Measure(NamedTuple):
     @property
     def clause(self) -> str:
         """Describe what misses the threshold, in a clause."""
-        most = ' at most' * self.key.startswith('max')
-        text = _CLAUSES[self.key].format(f'{self.part:.0f} of {self.total:.0f}')
-        return (f'{text} ({self._percent(self.share)};{most} {self._percent(self.limit)} '
-                f'{"allowed" if most else "needed"})')
+        word = 'at most {} allowed' if self.key.startswith('max') else '{} needed'
+        return (_CLAUSES[self.key].format(f'{self.part:.0f} of {self.total:.0f}')
+                + f' ({self._percent(self.share)}; {word.format(self._percent(self.limit))})')
 
     def _percent(self, share: float) -> str:
         """Return a share with the digits that tell it from 0 and the share from its limit."""
-        digits = next(digits for digits in (0, 1, 2, 3) if digits == 3 or ((
-            float(f'{self.share:.{digits + 2}f}') or not self.part) and not (
-                self.is_missed and f'{self.share:.{digits}%}' == f'{self.limit:.{digits}%}')))
+        is_near = self.is_missed and abs(self.share - self.limit) < 0.01
+        digits = int(is_near or 0.0 < self.share < 0.005)
         return f'{share:.{digits}%}'
 
 
@@ -159,13 +154,8 @@ class CheckReport:
     @property
     def summary(self) -> tuple[str, ...]:
         """Return the verdict and the figures behind it, as sentences."""
-        name, meaning = self.verdict, VERDICTS[self.verdict][1]
-        if name == 'failed':
-            missed = [_FAILED[measure.key] for measure in self.measures
-                      if measure.is_missed and measure.key in _FAILED]
-            meaning = f'a robot is {" and ".join(missed or ["mostly refused"])}'
         why = '; not `passed`: ' + ', '.join(self.failures) if self.failures else ''
-        return f'{name}: {meaning}{why}', *self.localized
+        return f'{self.verdict}: {VERDICTS[self.verdict][1]}{why}', *self.localized
 
     @property
     def localized(self) -> tuple[str, ...]:
@@ -195,8 +185,7 @@ class CheckReport:
             f'({of_objects} by simulated objects'
             + (f', {of_keyframes} within reach of a keyframe)' if self.keyframes else ')'))
         simulated = relocalization.count_verdicts(self.grid.trials)['misled']
-        found.append(
-            f'{misled}{simulated} of {len(self.grid.trials)} simulated views misled')
+        found.append(f'{misled}{simulated} of {len(self.grid.trials)} simulated views misled')
         return tuple(found)
 
     @property
