@@ -185,7 +185,7 @@ class CheckReport:
             f'({of_objects} by simulated objects'
             + (f', {of_keyframes} within reach of a keyframe)' if self.keyframes else ')'))
         simulated = relocalization.count_verdicts(self.grid.trials)['misled']
-        found.append(f'{misled}{simulated} of {len(self.grid.trials)} simulated views misled')
+        found[-1] += f'; {misled}{simulated} of {len(self.grid.trials)} simulated views misled'
         return tuple(found)
 
     @property
