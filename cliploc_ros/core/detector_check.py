@@ -17,8 +17,7 @@ from cliploc_ros.core.observation import Detections
 from cliploc_ros.core.relocalizer import Relocalization
 from cliploc_ros.errors import did_you_mean
 
-# Number of frames that are kept, and minimum number of detections, or of images, for a verdict.
-# Both are guesses.
+# Number of frames that are kept, and minimum number of detections for a verdict. Both are guesses.
 _MOST_FRAMES, _LEAST = 20, 3
 # Maximum number of names in a message, and of their characters.
 _MOST_NAMES, _MOST_CHARACTERS = 5, 30
@@ -95,11 +94,6 @@ class DetectorCheck:
             numbers = ', which are numbers' if all(name.isdigit() for name in names) else ''
             hint = next(filter(None, (did_you_mean(name, self._known)
                                       for name in names[:_MOST_NAMES])), '')
-            # the right detector, too, sees an image without any object of the map
-            seen = [{*usable.class_ids} for _, usable in self._frames if len(usable)]
-            if not (numbers or hint) and (len(seen) < _LEAST
-                                          or self._known.keys() & set().union(*seen)):
-                return []
             text = (f'none of its classes is in the map: {in_words(names)}{numbers}{hint}; the '
                     f'map has {in_words(self._known)}: use the detector of the map, or class_map')
         return [Fault(text, True)] if text else []
