@@ -27,9 +27,10 @@ if TYPE_CHECKING:
     from cliploc_ros.offline.mapping.options import MappingOptions
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
-# Options of the check after a build: with fewer views, it takes seconds instead of a minute. The
-# number of pieces of advice after it.
-_QUICK, _ADVICE_SHOWN = ('--positions', '25', '--headings', '6', '--frames', '30'), 2
+# Options of the check after a build: with fewer views, it takes seconds instead of a minute.
+_QUICK = ('--positions', '25', '--headings', '6', '--frames', '30')
+# Number of pieces of advice after a build: the most urgent.
+_ADVICE_SHOWN = 2
 EPILOG = """\
 examples:
   build_map --bag drive --out office.yaml
