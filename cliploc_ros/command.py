@@ -108,7 +108,7 @@ def number[Number: (int, float)](kind: type[Number], allows: Callable[[Number], 
                                  ) -> Callable[[str], Number]:
     """Return an argparse type that accepts the numbers for which `allows` holds.
 
-    `what` describes them in the error message, as in "2 is not a number above 3".
+    `what` describes them in the error message, as in "2 is not within 3 and 4".
     """
     def parse(text: str) -> Number:
         try:
@@ -123,9 +123,10 @@ def number[Number: (int, float)](kind: type[Number], allows: Callable[[Number], 
 
 #: Types for argparse
 positive_int = number(int, lambda value: value >= 1, '1 or more')
-positive = number(float, lambda value: 0.0 < value < math.inf, 'a number above 0')
-not_negative = number(float, lambda value: 0.0 <= value < math.inf, 'a number of 0 or more')
-finite = number(float, math.isfinite, 'a finite number')
+# beyond these limits, a time in ns or its inverse is no number any more
+positive = number(float, lambda value: 1e-9 <= value <= 1e9, 'a number from 1e-9 to 1e9')
+not_negative = number(float, lambda value: 0.0 <= value <= 1e9, 'a number from 0 to 1e9')
+finite = number(float, lambda value: abs(value) <= 1e9, 'a number from -1e9 to 1e9')
 limit = number(float, lambda value: not math.isnan(value), 'a number')  # may be infinite
 #: Least and greatest seed that NumPy accepts
 SEEDS = 0, 2**63 - 1

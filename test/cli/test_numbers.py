@@ -39,11 +39,12 @@ def takes(action, text):
 
 
 @pytest.mark.parametrize('program', PROGRAMS)
-def test_options_that_are_numbers_refuse_nan_and_infinity(program):
+def test_options_that_are_numbers_refuse_nan_infinity_and_what_overflows(program):
     for action in options_of(program):
         name = action.option_strings[-1]
         assert not takes(action, 'nan'), name
-        assert takes(action, 'inf') == (name in MAY_BE_INFINITE), name
+        for text in ('inf', '1e300'):
+            assert takes(action, text) == (name in MAY_BE_INFINITE), name
 
 
 @pytest.mark.parametrize(('program', 'name'), [
