@@ -256,13 +256,17 @@ def zipped(**members):
     return packed.getvalue()
 
 
+# The identifiers are words: a packed file holds the time of day, and so would its identifier.
 @pytest.mark.parametrize(('file', 'content', 'inner', 'said'), [
-    ('a.zip', zipped(**{'../a': 'x', '/b': 'x'}), '', 'none of its members'),
-    ('a.zip', zipped(), '', 'none of its members'), ('a.tgz', packed('../a', b''), '', 'outside'),
-    ('a.tgz', packed('a', bytes(3_000_000)), '', 'more than 2 MB'),
-    ('a.zip', zipped(a=bytes(3_000_000)), '', 'more than 2 MB'),
-    ('a.zip', zipped(b=bytes(3_000_000)), 'b', 'more than 2 MB'),
-    ('a.zip', zipped(**{'b.zip': zipped(a=bytes(3_000_000))}), 'b.zip', 'more than 2 MB')])
+    pytest.param('a.zip', zipped(**{'../a': 'x', '/b': 'x'}), '', 'none of its members',
+                 id='zip-outside'),
+    pytest.param('a.zip', zipped(), '', 'none of its members', id='zip-empty'),
+    pytest.param('a.tgz', packed('../a', b''), '', 'outside', id='tar-outside'),
+    pytest.param('a.tgz', packed('a', bytes(3_000_000)), '', 'more than 2 MB', id='tar-large'),
+    pytest.param('a.zip', zipped(a=bytes(3_000_000)), '', 'more than 2 MB', id='zip-large'),
+    pytest.param('a.zip', zipped(b=bytes(3_000_000)), 'b', 'more than 2 MB', id='member-large'),
+    pytest.param('a.zip', zipped(**{'b.zip': zipped(a=bytes(3_000_000))}), 'b.zip',
+                 'more than 2 MB', id='inner-zip-large')])
 def test_an_archive_without_sound_members_or_of_any_size_is_named(file, content, inner, said,
                                                                   tmp_path):
     (tmp_path / 'downloads').mkdir()
