@@ -131,7 +131,7 @@ def check_page(name: str, landmark_map: LandmarkMap, report: CheckReport,
                           not measure.is_missed) for measure in report.measures),
          '<h2>What to do first</h2>', *cards[:_FIRST_ADVICE]], [first])]
     if later := cards[_FIRST_ADVICE:]:
-        parts.append(html.fold(f'{len(later)} more recommendations', *later))
+        parts.append(html.fold(counted(len(later), 'more recommendation'), *later))
     faulty = sum(_grade(landmark) == 'faulty' for landmark in report.landmarks)
     parts += [html.fold('All figures', html.table(('', ''), figures_of(report))),
               html.fold('Pictures', *others),
