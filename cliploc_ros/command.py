@@ -264,13 +264,14 @@ def split_ros_args(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 class StageBar:
-    """A progress bar that names the stage. It is not shown without a terminal."""
+    """A progress bar that names the stage. Without a terminal, each stage is a line."""
 
     def __enter__(self) -> Self:
         """Show the bar."""
         from tqdm import tqdm  # late, so that --help is fast
 
         self._bar = tqdm(total=100, disable=None, bar_format='{desc}: {percentage:3.0f} % |{bar}|')
+        self._stage = ''
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -279,6 +280,9 @@ class StageBar:
 
     def show(self, stage: str, share: float) -> None:
         """Show a stage and how much of it is done, 0 to 1."""
+        if self._bar.disable and stage != self._stage:
+            print(f'{stage} ...', file=sys.stderr, flush=True)
+        self._stage = stage
         self._bar.set_description_str(stage, refresh=False)
         self._bar.n = round(100 * share)
         self._bar.refresh()

@@ -20,6 +20,7 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.errors import CliplocError
 from cliploc_ros.offline.mapping.check.checking import check_map
 from cliploc_ros.offline.mapping.check.relocalization import count_verdicts, try_view
 from cliploc_ros.offline.mapping.make_map import Labeller, MadeMap, make_map
@@ -76,8 +77,12 @@ def main(model: str, out: str, *folders: str) -> None:
         seen = replace(room.detections, cameras=tuple(map(longer, room.detections.cameras))
                        ).select_frames(mapped)
         frames = frames_of_raws(room.frames.source, raws).select(mapped.tolist())
-        made = spoiled(make_map(seen, Labeller({}), MappingOptions(estimate_pose_errors=True),
-                                frames, LayerOptions()), case)
+        try:
+            made = spoiled(make_map(seen, Labeller({}), MappingOptions(estimate_pose_errors=True),
+                                    frames, LayerOptions()), case)
+        except CliplocError as error:
+            print(f'{room.name}, {case}: no map: {error}', flush=True)
+            continue
         report = check_map(made.landmark_map, seen, _QUICK, layer=made.layer,
                            image_of=partial(lambda rows, frame: image_of(rows[frame]), mapped))
         print(f'{room.name}, {case}: {report.verdict}; {report.localized[0]}', flush=True)

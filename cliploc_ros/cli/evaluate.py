@@ -149,15 +149,15 @@ def evaluate(options: argparse.Namespace) -> int:
         height_range_m=tuple(options.height_range),
         tilt_deviation_deg=options.tilt_deviation,
         vertical_deviation_deg=max(1.0, options.gravity_noise_deg), crops=options.crops)
-    methods = parse_methods(options.methods, paper, len(landmark_map))
+    methods = parse_methods(options.methods, paper, len(landmark_map), options.clip)
     others = trials.read_given_poses(options.poses, methods)
     comparing = [f"method '{method.name}'" for method in methods
                  if method.options.needs_similarities]
     comparing += ['--save-queries'] if options.save_queries else []
     if len(landmark_map) and comparing and not options.clip:
         raise OptionsError(f'--no-clip: {comparing[0]} compares crops with labels: omit one of '
-                           f"both, or give --methods class_bf or {AUTO}, or 'matching: class' in "
-                           'a file of methods')
+                           f'both, or give --methods {ALL} (then class_bf, class_ransac and '
+                           f"{AUTO}), or 'matching: class' in a file of methods")
     options.clip = options.clip and len(landmark_map) > 0 and bool(comparing)
     layer = _read_layer(options, landmark_map, methods)
     if not len(landmark_map) and layer is None:
@@ -170,7 +170,7 @@ def evaluate(options: argparse.Namespace) -> int:
                     layer=layer, noisy=draws if len(draws) > 1 else (),
                     sweep=options.sweep if options.figures else None,
                     given=others, about=_describe(options, given, layer is not None),
-                    remarks=_notes(options, queries, landmark_map))
+                    remarks=_notes(options, queries, landmark_map, methods))
     return 0
 
 
@@ -250,8 +250,8 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
 
 
 def _notes(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
-           landmark_map: 'LandmarkMap') -> list[str]:
-    """Return notes on a detector that cannot match the map, and on maps of these images."""
+           landmark_map: 'LandmarkMap', methods: 'Sequence[Method]') -> list[str]:
+    """Return notes on unused keyframes, on a wrong detector, and on maps of these images."""
     from cliploc_ros.cli.sources import source_of
     from cliploc_ros.core.detector_check import DetectorCheck
     from cliploc_ros.offline.datasets.map_recording import load_recording
@@ -260,6 +260,9 @@ def _notes(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
     for query in queries:
         check.add(query.observation.detections, query.observation.detections)
     notes = [f'note: the detector: {fault.text}' for fault in check.faults]
+    if (options.keyframes is None and any(method.keyframes for method in methods)
+            and (problem := _why_no_keyframes(options, methods))):
+        notes.append(f'note: {AUTO} is tried without keyframes: {problem}')
     if options.queries is None:
         images = source_of(options).resolve()
         notes += [f'note: {file} was built from these images ({images}): results are optimistic'
@@ -275,15 +278,19 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
 
     CliplocError: keyframes are requested, but cannot be used.
     """
-    problem = (
-        f"no method uses them: add '{AUTO}'" if not any(method.keyframes for method in methods)
-        else 'several maps are searched by objects only' if len(options.map) > 1
-        else '--queries has no images: give --bag or a folder' if options.queries else '')
+    problem = _why_no_keyframes(options, methods)
     if not problem:
         return shared.read_layer(options.map[0], landmark_map, options.keyframes)
     if options.keyframes:
         raise OptionsError(f'--keyframes: {problem}')
     return None
+
+
+def _why_no_keyframes(options: argparse.Namespace, methods: 'Sequence[Method]') -> str:
+    """Return why the methods cannot use keyframes; '' if they can."""
+    return (f"no method uses them: add '{AUTO}'" if not any(method.keyframes for method in methods)
+            else 'several maps are searched by objects only' if len(options.map) > 1
+            else '--queries has no images: give --bag or a folder' if options.queries else '')
 
 
 def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> int:

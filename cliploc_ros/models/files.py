@@ -312,7 +312,8 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
                         *(pattern for pattern in beside if '/' not in pattern)])
     return download(f"the network '{name}'", own, (
         f'Without a network: download {listed} from https://huggingface.co/{repository} on '
-        f'another machine into a folder, and set `{option}` to its path'), fetch)
+        f'another machine into a folder, and set `{option}` to its path'
+        + ', or use no CLIP: `no_clip`, `matching: class`' * (option == 'clip_pretrained')), fetch)
 
 
 def find_network(folder: Path, name: str, networks: Sequence[str]) -> Path:

@@ -144,10 +144,10 @@ class _Camera:
 
     def examine(self, health: Health, stale_after_s: float) -> None:
         """Report a missing publisher, missing images, and rates."""
-        own, topic = Health(), self._node.resolve_topic_name(self._topic)
+        own, topic = Health(), qos.resolved(self._node, self._topic)
         silent_s = time.monotonic() - self._heard_at
         if self._node.count_publishers(topic) == 0:
-            own.warn(f'no image: nobody publishes {topic}; remap it, or start its publisher')
+            own.warn(qos.why_silent(self._node, 'image', topic, self._type))
             if self.subscription is not None and silent_s > stale_after_s:
                 self._node.get_logger().warning(own.message, once=True)
         elif self.subscription is not None and silent_s > stale_after_s:

@@ -72,7 +72,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         with suppress(CliplocError):  # with a bad name, the node cannot be configured anyway
             self.settings.snapshot()
             self.facts['topics'] = ' '.join(
-                f'{name}:={self.resolve_topic_name(name)}' for name in (
+                f'{name}:={qos.resolved(self, name)}' for name in (
                     *(topic for source in sources for topic in source.topics.values()),
                     *_OTHER_TOPICS, parameters.localizer_pose) if name)
         self._handoff = HandOff(self, self._robot.odometry, self._robot.transforms)

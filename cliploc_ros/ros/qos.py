@@ -39,11 +39,41 @@ _OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIAB
 # messages all the time.
 _RENEWAL_PERIOD_S = 1.0
 _LOG_PERIOD_S = 5.0
+_TRANSPORTS = ('compressed', 'compressedDepth')
 
 
 def overridable(*but: QoSPolicyKind) -> QoSOverridingOptions:
     """Return options that allow users to override all policies except `but`."""
     return QoSOverridingOptions(policy_kinds=[kind for kind in _OVERRIDABLE if kind not in but])
+
+
+def resolved(node: Node, topic: str) -> str:
+    """Return the full name of a topic.
+
+    A transport follows its base topic, as in image_transport, unless it is remapped itself.
+    """
+    own = str(node.resolve_topic_name(topic))
+    base, _, transport = topic.rpartition('/')
+    if transport in _TRANSPORTS and own == node.resolve_topic_name(topic, only_expand=True):
+        return f'{node.resolve_topic_name(base)}/{transport}'
+    return own
+
+
+def why_silent(node: Node, name: str, topic: str, message_type: type) -> str:
+    """Return why nothing arrives on a topic (its full name), with the remedy."""
+    offered = {info.topic_type for info in node.get_publishers_info_by_topic(topic)}
+    package, kind = message_type.__module__.split('.')[0], message_type.__name__
+    if offered and f'{package}/msg/{kind}' not in offered:
+        return (f'no {name}: {topic} has messages of type {", ".join(sorted(offered))}, expected '
+                f'{package}/msg/{kind}: remap {name}, or set image_transport')
+    if offered:
+        return (f'no {name} on {topic} from its {node.count_publishers(topic)} publisher(s): '
+                'check that it publishes, and that its QoS is compatible; or it is slow')
+    for other in (f'{topic}/compressed', topic.removesuffix('/compressed')):
+        if other != topic and node.count_publishers(other):
+            return (f'no {name}: nobody publishes {topic}, but {other} is published: set '
+                    f'image_transport to {"compressed" if len(other) > len(topic) else "raw"}')
+    return f'no {name}: nobody publishes {topic}; remap it, or start its publisher'
 
 
 class AdaptiveSubscription:
@@ -73,7 +103,7 @@ class AdaptiveSubscription:
                  callback: Callable[[Any], None], profile: QoSProfile) -> None:
         self._node = node
         self._message_type = message_type
-        self._topic = node.resolve_topic_name(topic)
+        self._topic = resolved(node, topic)
         self._callback = callback
         self._profile = profile
         # A reliability set by the user is kept. Otherwise the parameter is not declared, because

@@ -157,6 +157,9 @@ def test_all_are_the_papers_ten_and_auto():
     *methods, auto = parse_methods(['all'], FIVE, 40)
     assert (auto,) == parse_methods(['auto'], FIVE, 40)
     assert tuple(method.name for method in methods) == PAPER_METHODS
+    assert [method.name for method in parse_methods(
+            ['all'], replace(FIVE, matching='class'), 40, with_clip=False)] == [
+                'class_bf', 'class_ransac', 'auto']
     for method in methods:
         assert f'{method.options.matching}_{method.options.algorithm}' == method.name
         assert (method.options.iterations, method.options.k) == (500, 5)
@@ -309,25 +312,39 @@ def test_poses_of_another_program_that_fit_after_one_transform(questions, change
     poses = TimedPoses.from_samples(
         [query.observation.stamp_ns for query in queries],
         [[*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()] for pose in given], 'here')
-    found = find_misfit(given_results('theirs', poses, queries), queries)
+    found = find_misfit(given_results('theirs', poses, queries), queries, poses)
     assert found.startswith(said and 'note: theirs: poses would fit after one transform (not '
                             f'applied): {said}')
     assert bool(found) == bool(said)
     if 'frame' in said:
-        assert not find_misfit(given_results('theirs', poses, questions), questions)
+        assert not find_misfit(given_results('theirs', poses, questions), questions, poses)
+
+
+@pytest.mark.parametrize(('unit', 'late_ms', 'said'), [
+    (2.0, 0, 'their unit is 0.5 m'), (1.0, 50, 'its stamps are +50 ms off'), (1.0, 5, '')])
+def test_poses_of_another_program_in_another_unit_or_late(questions, unit, late_ms, said):
+    poses = TimedPoses.from_samples(
+        [query.observation.stamp_ns + late_ms * 1_000_000 for query in questions],
+        [[*number * unit * np.array([1.0, 0.3, 0.2]), 0.0, 0.0, 0.0, 1.0]
+         for number in range(1, 1 + len(questions))], 'here')
+    queries = [replace(query, map_from_camera=make_transform(
+        np.eye(3), number * np.array([1.0, 0.3, 0.2])))
+        for number, query in enumerate(questions, 1)]
+    found = find_misfit(given_results('theirs', poses, queries), queries, poses)
+    assert said in found and bool(said) == bool(found)
 
 
 def test_the_table_in_latex():
     """A cell holds one number, also of rows that were read from CSV; an empty cell stays empty."""
     rows = summary.csv_rows([make_summary([[0.1, 0.4]] * 2, 'my_own{}')])
-    cells = r'my\_own\{\} & 0.50 & 1.00 & 1.00 & 0.250 & 2.50 & 0.25 & 2.0 & 0.00 &  & 0 & \%'
+    cells = r'my\_own\{\} & 0.50 & 1.00 & 1.00 & 0.250 & 2.50 & 0.25 & 2.0 & 0.00 &  & 0 &  & \%'
     for again in (rows, [*csv.DictReader(summary.csv_text(rows).splitlines())]):
         text = summary.as_latex([{**again[0], 'paper_success': '%'}])
         assert text.splitlines() == [
-            r'% needs \usepackage{booktabs}', rf'\begin{{tabular}}{{l{"r" * 11}}}', r'\toprule',
+            r'% needs \usepackage{booktabs}', rf'\begin{{tabular}}{{l{"r" * 12}}}', r'\toprule',
             'method & success 0.25m & success 0.5m & success 1m & median error m & median error '
             'deg & mean error m & mean search ms & accepted & precision 1m & wrongly accepted & '
-            r'paper success \\', r'\midrule', rf'{cells} \\', r'\bottomrule', r'\end{tabular}']
+            r'keyframes ms & paper success \\', r'\midrule', rf'{cells} \\', r'\bottomrule', r'\end{tabular}']
     assert '& &' in summary.as_latex([rows[0] | {'accepted': ''}]).replace('  ', ' ')
 
 

@@ -299,8 +299,10 @@ def _points(evidence: Evidence) -> str:
     """Describe the keyframes that match at the pose, as part of a sentence; empty without any."""
     if evidence.recognized is None:
         return ''
+    is_tilted = evidence.recognized.tilt_error > CALIBRATION.attitude.vertical_sigmas
     return (f', {evidence.recognized.inliers} points of keyframes agree in '
-            f'{evidence.recognized.confirmed:.0%} of the image')
+            f'{evidence.recognized.confirmed:.0%} of the image'
+            + ' and contradict the known vertical (check gravity, tf and imu)' * is_tilted)
 
 
 def _point(position: Point) -> str:

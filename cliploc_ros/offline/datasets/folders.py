@@ -174,7 +174,7 @@ def _placed(folder: Path, layout: Layout, capture: frames.Capture, options: fram
     found = frames.folder_frames(folder, files, form)
     flat = sum(file.depth is None for file in files)
     if 0 < flat < len(files):
-        notes.append(f'{flat} of {len(files)} images have no depth image')
+        notes.append(f'{flat} of {len(files)} images have no depth image taken with them')
     posed = [(file, file.pose) for file in files if file.pose is not None]
     digest = ' '.join(hashlib.sha256(repr(known).encode()).hexdigest()[:12] for known in (
         [(file.color.name, file.stamp_ns, file.camera, _end_of(file.color)) for file, _ in posed],

@@ -83,7 +83,8 @@ _QUERIES = npz.Schema('query file', {
         npz.FINITE, npz.Check('is negative', lambda seconds: seconds < 0))),
     'query_group': npz.Field('integers', ('F',)),
     'is_main': npz.Field('booleans', ('F',), (_check_groups,)),
-}, DatasetError, not_empty={'F': 'frames', 'L': 'landmarks'})
+}, DatasetError, not_empty={'F': 'frames', 'L': 'landmarks'}, others={
+    'image_size': 'this is an observation file: make a query file with evaluate --save-queries'})
 
 
 @dataclass(frozen=True)

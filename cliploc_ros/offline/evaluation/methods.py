@@ -39,8 +39,8 @@ class Method:
         return self.options.algorithm == 'auto'
 
 
-def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: int
-                  ) -> tuple[Method, ...]:
+def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: int,
+                  with_clip: bool = True) -> tuple[Method, ...]:
     """Return the methods that the words name.
 
     OptionsError: a name, or an option in a file, is unknown or invalid; the message names it.
@@ -61,6 +61,7 @@ def parse_methods(words: Iterable[str], paper: RelocalizerOptions, landmarks: in
     for word in words:
         if word == ALL:
             found = [_named(name, paper, landmarks) for name in (*PAPER_METHODS, AUTO)]
+            found = [one for one in found if with_clip or not one.options.needs_similarities]
         elif word.endswith(('.yaml', '.yml')):
             content = read_parameter_file(word)
             if not content:

@@ -158,7 +158,7 @@ def compare_methods(landmark_map: LandmarkMap, queries: Sequence[PosedQuery],
     shown = [*own, *chain.from_iterable(of_others.values())]
     summaries = summary.summarize(shown)
     rows = summary.table_rows(summaries)
-    misfits = [find_misfit(its, queries) for its in of_others.values()]
+    misfits = [find_misfit(its, queries, given[name]) for name, its in of_others.items()]
     remarks = [*remarks, *filter(None, misfits), *summary.notes(summaries)]
     if names := ', '.join(method.name for method in methods if method.accumulates):
         remarks.append(f'{names}: one localizer gets the queries in the order of their stamps, as '

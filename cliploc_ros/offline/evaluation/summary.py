@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from cliploc_ros.core.geometry.transforms import invert_transform, pose_error
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER, invert_transform, pose_error
 from cliploc_ros.offline.evaluation.methods import PAPER_METHODS
 from cliploc_ros.offline.evaluation.trials import GIVEN, GIVEN_TOLERANCE_MS, Result
 
@@ -41,7 +41,7 @@ _OF_SEARCHES = ('mean_search_ms', 'search_ms_std', 'coverage', 'accepted', 'prec
 _LATEX = {'method': '', **dict.fromkeys(
     ('success_0.25m', 'success_0.5m', 'success_1m', 'accepted', 'precision_1m', 'median_error_deg',
      'mean_error_m'), '.2f'), 'median_error_m': '.3f', 'mean_search_ms': '.1f',
-    'wrongly_accepted': 'g'}
+    'keyframes_ms': '.1f', 'wrongly_accepted': 'g'}
 _OF_LATEX = {'\\': r'\textbackslash{}', '~': r'\textasciitilde{}', '^': r'\textasciicircum{}',
              '±': r'$\pm$', **{char: rf'\{char}' for char in '&%$#_{}'}}
 
@@ -75,6 +75,12 @@ class Summary:
     def is_given(self) -> bool:
         """Return whether another program found the poses: only the errors have a meaning then."""
         return bool((self.sources == GIVEN).any())
+
+    @property
+    def looks_right(self) -> bool:
+        """Return whether the poses found mostly look in the right direction."""
+        return bool(np.median([0.0, *self.errors_deg[np.isfinite(self.errors_deg)]])
+                    <= SAME_ANSWER.angle_deg)
 
     def success(self, limit_m: float) -> float:
         """Return the share of poses within a limit of the truth, accepted or not."""
@@ -195,8 +201,11 @@ def compare(one: Summary, other: Summary) -> Difference:
 
 
 def find_best(summaries: Sequence[Summary]) -> Summary:
-    """Return the summary of highest success; of equal ones, that of least median error."""
-    return max(summaries, key=lambda each: (each.success(SUCCESS_M),
+    """Return the summary of highest success; of equal ones, that of least median error.
+
+    A method whose cameras look elsewhere (median) is not the best one.
+    """
+    return max(summaries, key=lambda each: (each.looks_right, each.success(SUCCESS_M),
                                             -float(np.median(each.errors_m))))
 
 
@@ -269,8 +278,10 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     for summary in summaries:
         errors, inside = summary.of_accepted
         if errors.size:
-            lines.append(f'{summary.method} accepted: worst error {errors.max():.2f} m; {inside} '
-                         f'of {errors.size} poses in their 95 % ellipsoid.')
+            worst = int(np.where(summary.accepted, summary.errors_m, -1.0).max(axis=0).argmax())
+            lines.append(f'{summary.method} accepted: worst error {errors.max():.2f} m (query '
+                         f'{summary.queries[worst]} of results.json); {inside} of {errors.size} '
+                         'poses in their 95 % ellipsoid.')
     lines += [f'{summary.method} refused: {_kinds(summary)}.'
               for summary in summaries if summary.refusals]
     lines += [f'{summary.method} compared {summary.crops_share:.0%} of the crops of a query with '
@@ -279,7 +290,10 @@ def notes(summaries: Sequence[Summary]) -> list[str]:
     if any(summary.has_keyframes for summary in summaries):
         lines.append('Keyframes: number of poses from each source, median number of inlier '
                      'points, mean time outside the search.')
-    if len(summaries) > 1:
+    lines += [f'{summary.method}: the poses are turned by {np.median(summary.errors_deg):.0f} '
+              'degrees (median), and success judges positions only.'
+              for summary in summaries if not summary.looks_right]
+    if any(_WITHIN_NOISE in cell for row in table_rows(summaries)[1:] for cell in row):
         lines.append(f'{_WITHIN_NOISE}: the queries are too few to separate it from {best.method} '
                      '(at 1 m; paired bootstrap, 95 %).')
     return lines

@@ -36,6 +36,8 @@ GIVEN_TOLERANCE_MS = 10
 # Given poses with higher median errors [m] [deg] do not fit the truth, and a transform that fits
 # must divide these errors. At least and at most this many poses are compared. Chosen.
 _FITS, _BETTER, _LEAST_GIVEN, _COMPARED = (0.25, 5.0), 3.0, 4, 100
+# Relative difference of units that is named. Chosen.
+_OTHER_UNIT = 0.05
 
 
 @dataclass(frozen=True)
@@ -186,15 +188,18 @@ def given_results(name: str, poses: TimedPoses, queries: Sequence[PosedQuery]) -
     return results
 
 
-def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str:
+def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery], timed: TimedPoses
+                ) -> str:
     """Return a note if poses of another program are wrong, but fit after one transform; else ''.
 
-    Quaternions may be w first, poses inverse, or those of another body or in another coordinate
-    frame.
+    Quaternions may be w first, poses inverse, in another unit, or those of another body or in
+    another coordinate frame.
     """
     pairs = [(result.map_from_camera, query.map_from_camera)
              for result, query in zip(results, queries, strict=True) if result.solved]
     pairs = pairs[::-(-len(pairs) // _COMPARED) or 1]
+    if len(pairs) < min(_LEAST_GIVEN, len(queries)):
+        return _late(results, timed)
     if len(pairs) < _LEAST_GIVEN:
         return ''
     given, truth = np.array(pairs).transpose(1, 0, 2, 3)
@@ -211,6 +216,13 @@ def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str
     readings = {'': given, 'quaternions are w first (add this first line to the file: # timestamp '
                 'tx ty tz qw qx qy qz)': np.array([*map(w_first, given)]),
                 'poses are inverse (map in camera)': np.linalg.inv(given)}
+    spreads = [np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1))
+               for places in (truth[:, :3, 3], given[:, :3, 3])]
+    unit_m = spreads[0] / max(spreads[1], 1e-9)
+    if abs(unit_m - 1.0) > _OTHER_UNIT:
+        scaled = given.copy()
+        scaled[:, :3, 3] *= unit_m
+        readings[f'their unit is {unit_m:.4g} m'] = scaled
     candidates: list[tuple[str, str, NDArray[np.float64], NDArray[np.float64]]] = []
     for reading, poses in readings.items():
         inverse = np.linalg.inv(poses)
@@ -231,6 +243,19 @@ def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery]) -> str
                     f'applied): {misread}; give poses of the camera (z forward) in the map, '
                     'x y z qx qy qz qw')
     return ''
+
+
+def _late(results: Sequence[Result], poses: TimedPoses) -> str:
+    """Return a note if all stamps of poses are off those of the results alike; else ''."""
+    offsets_ms = []
+    for result in results:
+        gaps_ms = poses.stamps_ns / 1e6 - 1e3 * result.timestamp
+        offsets_ms.append(gaps_ms[np.abs(gaps_ms).argmin()])
+    median_ms = float(np.median(offsets_ms))
+    spread_ms = float(np.median(np.abs(np.array(offsets_ms) - median_ms)))
+    return '' if spread_ms > GIVEN_TOLERANCE_MS else (
+        f'note: {results[0].method}: its stamps are {median_ms:+.0f} ms off those of the queries: '
+        'correct them')
 
 
 def _error(pose: NDArray[np.float64] | None, query: PosedQuery) -> dict[str, Any]:

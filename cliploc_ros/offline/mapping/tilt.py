@@ -74,7 +74,7 @@ def tilt_note(poses: NDArray[np.float64], of_robot: bool = False) -> str:
         return ''
     if of_robot or found[1] > _UPSIDE_DOWN_DEG:
         return (f'by the poses, the cameras are tilted by {found[1]:.0f} degrees: right if they '
-                'are mounted so, otherwise correct their mount') + (
+                'are mounted so, otherwise correct their mount; if they sway, set no gravity') + (
             '' if of_robot else '; if z of the poses points down, build_map --level turns it')
     return (f'z is {found[1]:.0f} degrees off the vertical of the cameras: heights and views from '
             'above are meaningless; build_map --level corrects it, where the map need not fit '

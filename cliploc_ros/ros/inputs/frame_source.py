@@ -237,15 +237,19 @@ class FrameSource:
             return
         self._unsubscribe()  # remove subscriptions of a failed attempt
         self._subscribed_at = time.monotonic()
-        of_topics = {'image': (self._image_type, qos.IMAGE),
-                     'camera_info': (CameraInfo, qos.CAMERA_INFO),
-                     'detections': (self._detections_type, qos.DETECTIONS_IN),
-                     'depth': (self._depth_type, qos.IMAGE),
-                     'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
         for name, topic in self.topics.items():
-            message_type, profile = of_topics[name]
+            message_type, profile = self._kinds[name]
             self._subscriptions.append(qos.AdaptiveSubscription(
                 self._node, message_type, topic, partial(self._receive, name), profile))
+
+    @property
+    def _kinds(self) -> dict[str, tuple[type, qos.QoSProfile]]:
+        """Return the message type and the quality of service of each topic."""
+        return {'image': (self._image_type, qos.IMAGE),
+                'camera_info': (CameraInfo, qos.CAMERA_INFO),
+                'detections': (self._detections_type, qos.DETECTIONS_IN),
+                'depth': (self._depth_type, qos.IMAGE),
+                'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
 
     def _unsubscribe(self) -> None:
         for subscription in self._subscriptions:
@@ -367,10 +371,7 @@ class FrameSource:
             return (f'no detections on {topic} from its {publishers} publisher(s): give '
                     f'the detector the same image topic, {self._resolved("image")}; see its log, '
                     'choose a faster profile or a smaller detector, or raise timeout_s')
-        if publishers:
-            return (f'no {name} on {topic} from its {publishers} publisher(s): check that it '
-                    'publishes, and that its QoS is compatible; or it is slow')
-        return f'no {name}: nobody publishes {topic}; remap it, or start its publisher'
+        return qos.why_silent(self._node, name, topic, self._kinds[name][0])
 
     def _resolved(self, name: str) -> str:
-        return str(self._node.resolve_topic_name(self.topics[name]))
+        return qos.resolved(self._node, self.topics[name])

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The result of a check: figures, verdict and advice."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, get_type_hints
 
@@ -174,7 +175,8 @@ class CheckReport:
                           ', keyframes not tried without images')
             found.append(
                 f'{counted(len(trials), "recorded view")}, each in a map of the other views: '
-                f'{counts["accepted"]} localized ({alone}), {counts["refused"]} refused')
+                f'{counts["accepted"]} localized ({alone}{_errors(trials)}), '
+                f'{counts["refused"]} refused')
             misled = f'{counts["misled"]} of {len(trials)} recorded and '
         of_objects, of_keyframes = (int(headings.any(axis=1)[near].sum()) for headings in (
             self.grid.by_objects, self.grid.by_keyframes))
@@ -208,6 +210,17 @@ class CheckReport:
     def duplicates(self) -> int:
         """Return the number of pairs of landmarks that are one object."""
         return sum(overlap.is_duplicate for overlap in self.overlaps)
+
+
+def _errors(trials: Sequence[relocalization.Trial]) -> str:
+    """Return the median and the greatest error of localized views; '' without such a view."""
+    errors = [(trial.error_m or 0.0, trial.stamp_s or 0.0) for trial in trials
+              if trial.verdict == 'accepted']
+    if not errors:
+        return ''
+    worst_m, stamp_s = max(errors)
+    return (f'; error {np.median([error_m for error_m, _ in errors]):.2f} m (median), '
+            f'{worst_m:.2f} m at most, at {stamp_s:.2f} s')
 
 
 def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
