@@ -344,7 +344,8 @@ def test_the_table_in_latex():
             r'% needs \usepackage{booktabs}', rf'\begin{{tabular}}{{l{"r" * 12}}}', r'\toprule',
             'method & success 0.25m & success 0.5m & success 1m & median error m & median error '
             'deg & mean error m & mean search ms & accepted & precision 1m & wrongly accepted & '
-            r'keyframes ms & paper success \\', r'\midrule', rf'{cells} \\', r'\bottomrule', r'\end{tabular}']
+            r'keyframes ms & paper success \\', r'\midrule', rf'{cells} \\', r'\bottomrule',
+            r'\end{tabular}']
     assert '& &' in summary.as_latex([rows[0] | {'accepted': ''}]).replace('  ', ' ')
 
 
