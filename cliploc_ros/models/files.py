@@ -108,10 +108,7 @@ def _content(path: Path, cache_dir: str | None) -> tuple[str, list[str]]:
     text = json.dumps(found)
     with suppress(OSError):  # a read-only cache works too
         if time.time_ns() - status.st_ctime_ns > _SETTLED_NS:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            check_owners(kept.parent)
-            remove_unused(kept.parent, _MOST_DIGESTS - 1)
-            with replace_file(kept) as partial:
+            with new_entry(kept, _MOST_DIGESTS) as partial:
                 partial.write_text(f'{hashlib.sha256(text.encode()).hexdigest()} {text}')
     return found
 
@@ -185,6 +182,20 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
             remedy += ('; or run doctor --prepare --cache-dir DIR there, and copy the content of '
                        f'DIR into {folder.parent}')
         raise ModelError(f'cannot download {what}: {reason}. {remedy}') from error
+
+
+@contextmanager
+def new_entry(file: Path, most: int) -> Iterator[Path]:
+    """Yield the path of a temporary file that becomes an entry of a cache, see replace_file.
+
+    The folder is made if it does not exist. Beyond ``most`` entries, the least recently used ones
+    are removed. Raises OSError if the folder belongs to another user, is read-only or full.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    check_owners(file.parent)
+    remove_unused(file.parent, most - 1)
+    with replace_file(file) as partial:
+        yield partial
 
 
 def remove_unused(folder: Path, most: int) -> None:

@@ -32,7 +32,6 @@ from cliploc_ros.files.storage import (
     check_owners,
     parse_json,
     read_file,
-    replace_file,
     resolve_cache_dir,
     warn_not_kept,
 )
@@ -40,7 +39,7 @@ from cliploc_ros.models.files import (
     check_weights_file,
     digest_network,
     first_line,
-    remove_unused,
+    new_entry,
     weights_beside,
 )
 
@@ -324,10 +323,7 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
         digest = hashlib.sha256()
         for part in parts:
             digest.update(part)
-        stored.parent.mkdir(parents=True, exist_ok=True)
-        check_owners(stored.parent)
-        remove_unused(stored.parent, _MOST_NETWORKS - 1)
-        with replace_file(stored) as partial, partial.open('wb') as opened:
+        with new_entry(stored, _MOST_NETWORKS) as partial, partial.open('wb') as opened:
             opened.writelines((digest.digest(), *parts))
         # Loaded from the file, so that the weights are in memory once, and the file is checked.
         compiled, _ = _load(stored, precision)
