@@ -273,8 +273,7 @@ class Studio:
     @property
     def map_from_camera(self) -> NDArray[np.float64]:
         """The pose (4, 4) of the selected view."""
-        pose: NDArray[np.float64] = self.seen().detections.map_from_camera[self.view]
-        return pose
+        return np.asarray(self.seen().detections.map_from_camera[self.view])
 
     @property
     def camera(self) -> Camera:
