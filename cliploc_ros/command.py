@@ -134,8 +134,7 @@ SEEDS = 0, 2**63 - 1
 
 def within[Number: (int, float)](low: Number, high: Number) -> Callable[[str], Number]:
     """Return an argparse type that accepts numbers from low to high, of the type of the limits."""
-    return number(type(low), lambda value: low <= value <= high,
-                  f'within {low:g} and {high:g}')
+    return number(type(low), lambda value: low <= value <= high, f'within {low:g} and {high:g}')
 
 
 # Placeholders of paths in the help.

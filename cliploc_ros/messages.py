@@ -211,8 +211,7 @@ def camera_from_frame(msg: CameraInfoMessage) -> NDArray[np.float64]:
     return pose
 
 
-def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool
-                          ) -> list[Fault]:
+def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool) -> list[Fault]:
     """Return contradictory or implausible fields of a message, certain faults first.
 
     `camera` is the result of camera_from_msg for this message.

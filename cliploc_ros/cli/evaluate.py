@@ -210,8 +210,7 @@ def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]'
         if options.fuse:
             found = trials.with_neighbours(found, [query.group for query in found], noise_m,
                                            noise_deg, seed)
-        draws.append(tuple(query for query in found
-                           if options.frames == 'all' or query.is_main))
+        draws.append(tuple(query for query in found if options.frames == 'all' or query.is_main))
     return draws
 
 

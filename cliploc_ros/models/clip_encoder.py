@@ -130,8 +130,7 @@ def _images(weights: ClipWeights, landmark_map: LandmarkMap, map_file: str
             ) -> LandmarkEmbeddings | None:
     """Return the image embeddings of a map by this encoder; None if there are none."""
     try:
-        images = load_embeddings_of_map(map_file, landmark_map.landmark_ids,
-                                        landmark_map.map_set)
+        images = load_embeddings_of_map(map_file, landmark_map.landmark_ids, landmark_map.map_set)
     except MapError as error:
         logger.warning('only labels are compared: %s', error)
         return None

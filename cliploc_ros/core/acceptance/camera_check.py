@@ -323,8 +323,7 @@ class _Record:
                     - odds_of(*self.views.sums).log_odds)
             if gain > _TERMS.view:
                 self.views, self.since = self.views.joined(self.since), Views()
-            elif (gain < -_TERMS.view and self.since.are_right
-                  and self.by_extent < -_TERMS.fits):
+            elif (gain < -_TERMS.view and self.since.are_right and self.by_extent < -_TERMS.fits):
                 self.views, self.since = self.since, Views()
         self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds()
 
@@ -386,8 +385,7 @@ class CameraCheck:
 
     def __init__(self) -> None:
         self._records: dict[str, _Record] = {}
-        self._instants: deque[dict[str, tuple[int, int]]] = deque(
-            maxlen=int(_TERMS.most_instants))
+        self._instants: deque[dict[str, tuple[int, int]]] = deque(maxlen=int(_TERMS.most_instants))
 
     def copied(self) -> 'CameraCheck':
         """Return a copy that later looks do not change."""

@@ -136,8 +136,7 @@ class Comparison:
             or self._by_points >= self._joined.options.min_confidence)
         return None if is_sure else self.by_objects
 
-    def _confidences(self, rows: NDArray[np.int64], odds: Sequence[float]
-                     ) -> NDArray[np.float64]:
+    def _confidences(self, rows: NDArray[np.int64], odds: Sequence[float]) -> NDArray[np.float64]:
         """Return the probabilities (r,) of the contenders of some rows, given their odds."""
         return confidence.confidences(np.array(odds), self.poses[rows], self._none, prior=np.array(
             [self.contenders[row].prior for row in rows]))

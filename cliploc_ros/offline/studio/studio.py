@@ -173,8 +173,7 @@ class ReviewQueue:
 
     # ---------------------------------------------------------------------------------------------
 
-    def _decide(self, ids: Sequence[str], decision: str, what: str, gesture: object = None
-                ) -> str:
+    def _decide(self, ids: Sequence[str], decision: str, what: str, gesture: object = None) -> str:
         """Store a decision, and select the next landmark without a decision."""
         self._document.edit(edits.mark, ids, decision, decision=decision, gesture=gesture)
         return self._go_on(ids[-1], what)

@@ -351,8 +351,7 @@ class OdometrySource(qos.Listener):
         wait if odometry has no publisher.
         """
         def is_recent() -> bool:
-            return (self._newest is not None
-                    and time.monotonic() - self._newest_at <= max_age_s)
+            return (self._newest is not None and time.monotonic() - self._newest_at <= max_age_s)
         with self._heard:
             if self.is_published:
                 self._heard.wait_for(is_recent, patience_s)
