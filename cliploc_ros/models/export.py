@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.errors import ModelError, did_you_mean
+from cliploc_ros.errors import ModelError, did_you_mean, first_line
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models import exports
-from cliploc_ros.models.files import check_weights_file, download, fingerprint_file, first_line
+from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
 from cliploc_ros.models.onnx_network import CompiledNetwork, import_openvino, read_config
 from cliploc_ros.models.protocols import ClipOptions
 

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.errors import CliplocError, ModelError
+from cliploc_ros.errors import CliplocError, ModelError, first_line
 from cliploc_ros.files import storage
-from cliploc_ros.models.files import digest_file, fingerprint_file, first_line, remove_unused
+from cliploc_ros.models.files import digest_file, fingerprint_file, remove_unused
 from cliploc_ros.models.onnx_network import free_memory
 
 # Version of these folders and of the export; a change makes new folders.

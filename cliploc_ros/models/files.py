@@ -17,7 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
-from cliploc_ros.errors import ModelError
+from cliploc_ros.errors import ModelError, first_line
 from cliploc_ros.files import storage
 
 _BLOCK_BYTES = 64 * 1024
@@ -210,12 +210,6 @@ def remove_unused(folder: Path, most: int) -> None:
             shutil.rmtree(entry, ignore_errors=True)
         else:
             entry.unlink(missing_ok=True)
-
-
-def first_line(error: Exception) -> str:
-    """Return the first line of an error in ASCII, without emojis and colours."""
-    lines = str(error).encode('ascii', 'ignore').decode().strip().splitlines()
-    return lines[0].strip() if lines else type(error).__name__
 
 
 def is_hub_name(name: str) -> bool:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from cliploc_ros.errors import ModelError
+from cliploc_ros.errors import ModelError, first_line
 from cliploc_ros.files.storage import parse_json, read_file
 from cliploc_ros.models import exports
 from cliploc_ros.models.files import (
@@ -28,7 +28,6 @@ from cliploc_ros.models.files import (
     digest_network,
     find_network,
     fingerprint_file,
-    first_line,
     is_hub_name,
     resolve_folder,
 )

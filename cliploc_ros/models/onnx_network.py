@@ -26,15 +26,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.errors import ModelError
+from cliploc_ros.errors import ModelError, first_line
 from cliploc_ros.files import storage
-from cliploc_ros.models.files import (
-    check_weights_file,
-    digest_network,
-    first_line,
-    new_entry,
-    weights_beside,
-)
+from cliploc_ros.models.files import check_weights_file, digest_network, new_entry, weights_beside
 
 # A compiled network is as large as its file: ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
 _MOST_NETWORKS = 8
