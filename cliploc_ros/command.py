@@ -155,6 +155,13 @@ class _Once(argparse.Action):
         super().__call__(parser, namespace, values, option_string)
 
 
+def program(name: str, epilog: str, description: str, usage: str | None = None
+            ) -> argparse.ArgumentParser:
+    """Return the parser of a program, whose help ends with the epilog as it is written."""
+    return argparse.ArgumentParser(name, usage, description, epilog,
+                                   formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
 def option(group: Any, shown: str, text: str | None = None,
            kind: Callable[[str], Any] | None = None, default: Any = None, **more: Any) -> None:
     """Add an option or argument to a parser, or to an argument group.

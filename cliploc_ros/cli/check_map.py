@@ -40,11 +40,10 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='check_map', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Check a map: its landmarks, where a robot would be accepted, refused or '
-        'misled in it, places that look alike, and systematic errors. Writes check.html and '
-        'check.json. Without observations the report is shorter. Needs no sourced ROS.')
+    parser = command.program('check_map', EPILOG, 'Check a map: its landmarks, where a robot '
+                             'would be accepted, refused or misled in it, places that look alike, '
+                             'and systematic errors. Writes check.html and check.json. Without '
+                             'observations the report is shorter. Needs no sourced ROS.')
     option(parser, 'map MAP', 'a map file')
     option(parser, '--observations NPZ', 'boxes and poses of a recording of the place (default: '
            'those that the map was built from, as named by NAME.recording.json next to the map)')

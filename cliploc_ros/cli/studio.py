@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cliploc_ros.cli.options import add_topic_options, read_layer
-from cliploc_ros.command import needs_ros, option, run_main, within
+from cliploc_ros.command import needs_ros, option, program, run_main, within
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
@@ -41,10 +41,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='studio', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Create and correct a map in the browser. Needs no sourced ROS, except for '
-        '--ros.')
+    parser = program('studio', EPILOG, 'Create and correct a map in the browser. Needs no sourced '
+                     'ROS, except for --ros.')
     option(parser, 'map MAP', 'a map file; a new one starts empty (map.yaml, or the first unused '
            'name of map-2.yaml, map-3.yaml, ...)', nargs='?')
     option(parser, '--observations NPZ', 'boxes and poses of a recording of the place')
