@@ -22,15 +22,7 @@ from PIL import Image
 
 from cliploc_ros.errors import ModelError, first_line
 from cliploc_ros.files.storage import parse_json, read_file
-from cliploc_ros.models import exports
-from cliploc_ros.models.files import (
-    digest_file,
-    digest_network,
-    find_network,
-    fingerprint_file,
-    is_hub_name,
-    resolve_folder,
-)
+from cliploc_ros.models import exports, files
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, colours, numbers, one_of, read_config
 from cliploc_ros.models.protocols import ClipOptions
 
@@ -69,23 +61,23 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     """
     named = options.checkpoint_path or options.pretrained
     if names_onnx(options):
-        name, folder = named, resolve_folder(
+        name, folder = named, files.resolve_folder(
             named, [exports.IMAGE_TOWERS, exports.TEXT_TOWERS], exports.BESIDE,
             options.cache_dir, 'clip_pretrained')
     else:
         given, config = Path(named).expanduser().absolute(), ''
         name = options.model.replace('/', '-')  # OpenAI's spelling is ViT-L/14
         if name.endswith('.json') and (file := Path(options.model).expanduser()).is_file():
-            name, config = file.stem, digest_file(file)
+            name, config = file.stem, files.digest_file(file)
         tag = options.pretrained if options.checkpoint_path or not given.is_file() else ''
 
         from cliploc_ros.models.export import export_clip
         folder = exports.exported(options.cache_dir, name, f'CLIP {name}', (
             'CLIP', name, config, tag,
-            digest_file(given, options.cache_dir) if given.is_file() else ''),
+            files.digest_file(given, options.cache_dir) if given.is_file() else ''),
             partial(export_clip, options), exports.WITHOUT_CLIP)
-    image_tower = find_network(folder, named, exports.IMAGE_TOWERS)
-    text_tower = find_network(folder, '', exports.TEXT_TOWERS)
+    image_tower = files.find_network(folder, named, exports.IMAGE_TOWERS)
+    text_tower = files.find_network(folder, '', exports.TEXT_TOWERS)
     about = read_config(folder / exports.CONFIG, 'it has the length of an embedding')
     vision = about.get('vision_config')
     embed_dim = (about.get('projection_dim') or about.get('embed_dim')
@@ -94,9 +86,9 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
         raise ModelError(f"{folder / exports.CONFIG} has the length of an embedding neither in "
                          "'projection_dim' nor in 'embed_dim': add it")
     key = exports.export_key(folder, options.cache_dir) or (
-        f'onnx:{fingerprint_file(image_tower)}:{fingerprint_file(text_tower)}')
+        f'onnx:{files.fingerprint_file(image_tower)}:{files.fingerprint_file(text_tower)}')
     return ClipWeights(name, folder, image_tower, text_tower, embed_dim, key,
-                       f'{key}:{digest_network(text_tower, options.cache_dir)}')
+                       f'{key}:{files.digest_network(text_tower, options.cache_dir)}')
 
 
 def names_onnx(options: ClipOptions) -> bool:
@@ -106,7 +98,7 @@ def names_onnx(options: ClipOptions) -> bool:
     """
     named = options.checkpoint_path or options.pretrained
     folder = Path(named).expanduser()
-    return bool(named) and (is_hub_name(named) or (folder.is_dir() and (
+    return bool(named) and (files.is_hub_name(named) or (folder.is_dir() and (
         os.sep in named or any((folder / file).exists() for file in exports.IMAGE_TOWERS))))
 
 
@@ -299,13 +291,13 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
     except ModuleNotFoundError as error:
         raise ModelError(f"{error.name} is not installed, but labels need it: pip install "
                          f"{error.name}, or the extra 'runtime'") from error
-    files = [file for file in (folder / exports.TOKENIZER, folder / 'textual' / exports.TOKENIZER)
+    found = [file for file in (folder / exports.TOKENIZER, folder / 'textual' / exports.TOKENIZER)
              if file.exists()]
-    if not files:
+    if not found:
         raise ModelError(f'{folder / exports.TOKENIZER} is missing; it splits labels into tokens: '
                          'put the file of the published network there')
     try:
-        text = read_file(files[0]).decode()
+        text = read_file(found[0]).decode()
         about = parse_json(text)
         # on a prefix that its merges lack, the library ends the process
         if 'merges' in about['model'] and about['model'].get('continuing_subword_prefix'):
@@ -317,7 +309,7 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
         if not _LEAST_SHARE * known <= size <= known:
             raise ValueError(f'it has {size} tokens, but the text tower has {known}')
     except Exception as error:  # the library has no exception classes
-        raise ModelError(f'{files[0]} is not a tokenizer of a CLIP: {first_line(error)}'
+        raise ModelError(f'{found[0]} is not a tokenizer of a CLIP: {first_line(error)}'
                          ) from error
     padding = 0
     with contextlib.suppress(ValueError, LookupError, TypeError):
