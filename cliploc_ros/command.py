@@ -134,8 +134,7 @@ SEEDS = 0, 2**63 - 1
 
 def within[Number: (int, float)](low: Number, high: Number) -> Callable[[str], Number]:
     """Return an argparse type that accepts numbers from low to high, of the type of the limits."""
-    return number(type(low), lambda value: low <= value <= high,
-                  f'within {low:g} and {high:g}')
+    return number(type(low), lambda value: low <= value <= high, f'within {low:g} and {high:g}')
 
 
 # Placeholders of paths in the help.
@@ -154,6 +153,13 @@ class _Once(argparse.Action):
             raise argparse.ArgumentError(self, 'given twice: give it once, with all its values')
         self.given_in = namespace
         super().__call__(parser, namespace, values, option_string)
+
+
+def program(name: str, epilog: str, description: str, usage: str | None = None
+            ) -> argparse.ArgumentParser:
+    """Return the parser of a program, whose help ends with the epilog as it is written."""
+    return argparse.ArgumentParser(name, usage, description, epilog,
+                                   formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def option(group: Any, shown: str, text: str | None = None,

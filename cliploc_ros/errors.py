@@ -47,6 +47,12 @@ def counted(number: int, what: str) -> str:
     return f'{number} {what}{plural if number != 1 else ""}'
 
 
+def first_line(error: Exception) -> str:
+    """Return the first line of an error in ASCII, without emojis and colours."""
+    lines = str(error).encode('ascii', 'ignore').decode().strip().splitlines()
+    return lines[0].strip() if lines else type(error).__name__
+
+
 def misspelt_classes(class_ids: Iterable[str], known: Iterable[str], all_known: bool = False
                      ) -> dict[str, str]:
     """Return the classes of a map that look misspelt, each with a hint of the right spelling.

@@ -80,14 +80,11 @@ def _rows(msg: ImageMessage, used: int) -> NDArray[np.uint8]:
 
 
 def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
-    check_size(*declared_size(bytes(msg.data), msg.format))
-    data = np.frombuffer(msg.data, dtype=np.uint8)
-    try:
-        # EXIF orientation is ignored: the intrinsics belong to the image as the sensor took it.
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise ImageError(f"compressed image ('{msg.format}') does not decode: {error.err}"
-                         ) from error
+    data = bytes(msg.data)
+    check_size(*declared_size(data, msg.format))
+    # EXIF orientation is ignored: the intrinsics belong to the image as the sensor took it.
+    image = _unpacked(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION,
+                      f"compressed image ('{msg.format}')")
     if image is None:
         raise ImageError(f"compressed image ('{msg.format}', {len(data)} bytes) does not decode")
     # 'rgb8; jpeg compressed bgr8': the last word is the encoding of the compressed pixels. With
@@ -95,6 +92,14 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
     _, _, packed = msg.format.partition('compressed')
     is_red_first = packed.strip().startswith('rgb')
     return np.ascontiguousarray(image if is_red_first else image[:, :, ::-1])
+
+
+def _unpacked(data: bytes, flags: int, what: str) -> NDArray[Any] | None:
+    """Decode a JPEG or PNG; ImageError: OpenCV raises, and the message names what it is."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise ImageError(f'{what} does not decode: {error.err}') from error
 
 
 def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
@@ -139,12 +144,9 @@ def _decode_depth_png(msg: CompressedImageMessage) -> NDArray[np.generic]:
                          'record the compressedDepth topic, as PNG')
     is_inverse = _depth_type(encoding) == np.float32
     data = bytes(msg.data)
-    check_size(*declared_size(data[_DEPTH_HEADER.size:], msg.format))
-    try:
-        values = cv2.imdecode(np.frombuffer(data, np.uint8, offset=_DEPTH_HEADER.size),
-                              cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise ImageError(f"depth image ('{msg.format}') does not decode: {error.err}") from error
+    png = data[_DEPTH_HEADER.size:]
+    check_size(*declared_size(png, msg.format))
+    values = _unpacked(png, cv2.IMREAD_UNCHANGED, f"depth image ('{msg.format}')")
     if values is None or values.dtype != np.uint16 or values.ndim != 2:
         raise ImageError(f"depth image ('{msg.format}', {len(data)} bytes) is not a 16-bit PNG "
                          'with one channel')
@@ -211,8 +213,7 @@ def camera_from_frame(msg: CameraInfoMessage) -> NDArray[np.float64]:
     return pose
 
 
-def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool
-                          ) -> list[Fault]:
+def faults_of_camera_info(msg: CameraInfoMessage, camera: Camera, rectified: bool) -> list[Fault]:
     """Return contradictory or implausible fields of a message, certain faults first.
 
     `camera` is the result of camera_from_msg for this message.

@@ -16,15 +16,16 @@ def small_disk(folder) -> list[str]:
     The command gets a separate mount namespace, which needs no privileges; the test is skipped if
     the system forbids that.
     """
-    return _tried([*_MOUNT, 'size=64k', str(folder)])
+    return allowed([*_MOUNT, 'size=64k', str(folder)])
 
 
 def read_only_disk(folder) -> list[str]:
     """Return the prefix of a command that runs it with an empty read-only disk on a folder."""
-    return _tried([*_MOUNT, 'ro', str(folder)])
+    return allowed([*_MOUNT, 'ro', str(folder)])
 
 
-def _tried(command: list[str]) -> list[str]:
+def allowed(command: list[str]) -> list[str]:
+    """Return the prefix of a command; skip the test if the system forbids its namespaces."""
     tried = subprocess.run([*command, 'true'], capture_output=True, text=True, check=False)
     if tried.returncode:
         pytest.skip(f'no namespaces here: {tried.stderr.strip()}')

@@ -40,11 +40,10 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='check_map', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Check a map: its landmarks, where a robot would be accepted, refused or '
-        'misled in it, places that look alike, and systematic errors. Writes check.html and '
-        'check.json. Without observations the report is shorter. Needs no sourced ROS.')
+    parser = command.program('check_map', EPILOG, 'Check a map: its landmarks, where a robot '
+                             'would be accepted, refused or misled in it, places that look alike, '
+                             'and systematic errors. Writes check.html and check.json. Without '
+                             'observations the report is shorter. Needs no sourced ROS.')
     option(parser, 'map MAP', 'a map file')
     option(parser, '--observations NPZ', 'boxes and poses of a recording of the place (default: '
            'those that the map was built from, as named by NAME.recording.json next to the map)')
@@ -93,7 +92,7 @@ def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
 
     landmark_map = LandmarkMap.from_file(options.map)
     recording = load_recording(options.map) if options.observations is None else None
-    detections, images = _read_recording(options, recording) or (None, None)
+    detections, images = _read_recording(options, recording)
     check_options = CheckOptions(
         relocalizer=RelocalizerOptions(min_confidence=options.min_confidence),
         folds=options.folds, frames=options.frames, spacing_m=options.grid,
@@ -104,9 +103,7 @@ def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
         random_seed=options.seed)
     thresholds = Thresholds(**{field.name: getattr(options, field.name)
                                for field in fields(Thresholds)})
-    image_of = None
-    if detections is not None and images is not None:
-        image_of = partial(images.of, detections)
+    image_of = None if detections is None or images is None else partial(images.of, detections)
     layer = read_layer(options.map, landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)
@@ -122,7 +119,7 @@ def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
 
 
 def _read_recording(options: argparse.Namespace, recording: 'MapRecording | None'
-                    ) -> 'tuple[PosedDetections, Images | None] | None':
+                    ) -> 'tuple[PosedDetections | None, Images | None]':
     """Return the recording of the command line or of the map, and its images if they are found."""
     from cliploc_ros.cli.sources import images_at
     from cliploc_ros.offline.datasets.images import images_of_recording
@@ -137,7 +134,7 @@ def _read_recording(options: argparse.Namespace, recording: 'MapRecording | None
     else:
         print('no recording of this map is known: the map is checked by simulation only; give '
               '--observations', flush=True)
-        return None
+        return None, None
     images = None
     try:
         if options.images is not None:

@@ -7,7 +7,8 @@ import os
 import sys
 from collections.abc import Sequence
 
-from cliploc_ros.command import needs_ros, option, positive, printable, run_main, running_ros
+from cliploc_ros import command
+from cliploc_ros.command import option
 from cliploc_ros.core.map.parameter_file import read_parameter_file
 from cliploc_ros.errors import OptionsError
 
@@ -34,22 +35,22 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Check a robot; return the exit code."""
-    return run_main(make_parser(), run, args)
+    return command.run_main(make_parser(), run, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='doctor', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        usage='doctor [options] [--ros-args ...]',
-        description='Check parameters, map, cameras, clocks, tf, odometry, localizer, the input '
-        'of a request and its answer. Each failure comes with its remedy.')
+    parser = command.program('doctor', EPILOG, 'Check parameters, map, cameras, clocks, tf, '
+                             'odometry, localizer, the input of a request and its answer. Each '
+                             'failure comes with its remedy.',
+                             usage='doctor [options] [--ros-args ...]')
     option(parser, '--relocalizer NAME', 'its name, absolute or in the namespace of this node '
            '(%(default)s)', default='relocalizer')
     option(parser, '--params-file FILE', 'check with these parameters; repeat it as on the '
            'command line of the node (default: ask the running relocalizer)', default=[],
            action='append')
-    option(parser, '--timeout S', 'wait S seconds for an input (%(default)g)', positive, 10.0)
+    option(parser, '--timeout S', 'wait S seconds for an input (%(default)g)',
+           command.positive, 10.0)
     option(parser, '--prepare', 'make a robot ready, so that its nodes need no network to start')
     option(parser, '--image FILE', "--prepare: picture of the robot's camera for the requests "
            '(default: a drawn one)')
@@ -64,12 +65,12 @@ def run(options: argparse.Namespace) -> int:
     arguments = options.ros_args
     if options.prepare:
         arguments = prepared_arguments(options)
-    with needs_ros('doctor'):
+    with command.needs_ros('doctor'):
         from cliploc_ros.nodes.doctor import Report, State, doctor, make_ready
 
     report = Report(lambda what, state, text: print(
-        f'{what:<12} {state:<12} {printable(text)}', flush=True))
-    with running_ros(arguments):
+        f'{what:<12} {state:<12} {command.printable(text)}', flush=True))
+    with command.running_ros(arguments):
         if options.prepare:
             for line in make_ready(options.image, options.cache_dir, not options.without_detector,
                                    report):

@@ -12,8 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cliploc_ros import command
 from cliploc_ros.cli import options as shared
-from cliploc_ros.command import SEEDS, limit, not_negative, option, positive_int, run_main, within
+from cliploc_ros.command import limit, not_negative, option, positive_int, within
 from cliploc_ros.core.options import COMPARED, CROPS, RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.evaluation.methods import ALL, AUTO, PAPER_METHODS
@@ -45,16 +46,15 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run ``evaluate``; return the exit code."""
-    return run_main(make_parser(), evaluate, args)
+    return command.run_main(make_parser(), evaluate, args)
 
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='evaluate', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Compare methods on the same input. Writes the paper's table as a page, text, "
-        'LaTeX and CSV, results.json, run.json with input and options, figures and trajectories. '
-        'Runs without ROS.')
+    parser = command.program('evaluate', EPILOG, 'Compare methods on the same input. Writes the '
+                             "paper's table as a page, text, LaTeX and CSV, results.json, "
+                             'run.json with input and options, figures and trajectories. Runs '
+                             'without ROS.')
     sources = parser.add_mutually_exclusive_group(required=True)
     option(sources, '--queries NPZ', 'recorded boxes and similarities; options of networks and '
            'recordings have no effect on it and are refused')
@@ -69,7 +69,7 @@ def make_parser() -> argparse.ArgumentParser:
            'the camera (z forward) in the map, in TUM format; each query gets the pose that is '
            'nearest in time, within 10 ms', default=[], nargs='+', action='extend')
     option(parser, '--trials', "number of trials (%(default)s, the paper's)", positive_int, 5)
-    option(parser, '--seed', 'seed of the first trial (%(default)s)', within(*SEEDS), 0)
+    option(parser, '--seed', 'seed of the first trial (%(default)s)', within(*command.SEEDS), 0)
     option(parser, '--frames', "frames of a query file; 'all': neighbours of queries, too",
            default='main', choices=('main', 'all'))
     option(parser, '--crops', f"crops that '{AUTO}' compares with labels (%(default)s)",
@@ -210,8 +210,7 @@ def _with_sensors(options: argparse.Namespace, queries: 'Sequence[PosedQuery]'
         if options.fuse:
             found = trials.with_neighbours(found, [query.group for query in found], noise_m,
                                            noise_deg, seed)
-        draws.append(tuple(query for query in found
-                           if options.frames == 'all' or query.is_main))
+        draws.append(tuple(query for query in found if options.frames == 'all' or query.is_main))
     return draws
 
 
@@ -312,9 +311,8 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     wanted = options.keyframes
     if wanted is None and not case.report.get('parameters', {}).get('keyframes_file', True):
         wanted = False
-    layer = None
-    if len(options.map) == 1:
-        layer = shared.read_layer(options.map[0], landmark_map, wanted)
+    layer = None if len(options.map) > 1 else shared.read_layer(
+        options.map[0], landmark_map, wanted)
     again = repeat(case, Localizer(Relocalizer(landmark_map, case.options),
                                    None if layer is None else KeyframeLocalizer(layer)), observer)
     is_same = again.accepted == (case.report.get('found') == 'accepted')

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from cliploc_ros.cli.options import add_weights_options
-from cliploc_ros.command import option, run_main
+from cliploc_ros.command import option, program, run_main
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.storage import MAKE_ROOM, make_folder, unfinished
 
@@ -33,10 +33,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='export_network', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Write a detector of ultralytics or a CLIP of open_clip as ONNX, and compare '
-        'the results of both.')
+    parser = program('export_network', EPILOG, 'Write a detector of ultralytics or a CLIP of '
+                     'open_clip as ONNX, and compare the results of both.')
     add_weights_options(parser)
     option(parser, '--half', 'store weights in half precision: half the size; the network still '
            'runs in fp32')

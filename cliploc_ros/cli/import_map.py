@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cliploc_ros.command import check_output, finite, option, positive, printable, run_main
+from cliploc_ros import command
+from cliploc_ros.command import option
 from cliploc_ros.errors import DatasetError, OptionsError
 
 if TYPE_CHECKING:
@@ -32,15 +33,13 @@ examples:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Import a map; return the exit code."""
-    return run_main(make_parser(), import_map, args)
+    return command.run_main(make_parser(), import_map, args)
 
 
 def make_parser(formats: Sequence[str] = ('csv',)) -> argparse.ArgumentParser:
     """Return the parser of the command line, with the formats of the input."""
-    parser = argparse.ArgumentParser(
-        prog='import_map', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Import a map from a table. An existing map is replaced only when the new one '
-        'is complete. Needs no sourced ROS.')
+    parser = command.program('import_map', EPILOG, 'Import a map from a table. An existing map is '
+                             'replaced only when the new one is complete. Needs no sourced ROS.')
     option(parser, 'input IN', 'the file to import')
     option(parser, '--from', 'its format (%(default)s)', dest='format', choices=formats,
            default=formats[0])
@@ -49,11 +48,11 @@ def make_parser(formats: Sequence[str] = ('csv',)) -> argparse.ArgumentParser:
     place = parser.add_argument_group('coordinate frame and errors of the map')
     option(place, '--frame-id', 'coordinate frame of the map (%(default)s)', default='map')
     option(place, '--scale METRES', 'length of a unit of the file in metres (%(default)s)',
-           positive, 1.0)
+           command.positive, 1.0)
     option(place, '--transform V', "x y z [m] qx qy qz qw of the file's coordinate frame in the "
-           "map's", finite, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), nargs=7)
+           "map's", command.finite, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), nargs=7)
     option(place, '--errors METRES DEGREES', 'errors of the landmarks on each axis, both '
-           'independent and shared, if the file has no position_sigma (0.05 1)', positive,
+           'independent and shared, if the file has no position_sigma (0.05 1)', command.positive,
            _ERRORS)
     refit = parser.add_argument_group('fit to a recording')
     option(refit, '--refit NPZ', 'fit each landmark to the boxes of these observations')
@@ -76,7 +75,7 @@ def import_map(options: argparse.Namespace,
     begin = time.monotonic()
     for name, path in (('out', options.out), ('report', options.report)):
         if path is not None:
-            check_output(path)
+            command.check_output(path)
             if any(other is not None and path.exists() and other.exists() and path.samefile(other)
                    for other in (options.input, options.refit)):
                 raise OptionsError(f'--{name} {path} is an input; name another file')
@@ -115,7 +114,7 @@ def import_map(options: argparse.Namespace,
         f'  {skipped.landmark_id}: {skipped.reason}' for skipped in left_out[:_LEFT_OUT_SHOWN])]
     if len(left_out) > _LEFT_OUT_SHOWN:
         lines.append(f'  and {len(left_out) - _LEFT_OUT_SHOWN} more: see --report')
-    print('\n'.join(map(printable, lines)))
+    print('\n'.join(map(command.printable, lines)))
     print(f'wrote {options.out} with {len(landmark_map)} landmarks in '
           f'{time.monotonic() - begin:.1f} s')
     return 0

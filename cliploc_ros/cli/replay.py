@@ -38,11 +38,10 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='replay', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        usage='replay BAG [options] [--ros-args ...]',
-        description='Publish the messages of a rosbag2 recording (sqlite3 or mcap, also those of '
-        '`ros2 bag record`) with their recorded bytes, types and QoS.')
+    parser = command.program('replay', EPILOG, 'Publish the messages of a rosbag2 recording '
+                             '(sqlite3 or mcap, also those of `ros2 bag record`) with their '
+                             'recorded bytes, types and QoS.',
+                             usage='replay BAG [options] [--ros-args ...]')
     option(parser, 'bag BAG', 'folder, or a .mcap or .db3 file', Path)
     option(parser, '-r --rate X', 'speed: 2 is twice as fast as recorded (default: 1)',
            command.positive, 1.0)

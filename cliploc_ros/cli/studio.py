@@ -10,15 +10,14 @@ import webbrowser
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cliploc_ros.cli.options import add_topic_options, read_layer
-from cliploc_ros.command import needs_ros, option, run_main, within
+from cliploc_ros.command import needs_ros, option, program, run_main, within
 from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-    from cliploc_ros.offline.studio.live import LiveRelocalizer
     from cliploc_ros.offline.studio.studio import Studio
 
 _LOOPBACK = '127.0.0.1'
@@ -41,10 +40,8 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='studio', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Create and correct a map in the browser. Needs no sourced ROS, except for '
-        '--ros.')
+    parser = program('studio', EPILOG, 'Create and correct a map in the browser. Needs no sourced '
+                     'ROS, except for --ros.')
     option(parser, 'map MAP', 'a map file; a new one starts empty (map.yaml, or the first unused '
            'name of map-2.yaml, map-3.yaml, ...)', nargs='?')
     option(parser, '--observations NPZ', 'boxes and poses of a recording of the place')
@@ -74,7 +71,12 @@ def serve(options: argparse.Namespace) -> int:
 
     studio = open_studio(options)
     try:
-        with (follow(options) as live,
+        relocalizer: AbstractContextManager[Any] = nullcontext()
+        if options.ros:
+            with needs_ros('--ros'):
+                from cliploc_ros.offline.studio.live import follow_relocalizer
+            relocalizer = follow_relocalizer(options.relocalizer, options.ros_args)
+        with (relocalizer as live,
               serve_studio(studio, options.host, options.port, live) as (url, _)):
             print(f'{studio.document.path}: {len(studio.document.landmarks)} landmarks, '
                   f'{studio.views} views')
@@ -92,15 +94,6 @@ def serve(options: argparse.Namespace) -> int:
     finally:
         studio.document.close()
     return 0
-
-
-def follow(options: argparse.Namespace) -> 'AbstractContextManager[LiveRelocalizer | None]':
-    """Return the running relocalizer if --ros is given; OptionsError: ROS is missing."""
-    if not options.ros:
-        return nullcontext()
-    with needs_ros('--ros'):
-        from cliploc_ros.offline.studio.live import follow_relocalizer
-    return follow_relocalizer(options.relocalizer, options.ros_args)
 
 
 def open_studio(options: argparse.Namespace) -> 'Studio':

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from cliploc_ros.command import option, positive_int, run_main
+from cliploc_ros.command import option, positive_int, program, run_main
 from cliploc_ros.offline.datasets.bags import STORAGES
 
 EPILOG = """\
@@ -32,11 +32,10 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='tum_to_bag', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Convert a TUM RGB-D folder (rgb.txt, rgb/, groundtruth.txt), 7-Scenes or '
-        'another folder of build_map --folder into a rosbag2 recording with the topics of the '
-        'nodes, without depth. Needs no sourced ROS.')
+    parser = program('tum_to_bag', EPILOG, 'Convert a TUM RGB-D folder (rgb.txt, rgb/, '
+                     'groundtruth.txt), 7-Scenes or another folder of build_map --folder into a '
+                     'rosbag2 recording with the topics of the nodes, without depth. Needs no '
+                     'sourced ROS.')
     option(parser, 'folder', 'the folder', Path)
     option(parser, 'output', 'folder of the recording; must not exist', Path)
     option(parser, '--every N', 'take only every N-th image (default: 1)', positive_int, 1)

@@ -32,11 +32,10 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
-        prog='wake_up', epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
-        usage='wake_up [options] [--ros-args ...]',
-        description='Wait for an active relocalizer, its camera and a localizer; then request '
-        "the pose until one is accepted, turning with Nav2's action spin between requests.")
+    parser = command.program('wake_up', EPILOG, 'Wait for an active relocalizer, its camera and a '
+                             'localizer; then request the pose until one is accepted, turning '
+                             "with Nav2's action spin between requests.",
+                             usage='wake_up [options] [--ros-args ...]')
     option(parser, '--relocalizer NAME', 'its name, in the namespace of this node or absolute '
            '(%(default)s)', default='relocalizer')
     option(parser, '--timeout S', 'start no more turns after S seconds, not counting those in '

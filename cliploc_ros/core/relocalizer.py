@@ -130,8 +130,7 @@ class Relocalization:
         return self.hypotheses[0].score if self.hypotheses else 0.0
 
 
-def in_its_map(found: Relocalization, landmark_map: LandmarkMap
-               ) -> tuple[Relocalization, MapPart]:
+def in_its_map(found: Relocalization, landmark_map: LandmarkMap) -> tuple[Relocalization, MapPart]:
     """Transform a result to the coordinate frame of the map of its best pose; return this map too.
 
     The result was found in landmark_map, which may be a JoinedMap. Poses on other maps are

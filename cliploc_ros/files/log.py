@@ -134,5 +134,4 @@ class Log:
         self._file.close()
 
     def _unwritable(self, problem: OSError) -> CliplocError:
-        return self._error(
-            f'{self.path}: cannot be written: {problem.strerror}; {self._advice}')
+        return self._error(f'{self.path}: cannot be written: {problem.strerror}; {self._advice}')

@@ -356,8 +356,7 @@ def check_owners(folder: Path) -> None:
     """
     trusted, is_ours = {os.getuid(), 0, Path(__file__).stat().st_uid}, True
     with suppress(OSError):  # reported by the first write
-        is_ours = not any(is_foreign(path.stat(), trusted)
-                          for path in (folder, *folder.iterdir()))
+        is_ours = not any(is_foreign(path.stat(), trusted) for path in (folder, *folder.iterdir()))
     if not is_ours:
         raise PermissionError(errno.EACCES, 'other users own its folder or can write to it')
 

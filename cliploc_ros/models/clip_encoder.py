@@ -13,6 +13,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Sequence
+from itertools import batched
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +33,8 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.arrays import Check, Field, Schema
-from cliploc_ros.files.storage import (
-    MAKE_ROOM,
-    check_owners,
-    replace_file,
-    resolve_cache_dir,
-    warn_not_kept,
-)
-from cliploc_ros.models.files import remove_unused
+from cliploc_ros.files.storage import MAKE_ROOM, check_owners, resolve_cache_dir, warn_not_kept
+from cliploc_ros.models.files import new_entry
 from cliploc_ros.models.observer import crop_bounds
 from cliploc_ros.models.onnx_clip import (
     ClipWeights,
@@ -135,8 +130,7 @@ def _images(weights: ClipWeights, landmark_map: LandmarkMap, map_file: str
             ) -> LandmarkEmbeddings | None:
     """Return the image embeddings of a map by this encoder; None if there are none."""
     try:
-        images = load_embeddings_of_map(map_file, landmark_map.landmark_ids,
-                                        landmark_map.map_set)
+        images = load_embeddings_of_map(map_file, landmark_map.landmark_ids, landmark_map.map_set)
     except MapError as error:
         logger.warning('only labels are compared: %s', error)
         return None
@@ -188,13 +182,10 @@ class ClipEncoder:
         not finite.
         """
         bounds = crop_bounds(bboxes_xyxy, image_rgb.shape[1], image_rgb.shape[0])
-        features = []
-        for start in range(0, len(bounds), _BATCH):
-            features.append(self._tower(np.stack([
-                self._tower.prepare(image_rgb[top:bottom, left:right])
-                for left, top, right, bottom in
-                bounds[start:start + _BATCH].tolist()])))
-        return _unit_rows(features, self._weights)
+        prepared = (self._tower.prepare(image_rgb[top:bottom, left:right])
+                    for left, top, right, bottom in bounds.tolist())
+        return _unit_rows([self._tower(np.stack(batch)) for batch in batched(prepared, _BATCH)],
+                          self._weights)
 
 
 def encode_labels(weights: ClipWeights, labels: Sequence[str], options: ClipOptions
@@ -268,10 +259,7 @@ class LabelCache:
         """Write the embeddings of labels; a failure causes only a warning."""
         file = self._file(key, labels)
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            check_owners(self._folder)
-            remove_unused(self._folder, self._most_files - 1)
-            with replace_file(file) as partial:
+            with new_entry(file, self._most_files) as partial:
                 np.savez(partial, embeddings=embeddings,
                          identity=np.frombuffer(_identity(key, labels), dtype=np.uint8))
         except OSError as error:

@@ -18,19 +18,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.errors import ModelError, did_you_mean
+from cliploc_ros.errors import ModelError, did_you_mean, first_line
 from cliploc_ros.files.storage import resolve_cache_dir
-from cliploc_ros.models.exports import (
-    CHECKPOINT,
-    CONFIG,
-    IMAGE_TOWERS,
-    PREPROCESS,
-    TEXT_TOWERS,
-    TOKENIZER,
-    ExportError,
-    describe_export,
-)
-from cliploc_ros.models.files import check_weights_file, download, fingerprint_file, first_line
+from cliploc_ros.models import exports
+from cliploc_ros.models.files import check_weights_file, download, fingerprint_file
 from cliploc_ros.models.onnx_network import CompiledNetwork, import_openvino, read_config
 from cliploc_ros.models.protocols import ClipOptions
 
@@ -70,8 +61,8 @@ def export_clip(options: ClipOptions, folder: Path, half: bool = False) -> None:
     sides = (size, size) if isinstance(size, int) else tuple(size)
     images = torch.from_numpy(np.random.default_rng(0).standard_normal(
         (3, 3, *sides)).astype(np.float32))
-    for towers, name, example in ((IMAGE_TOWERS, 'visual', images),
-                                  (TEXT_TOWERS, 'text', tokenizer(_TEXTS))):
+    for towers, name, example in ((exports.IMAGE_TOWERS, 'visual', images),
+                                  (exports.TEXT_TOWERS, 'text', tokenizer(_TEXTS))):
         file = folder / towers[-1]
         file.parent.mkdir(parents=True)
         tower = getattr(model, name)
@@ -85,14 +76,15 @@ def export_clip(options: ClipOptions, folder: Path, half: bool = False) -> None:
         compare(file, example.numpy(), expected, half)
         delattr(model, name)  # frees its memory
         del tower
-    (folder / PREPROCESS).write_text(json.dumps(crops))
-    (folder / 'textual' / TOKENIZER).write_text(_tokenizer_of(tokenizer))
+    (folder / exports.PREPROCESS).write_text(json.dumps(crops))
+    (folder / 'textual' / exports.TOKENIZER).write_text(_tokenizer_of(tokenizer))
     config = open_clip.get_model_config(weights.model)
-    (folder / CONFIG).write_text(json.dumps({
+    (folder / exports.CONFIG).write_text(json.dumps({
         'embed_dim': config['embed_dim'], 'text_cfg': {
             'context_length': tokenizer.context_length, 'vocab_size': tokenizer.vocab_size}}))
-    describe_export(folder, f'{weights.model}:{"quick_gelu" if weights.quick_gelu else "gelu"}:'
-                    f'{fingerprint_file(weights.file)}')
+    activation = 'quick_gelu' if weights.quick_gelu else 'gelu'
+    exports.describe_export(
+        folder, f'{weights.model}:{activation}:{fingerprint_file(weights.file)}')
 
 
 # ---- finding and loading the weights ------------------------------------------------------------
@@ -137,8 +129,9 @@ def _find(options: ClipOptions) -> _Weights:
         own, where = resolve_cache_dir(options.cache_dir) / 'weights', tag.get('hf_hub', '')
         address = f'https://huggingface.co/{where}' if where else tag.get('url')
         file = download(f"the weights '{name}' of CLIP model '{model}'", own, (
-            f'Without a network: download {address} on another machine and set {CHECKPOINT}'
-            ), partial(open_clip.download_pretrained, tag, cache_dir=str(own)))
+            f'Without a network: download {address} on another machine and set '
+            f'{exports.CHECKPOINT}'),
+            partial(open_clip.download_pretrained, tag, cache_dir=str(own)))
     check_weights_file(file)
     quick_gelu = bool(config.get('quick_gelu') or tag.get('quick_gelu') or _is_torchscript(file))
     return _Weights(model, file, quick_gelu, {
@@ -265,7 +258,7 @@ def _tokenizer_of(tokenizer: Any) -> str:
     for text, row in zip(_TEXTS, tokenizer(_TEXTS).tolist(), strict=True):
         ids = found.encode(text).ids
         if row != ids + [0] * (len(row) - len(ids)):
-            raise ExportError('its tokenizer is not that of CLIP')
+            raise exports.ExportError('its tokenizer is not that of CLIP')
     return str(found.to_str())
 
 
@@ -313,11 +306,12 @@ def compare(file: Path, probe: NDArray[Any], expected: 'torch.Tensor', half: boo
     try:
         found = CompiledNetwork.of(import_openvino().Core().read_model(file))(probe)[0]
     except Exception as error:  # OpenVINO has no exception classes
-        raise ExportError(f'OpenVINO cannot run its export: {error}') from error
+        raise exports.ExportError(f'OpenVINO cannot run its export: {error}') from error
     if found.shape != wanted.shape:
-        raise ExportError(f'its export gives the shape {found.shape}, PyTorch {wanted.shape}')
+        raise exports.ExportError(
+            f'its export gives the shape {found.shape}, PyTorch {wanted.shape}')
     rows = len(wanted)
     off = float(np.max(np.linalg.norm((found - wanted).reshape(rows, -1), axis=1)
                        / np.linalg.norm(wanted.reshape(rows, -1), axis=1)))
     if not off <= _TOLERANCE * (10 if half else 1):  # also for NaN
-        raise ExportError(f'its export has a relative error of {off:.2g}')
+        raise exports.ExportError(f'its export has a relative error of {off:.2g}')

@@ -14,15 +14,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from cliploc_ros.errors import CliplocError, ModelError
-from cliploc_ros.files.storage import (
-    MAKE_ROOM,
-    parse_json,
-    read_file,
-    resolve_cache_dir,
-    unfinished,
-)
-from cliploc_ros.models.files import digest_file, fingerprint_file, first_line, remove_unused
+from cliploc_ros.errors import CliplocError, ModelError, first_line
+from cliploc_ros.files import storage
+from cliploc_ros.models.files import digest_file, fingerprint_file, remove_unused
 from cliploc_ros.models.onnx_network import free_memory
 
 # Version of these folders and of the export; a change makes new folders.
@@ -78,7 +72,7 @@ def export_key(folder: Path, cache_dir: str) -> str:
     """
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError,
                              RecursionError, ModelError):
-        about: dict[str, Any] = parse_json(read_file(folder / _ABOUT))
+        about: dict[str, Any] = storage.parse_json(storage.read_file(folder / _ABOUT))
         changed = [name for name, digest in about['files'].items()
                    if digest != digest_file(folder / name, cache_dir)
                    and digest != fingerprint_file(folder / name)]
@@ -100,7 +94,7 @@ def exported(cache_dir: str, kind: str, name: str, identity: Sequence[str],
     ModelError, ExportError: see run_export, or the folder cannot be written.
     """
     digest = hashlib.sha256(json.dumps([_FORMAT, *identity]).encode()).hexdigest()
-    cache = resolve_cache_dir(cache_dir) / 'onnx'
+    cache = storage.resolve_cache_dir(cache_dir) / 'onnx'
     folder, started = cache / f'{kind}-{digest[:32]}', time.monotonic()
     if export_key(folder, cache_dir):
         with contextlib.suppress(OSError):  # a read-only cache works too
@@ -117,7 +111,7 @@ def exported(cache_dir: str, kind: str, name: str, identity: Sequence[str],
         try:
             cache.mkdir(parents=True, exist_ok=True)
             remove_unused(cache, _MOST_EXPORTS - 1)
-            with unfinished(folder, Path.mkdir) as beside:
+            with storage.unfinished(folder, Path.mkdir) as beside:
                 whole = Path(shutil.copytree(written, beside / folder.name))
                 if folder.exists():  # damaged, or from another process
                     folder.rename(beside / 'old')
@@ -125,7 +119,7 @@ def exported(cache_dir: str, kind: str, name: str, identity: Sequence[str],
         except OSError as error:
             reason = error.strerror or 'is the disk full?'  # copytree joins many errors
             raise ModelError(f'the export of {name} cannot be written to {folder}: {reason}; '
-                             f'{MAKE_ROOM} (cache_dir)') from error
+                             f'{storage.MAKE_ROOM} (cache_dir)') from error
     free_memory()
     logger.info('exported %s in %.0f s', name, time.monotonic() - started)
     return folder

@@ -17,15 +17,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
-from cliploc_ros.errors import ModelError
-from cliploc_ros.files.storage import (
-    check_owners,
-    open_file,
-    parse_json,
-    read_file,
-    replace_file,
-    resolve_cache_dir,
-)
+from cliploc_ros.errors import ModelError, first_line
+from cliploc_ros.files import storage
 
 _BLOCK_BYTES = 64 * 1024
 _BLOCK_COUNT = 66
@@ -97,21 +90,18 @@ def _content(path: Path, cache_dir: str | None) -> tuple[str, list[str]]:
     if cache_dir is None or status.st_size < _LARGE:
         return _read(path, *state)
     name = hashlib.sha256(json.dumps([str(path.absolute()), *state]).encode()).hexdigest()
-    kept = resolve_cache_dir(cache_dir) / 'digests' / f'{path.stem}-{name[:32]}.json'
+    kept = storage.resolve_cache_dir(cache_dir) / 'digests' / f'{path.stem}-{name[:32]}.json'
     with suppress(OSError, ValueError):
-        check_owners(kept.parent)
-        check, _, text = read_file(kept).decode().partition(' ')
+        storage.check_owners(kept.parent)
+        check, _, text = storage.read_file(kept).decode().partition(' ')
         if hashlib.sha256(text.encode()).hexdigest() == check:
-            digest, names = parse_json(text)
+            digest, names = storage.parse_json(text)
             return digest, names
     found = _read(path, *state)
     text = json.dumps(found)
     with suppress(OSError):  # a read-only cache works too
         if time.time_ns() - status.st_ctime_ns > _SETTLED_NS:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            check_owners(kept.parent)
-            remove_unused(kept.parent, _MOST_DIGESTS - 1)
-            with replace_file(kept) as partial:
+            with new_entry(kept, _MOST_DIGESTS) as partial:
                 partial.write_text(f'{hashlib.sha256(text.encode()).hexdigest()} {text}')
     return found
 
@@ -140,7 +130,7 @@ def _blob(path: Path) -> str:
 @contextmanager
 def _opened(path: Path) -> Iterator[BinaryIO]:
     try:
-        with open_file(path) as file:
+        with storage.open_file(path) as file:
             yield file
     except OSError as error:
         raise ModelError(f'{path} cannot be read: {error.strerror}; check the path of the weights'
@@ -187,6 +177,20 @@ def download(what: str, folder: Path, remedy: str, fetch: Callable[[], str | Pat
         raise ModelError(f'cannot download {what}: {reason}. {remedy}') from error
 
 
+@contextmanager
+def new_entry(file: Path, most: int) -> Iterator[Path]:
+    """Yield the path of a temporary file that becomes an entry of a cache, see replace_file.
+
+    The folder is made if it does not exist. Beyond ``most`` entries, the least recently used ones
+    are removed. Raises OSError if the folder belongs to another user, is read-only or full.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    storage.check_owners(file.parent)
+    remove_unused(file.parent, most - 1)
+    with storage.replace_file(file) as partial:
+        yield partial
+
+
 def remove_unused(folder: Path, most: int) -> None:
     """Remove the least recently used entries of a cache.
 
@@ -206,12 +210,6 @@ def remove_unused(folder: Path, most: int) -> None:
             shutil.rmtree(entry, ignore_errors=True)
         else:
             entry.unlink(missing_ok=True)
-
-
-def first_line(error: Exception) -> str:
-    """Return the first line of an error in ASCII, without emojis and colours."""
-    lines = str(error).encode('ascii', 'ignore').decode().strip().splitlines()
-    return lines[0].strip() if lines else type(error).__name__
 
 
 def is_hub_name(name: str) -> bool:
@@ -252,7 +250,7 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
         raise ModelError(f'{folder} does not exist: check the path of the network')
     repository, revision, file = match.groups()
     wanted = [[file], *networks[1:]] if file else list(networks)
-    own = resolve_cache_dir(cache_dir) / 'weights'
+    own = storage.resolve_cache_dir(cache_dir) / 'weights'
     request = json.dumps([repository, revision, [*map(list, wanted)], list(beside)])
     digest = hashlib.sha256(request.encode()).hexdigest()
     marker = own / f'{repository.replace("/", "--")}-{digest[:16]}.json'
@@ -269,7 +267,7 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
         return chosen
 
     try:
-        place = Path(str(json.loads(read_file(marker))))
+        place = Path(str(json.loads(storage.read_file(marker))))
         if place.is_absolute() or '..' in place.parts:
             raise ValueError('not a folder of this cache')
         found = own / place
@@ -304,7 +302,7 @@ def resolve_folder(name: str, networks: Sequence[Sequence[str]], beside: Sequenc
             snapshot = Path(str(path)[:-len(part)])
             chosen += [file for file in files if file not in chosen
                        and snapshot / file in weights_beside(path)]
-        with replace_file(marker) as partial:
+        with storage.replace_file(marker) as partial:
             partial.write_text(json.dumps(str(snapshot.resolve().relative_to(own.resolve()))))
         return snapshot
 
@@ -329,7 +327,7 @@ def _check_content(file: Path, stated: str, cache_dir: str | None) -> None:
     """Compare a file with its digest on the hub; ValueError: it differs, and was removed."""
     if not stated:
         return
-    content = b'' if len(stated) == 64 else read_file(file)
+    content = b'' if len(stated) == 64 else storage.read_file(file)
     if stated != (digest_file(file, cache_dir) if len(stated) == 64 else hashlib.sha1(
             b'blob %d\0' % len(content) + content, usedforsecurity=False).hexdigest()):
         file.resolve().unlink()

@@ -35,8 +35,7 @@ _SLOWER = 1.3
 _MOST_CROPS = 64
 
 
-def crop_bounds(bboxes_xyxy: NDArray[np.float64], width: int, height: int
-                ) -> NDArray[np.int64]:
+def crop_bounds(bboxes_xyxy: NDArray[np.float64], width: int, height: int) -> NDArray[np.int64]:
     """Return the pixels (n, 4) that boxes touch: left, top, and right, bottom (exclusive).
 
     The bounds are clipped to the image. Each crop has at least one pixel. CliplocError: a box
@@ -136,8 +135,7 @@ class Observer:
                ) -> NDArray[np.float32]:
         """Encode and store the embeddings (n, d) of at least one crop."""
         embeddings = self._encode(image_rgb, bboxes_xyxy)
-        self._known.extend(map(_Known, bboxes_xyxy, _pictures(image_rgb, bboxes_xyxy),
-                               embeddings))
+        self._known.extend(map(_Known, bboxes_xyxy, _pictures(image_rgb, bboxes_xyxy), embeddings))
         return embeddings
 
     def _encode(self, image_rgb: NDArray[np.uint8], bboxes_xyxy: NDArray[np.float64]

@@ -20,29 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from cliploc_ros.errors import ModelError
+from cliploc_ros.errors import ModelError, first_line
 from cliploc_ros.files.storage import parse_json, read_file
-from cliploc_ros.models.exports import (
-    BESIDE,
-    CONFIG,
-    IMAGE_TOWERS,
-    PREPROCESS,
-    PREPROCESSOR,
-    TEXT_TOWERS,
-    TOKENIZER,
-    WITHOUT_CLIP,
-    export_key,
-    exported,
-)
-from cliploc_ros.models.files import (
-    digest_file,
-    digest_network,
-    find_network,
-    fingerprint_file,
-    first_line,
-    is_hub_name,
-    resolve_folder,
-)
+from cliploc_ros.models import exports, files
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, colours, numbers, one_of, read_config
 from cliploc_ros.models.protocols import ClipOptions
 
@@ -81,33 +61,34 @@ def resolve_clip_weights(options: ClipOptions) -> ClipWeights:
     """
     named = options.checkpoint_path or options.pretrained
     if names_onnx(options):
-        name, folder = named, resolve_folder(named, [IMAGE_TOWERS, TEXT_TOWERS], BESIDE,
-                                             options.cache_dir, 'clip_pretrained')
+        name, folder = named, files.resolve_folder(
+            named, [exports.IMAGE_TOWERS, exports.TEXT_TOWERS], exports.BESIDE,
+            options.cache_dir, 'clip_pretrained')
     else:
         given, config = Path(named).expanduser().absolute(), ''
         name = options.model.replace('/', '-')  # OpenAI's spelling is ViT-L/14
         if name.endswith('.json') and (file := Path(options.model).expanduser()).is_file():
-            name, config = file.stem, digest_file(file)
+            name, config = file.stem, files.digest_file(file)
         tag = options.pretrained if options.checkpoint_path or not given.is_file() else ''
 
         from cliploc_ros.models.export import export_clip
-        folder = exported(options.cache_dir, name, f'CLIP {name}', (
+        folder = exports.exported(options.cache_dir, name, f'CLIP {name}', (
             'CLIP', name, config, tag,
-            digest_file(given, options.cache_dir) if given.is_file() else ''),
-            partial(export_clip, options), WITHOUT_CLIP)
-    image_tower = find_network(folder, named, IMAGE_TOWERS)
-    text_tower = find_network(folder, '', TEXT_TOWERS)
-    about = read_config(folder / CONFIG, 'it has the length of an embedding')
+            files.digest_file(given, options.cache_dir) if given.is_file() else ''),
+            partial(export_clip, options), exports.WITHOUT_CLIP)
+    image_tower = files.find_network(folder, named, exports.IMAGE_TOWERS)
+    text_tower = files.find_network(folder, '', exports.TEXT_TOWERS)
+    about = read_config(folder / exports.CONFIG, 'it has the length of an embedding')
     vision = about.get('vision_config')
     embed_dim = (about.get('projection_dim') or about.get('embed_dim')
                  or (vision.get('hidden_size') if isinstance(vision, dict) else None))
     if type(embed_dim) is not int or not 0 < embed_dim < 2**16:  # a boolean is an int, too
-        raise ModelError(f"{folder / CONFIG} has the length of an embedding neither in "
+        raise ModelError(f"{folder / exports.CONFIG} has the length of an embedding neither in "
                          "'projection_dim' nor in 'embed_dim': add it")
-    key = export_key(folder, options.cache_dir) or (
-        f'onnx:{fingerprint_file(image_tower)}:{fingerprint_file(text_tower)}')
+    key = exports.export_key(folder, options.cache_dir) or (
+        f'onnx:{files.fingerprint_file(image_tower)}:{files.fingerprint_file(text_tower)}')
     return ClipWeights(name, folder, image_tower, text_tower, embed_dim, key,
-                       f'{key}:{digest_network(text_tower, options.cache_dir)}')
+                       f'{key}:{files.digest_network(text_tower, options.cache_dir)}')
 
 
 def names_onnx(options: ClipOptions) -> bool:
@@ -117,8 +98,8 @@ def names_onnx(options: ClipOptions) -> bool:
     """
     named = options.checkpoint_path or options.pretrained
     folder = Path(named).expanduser()
-    return bool(named) and (is_hub_name(named) or (folder.is_dir() and (
-        os.sep in named or any((folder / file).exists() for file in IMAGE_TOWERS))))
+    return bool(named) and (files.is_hub_name(named) or (folder.is_dir() and (
+        os.sep in named or any((folder / file).exists() for file in exports.IMAGE_TOWERS))))
 
 
 class OnnxTower:
@@ -154,8 +135,8 @@ class CropPreparation:
     """
 
     def __init__(self, folder: Path, fixed: Sequence[int]) -> None:
-        is_open_clip = (folder / PREPROCESS).exists()
-        file = folder / (PREPROCESS if is_open_clip else PREPROCESSOR)
+        is_open_clip = (folder / exports.PREPROCESS).exists()
+        file = folder / (exports.PREPROCESS if is_open_clip else exports.PREPROCESSOR)
         about = read_config(file, 'it defines the preparation of images')
         size = about.get('size')
         if is_open_clip:
@@ -281,7 +262,8 @@ def _embedding(network: OnnxNetwork, outputs: dict[str, NDArray[np.float32]],
     if len(names) != 1 or outputs[names[0]].shape[1] != weights.embed_dim:
         shapes = {name: output.shape for name, output in outputs.items()}
         raise ModelError(f'{network.file} has the outputs {shapes}, expected one output (n, '
-                         f'{weights.embed_dim}) by {CONFIG}: export a tower with its projection')
+                         f'{weights.embed_dim}) by {exports.CONFIG}: export a tower with its '
+                         'projection')
     return names[0]
 
 
@@ -290,14 +272,14 @@ def _of_text(folder: Path, *names: str) -> int:
 
     ModelError: the configuration does not have it.
     """
-    config = read_config(folder / CONFIG, 'it has the sizes of the text tower')
+    config = read_config(folder / exports.CONFIG, 'it has the sizes of the text tower')
     text: dict[str, Any] = next((config[name] for name in ('text_config', 'text_cfg')
                                  if isinstance(config.get(name), dict)), {})
     size = next((text[name] for name in names if name in text), None)
     if size is None and (config.get('model_type') == 'clip' or 'text_cfg' in config):
         size = _DEFAULTS[names[0]]  # values equal to the default are omitted
     if not isinstance(size, int) or not 2 < size < 2**24:
-        raise ModelError(f"{folder / CONFIG} lacks '{names[0]}' of the text tower: add it")
+        raise ModelError(f"{folder / exports.CONFIG} lacks '{names[0]}' of the text tower: add it")
     return size
 
 
@@ -309,13 +291,13 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
     except ModuleNotFoundError as error:
         raise ModelError(f"{error.name} is not installed, but labels need it: pip install "
                          f"{error.name}, or the extra 'runtime'") from error
-    files = [file for file in (folder / TOKENIZER, folder / 'textual' / TOKENIZER)
+    found = [file for file in (folder / exports.TOKENIZER, folder / 'textual' / exports.TOKENIZER)
              if file.exists()]
-    if not files:
-        raise ModelError(f'{folder / TOKENIZER} is missing; it splits labels into tokens: put the '
-                         'file of the published network there')
+    if not found:
+        raise ModelError(f'{folder / exports.TOKENIZER} is missing; it splits labels into tokens: '
+                         'put the file of the published network there')
     try:
-        text = read_file(files[0]).decode()
+        text = read_file(found[0]).decode()
         about = parse_json(text)
         # on a prefix that its merges lack, the library ends the process
         if 'merges' in about['model'] and about['model'].get('continuing_subword_prefix'):
@@ -327,7 +309,7 @@ def _read_tokenizer(folder: Path) -> tuple[Any, int]:
         if not _LEAST_SHARE * known <= size <= known:
             raise ValueError(f'it has {size} tokens, but the text tower has {known}')
     except Exception as error:  # the library has no exception classes
-        raise ModelError(f'{files[0]} is not a tokenizer of a CLIP: {first_line(error)}'
+        raise ModelError(f'{found[0]} is not a tokenizer of a CLIP: {first_line(error)}'
                          ) from error
     padding = 0
     with contextlib.suppress(ValueError, LookupError, TypeError):

@@ -19,15 +19,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cliploc_ros.core.observation import Detections
-from cliploc_ros.errors import ModelError, OptionsError
+from cliploc_ros.errors import ModelError, OptionsError, first_line
 from cliploc_ros.models.exports import DETECTOR, export_key, exported
-from cliploc_ros.models.files import (
-    digest_file,
-    find_network,
-    first_line,
-    is_hub_name,
-    resolve_folder,
-)
+from cliploc_ros.models.files import digest_file, find_network, is_hub_name, resolve_folder
 from cliploc_ros.models.onnx_network import ANY, OnnxNetwork, colours, numbers, one_of, read_config
 from cliploc_ros.models.protocols import DetectorOptions
 

@@ -26,23 +26,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.errors import ModelError
-from cliploc_ros.files.storage import (
-    MAKE_ROOM,
-    check_owners,
-    parse_json,
-    read_file,
-    replace_file,
-    resolve_cache_dir,
-    warn_not_kept,
-)
-from cliploc_ros.models.files import (
-    check_weights_file,
-    digest_network,
-    first_line,
-    remove_unused,
-    weights_beside,
-)
+from cliploc_ros.errors import ModelError, first_line
+from cliploc_ros.files import storage
+from cliploc_ros.models.files import check_weights_file, digest_network, new_entry, weights_beside
 
 # A compiled network is as large as its file: ViT-L-14 takes 1.2 GB, YOLOv8x .3 GB.
 _MOST_NETWORKS = 8
@@ -112,14 +98,15 @@ class OnnxNetwork:
         # A compiled network is named by a hash of all that it depends on.
         openvino, content = import_openvino(), digest_network(file, cache_dir)
         with contextlib.suppress(FileNotFoundError):
-            if read_file(file.with_name(f'{file.name}.sha256')).split()[:1] != [
+            if storage.read_file(file.with_name(f'{file.name}.sha256')).split()[:1] != [
                     content.partition(':')[0].encode()]:
                 raise ModelError(f'{file} differs from the digest in {file.name}.sha256: copy '
                                  'both again')
         depends = [_FORMAT, openvino.Core().get_property('CPU', 'FULL_DEVICE_NAME'),
                    openvino.get_version(), precision, content]
         digest = hashlib.sha256(json.dumps(depends).encode()).hexdigest()
-        stored = resolve_cache_dir(cache_dir) / 'openvino' / f'{file.stem}-{digest[:32]}.blob'
+        cache = storage.resolve_cache_dir(cache_dir) / 'openvino'
+        stored = cache / f'{file.stem}-{digest[:32]}.blob'
         try:
             compiled, self.metadata = _load(stored, precision)
         except Exception as error:  # OpenVINO has no exception classes
@@ -166,7 +153,7 @@ def read_config(file: Path, purpose: str) -> dict[str, Any]:
     transformers.
     """
     try:
-        found = parse_json(read_file(file))
+        found = storage.parse_json(storage.read_file(file))
     except FileNotFoundError:
         raise ModelError(f'{file} is missing; {purpose}: put the file of the published network '
                          'there') from None
@@ -254,7 +241,7 @@ def _settings(precision: str | None) -> dict[str, Any]:
 
 def _load(stored: Path, precision: str | None) -> tuple[Any, dict[str, str]]:
     """Load a compiled network and its metadata, see _compile; any exception: it is unusable."""
-    check_owners(stored.parent)
+    storage.check_owners(stored.parent)
     content = np.memmap(stored, dtype=np.uint8, mode='r')
     if hashlib.sha256(content[32:]).digest() != content[:32].tobytes():
         raise ValueError('it is damaged')
@@ -324,16 +311,13 @@ def _compile(file: Path, stored: Path, precision: str | None) -> tuple[Any, dict
         digest = hashlib.sha256()
         for part in parts:
             digest.update(part)
-        stored.parent.mkdir(parents=True, exist_ok=True)
-        check_owners(stored.parent)
-        remove_unused(stored.parent, _MOST_NETWORKS - 1)
-        with replace_file(stored) as partial, partial.open('wb') as opened:
+        with new_entry(stored, _MOST_NETWORKS) as partial, partial.open('wb') as opened:
             opened.writelines((digest.digest(), *parts))
         # Loaded from the file, so that the weights are in memory once, and the file is checked.
         compiled, _ = _load(stored, precision)
     except Exception as error:  # OpenVINO's errors for a full disk and a bad network are the same
-        warn_not_kept(f'the compiled network is not cached: cannot write {stored} '
-                      f'({first_line(error)}); {MAKE_ROOM} (cache_dir)')
+        storage.warn_not_kept(f'the compiled network is not cached: cannot write {stored} '
+                              f'({first_line(error)}); {storage.MAKE_ROOM} (cache_dir)')
     free_memory()
     return compiled, metadata
 

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, FeatureKinds, Features, compact
-from cliploc_ros.errors import ModelError
+from cliploc_ros.errors import ModelError, first_line
 from cliploc_ros.files.storage import read_file, replace_file, resolve_cache_dir
-from cliploc_ros.models.files import download, first_line
+from cliploc_ros.models.files import download
 
 if TYPE_CHECKING:  # loaded where a layer has these features
     from cliploc_ros.models.onnx_network import CompiledNetwork

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.errors import ModelError, OptionsError, did_you_mean
+from cliploc_ros.errors import ModelError, OptionsError, did_you_mean, first_line
 from cliploc_ros.files.storage import resolve_cache_dir
 from cliploc_ros.models.clip_encoder import encode_labels, encoded_once
 from cliploc_ros.models.export import OPSET, compare, halve, quiet_export
 from cliploc_ros.models.exports import CHECKPOINT, DETECTOR, describe_export, needs_pytorch
-from cliploc_ros.models.files import check_weights_file, digest_file, download, first_line
+from cliploc_ros.models.files import check_weights_file, digest_file, download
 from cliploc_ros.models.onnx_clip import resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions, DetectorOptions
 

@@ -22,15 +22,8 @@ from vision_msgs.msg import Detection2DArray
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.messages import image_from_msg
+from cliploc_ros.models import protocols
 from cliploc_ros.models.onnx_detector import GREY, is_grey, load_detector
-from cliploc_ros.models.protocols import (
-    DetectorOptions,
-    ObjectDetector,
-    Prompts,
-    prompts_of_map,
-    prompts_of_names,
-    with_detector,
-)
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import detections_to_msg, of_camera, stamp_ns
 from cliploc_ros.ros.node.diagnostics import Health, Rates, StageTimes
@@ -169,7 +162,7 @@ class DetectorNode(ManagedNode[DetectorParameters]):
     def __init__(self) -> None:
         super().__init__('detector', DetectorParameters, RelocalizerParameters)
         #: The network, None unless it is loaded
-        self.detector: ObjectDetector | None = None
+        self.detector: protocols.ObjectDetector | None = None
         # The node is opened in one thread, subscribers are matched in another.
         self._lock = threading.Lock()
         self._open = False
@@ -181,14 +174,15 @@ class DetectorNode(ManagedNode[DetectorParameters]):
     def load(self) -> str:
         """Load the network."""
         parameters = self.settings.snapshot()
-        prompts: Prompts = ()
+        prompts: protocols.Prompts = ()
         if parameters.vocabulary == 'map':
             file = path_of(parameters.map_file)
-            prompts = prompts_of_map(LandmarkMap.from_file(file), file)
+            prompts = protocols.prompts_of_map(LandmarkMap.from_file(file), file)
         elif parameters.vocabulary:
-            prompts = prompts_of_names(parameters.vocabulary)
-        options = replace(with_detector(detector_options(parameters), parameters.profile),
-                          prompts=prompts, text_model=parameters.text_model)
+            prompts = protocols.prompts_of_names(parameters.vocabulary)
+        options = replace(
+            protocols.with_detector(detector_options(parameters), parameters.profile),
+            prompts=prompts, text_model=parameters.text_model)
         self.detector = load_detector(options)
         of_texts = f', {len(options.prompts)} texts' if options.prompts else ''
         return f'detector {options.model}{of_texts}'
@@ -251,9 +245,9 @@ class DetectorNode(ManagedNode[DetectorParameters]):
             camera.publish(detections_to_msg(detections, image.msg.header))
 
 
-def detector_options(parameters: DetectorParameters) -> DetectorOptions:
+def detector_options(parameters: DetectorParameters) -> protocols.DetectorOptions:
     """Return the network's options."""
-    return DetectorOptions(
+    return protocols.DetectorOptions(
         model=parameters.model, conf=parameters.conf, iou=parameters.iou, imgsz=parameters.imgsz,
         max_det=parameters.max_det, cache_dir=parameters.cache_dir)
 

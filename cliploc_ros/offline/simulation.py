@@ -117,13 +117,10 @@ class DetectorModel:
 
 def guess_detector(landmark_map: LandmarkMap) -> DetectorModel:
     """Return a detector with assumed errors, for a map without a recording."""
-    count = len(landmark_map)
-    ratios = np.full(count, _GUESSED_RATIO)
-    for row, detail in enumerate(landmark_map.details):
-        if detail.seen_ratio is not None:
-            ratios[row] = detail.seen_ratio
+    ratios = np.array([_GUESSED_RATIO if detail.seen_ratio is None else detail.seen_ratio
+                       for detail in landmark_map.every_detail])
     return DetectorModel(landmark_map, _GUESSED_CAMERA, (), ratios,
-                         np.full(count, _GUESSED_REACH_M), 1.0, GUESSED_MIN_SIDE_PX, ())
+                         np.full(len(ratios), _GUESSED_REACH_M), 1.0, GUESSED_MIN_SIDE_PX, ())
 
 
 @dataclass(frozen=True)
@@ -159,14 +156,12 @@ class LabelModel:
         bboxes_xyxy : ndarray (n, 4)
             [px].
         """
-        count = len(shown)
-        biases, known = np.zeros((count, _SIZE)), shown >= 0
-        biases[known] = self.biases[shown[known]]
+        count, known = len(shown), shown >= 0
         crops = np.array([np.sqrt(CLASS_SHARE) * _direction(f'class {name}')
                           for name in class_ids]).reshape(count, _SIZE)
         crops[known] = self.labels[shown[known]]
         noise = rng.normal(size=(count, _SIZE))
-        noise[known] = shared_noise(biases[known], noise[known])
+        noise[known] = shared_noise(self.biases[shown[known]], noise[known])
         return similarities_of(crops, _NOISE, noise, bboxes_xyxy, self.labels)
 
 

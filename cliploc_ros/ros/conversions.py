@@ -11,13 +11,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
-from vision_msgs.msg import (
-    BoundingBox2D,
-    Detection2D,
-    Detection2DArray,
-    ObjectHypothesis,
-    ObjectHypothesisWithPose,
-)
+from vision_msgs import msg as vision
 
 from cliploc_ros.core.geometry.transforms import quaternion_from_transform, transform_from_pose
 from cliploc_ros.core.observation import Detections
@@ -38,17 +32,17 @@ def of_camera(camera: str, topic: str) -> str:
     return f'{camera}/{topic}' if camera else topic
 
 
-def detections_to_msg(detections: Detections, header: Header) -> Detection2DArray:
+def detections_to_msg(detections: Detections, header: Header) -> vision.Detection2DArray:
     """Return detections as a message with the header of their image."""
-    msg = Detection2DArray(header=header)
+    msg = vision.Detection2DArray(header=header)
     for box, class_id, score in zip(detections.bboxes_xyxy, detections.class_ids,
                                     detections.scores, strict=True):
         left, top, right, bottom = map(float, box)
-        bbox = BoundingBox2D(size_x=right - left, size_y=bottom - top)
+        bbox = vision.BoundingBox2D(size_x=right - left, size_y=bottom - top)
         bbox.center.position.x, bbox.center.position.y = (left + right) / 2, (top + bottom) / 2
-        hypothesis = ObjectHypothesis(class_id=class_id, score=float(score))
-        msg.detections.append(Detection2D(header=header, bbox=bbox, results=[
-            ObjectHypothesisWithPose(hypothesis=hypothesis)]))
+        hypothesis = vision.ObjectHypothesis(class_id=class_id, score=float(score))
+        msg.detections.append(vision.Detection2D(header=header, bbox=bbox, results=[
+            vision.ObjectHypothesisWithPose(hypothesis=hypothesis)]))
     return msg
 
 
@@ -80,13 +74,13 @@ def pose_with_covariance_msg(header: Header, parent_from_child: NDArray[np.float
     return msg
 
 
-def detection_type(package: str) -> tuple[type, Callable[[Any], Detection2DArray]]:
+def detection_type(package: str) -> tuple[type, Callable[[Any], vision.Detection2DArray]]:
     """Return the detection message of a package, and its conversion to Detection2DArray.
 
     The package is `vision_msgs` or `yolo_msgs`. OptionsError: it is not installed.
     """
     if package == 'vision_msgs':
-        return Detection2DArray, lambda msg: msg
+        return vision.Detection2DArray, lambda msg: msg
     try:
         return importlib.import_module('yolo_msgs.msg').DetectionArray, from_yolo_msg
     except ImportError as error:
@@ -94,17 +88,17 @@ def detection_type(package: str) -> tuple[type, Callable[[Any], Detection2DArray
                            'workspace and source it, or set vision_msgs') from error
 
 
-def from_yolo_msg(msg: Any) -> Detection2DArray:
+def from_yolo_msg(msg: Any) -> vision.Detection2DArray:
     """Convert a yolo_msgs/DetectionArray: boxes, class names and scores."""
-    common = Detection2DArray(header=msg.header)
+    common = vision.Detection2DArray(header=msg.header)
     for detection in msg.detections:
         size, center = detection.bbox.size, detection.bbox.center
-        box = BoundingBox2D(size_x=size.x, size_y=size.y)
+        box = vision.BoundingBox2D(size_x=size.x, size_y=size.y)
         box.center.position.x, box.center.position.y = center.position.x, center.position.y
         box.center.theta = center.theta
-        hypothesis = ObjectHypothesis(class_id=detection.class_name or str(detection.class_id),
-                                      score=detection.score)
-        common.detections.append(Detection2D(
+        hypothesis = vision.ObjectHypothesis(
+            class_id=detection.class_name or str(detection.class_id), score=detection.score)
+        common.detections.append(vision.Detection2D(
             header=msg.header, id=detection.id, bbox=box,
-            results=[ObjectHypothesisWithPose(hypothesis=hypothesis)]))
+            results=[vision.ObjectHypothesisWithPose(hypothesis=hypothesis)]))
     return common

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
 
+from cliploc_ros import messages
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform
@@ -34,16 +35,6 @@ from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch, WatchReport
 from cliploc_ros.errors import CliplocError, MapError, ModelError
 from cliploc_ros.files.storage import read_file, resolve_cache_dir
-from cliploc_ros.messages import (
-    camera_from_msg,
-    depths_from_msg,
-    detections_from_msg,
-    faults_of_camera_info,
-    faults_of_headers,
-    faults_of_rectified,
-    image_from_msg,
-    parse_class_map,
-)
 from cliploc_ros.models.protocols import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
@@ -266,16 +257,17 @@ class Instants:
                   by_odometry: bool) -> tuple[NDArray[np.uint8], Observation]:
         """Return the image of a frame and its detections, without crops."""
         try:
-            image = image_from_msg(frame.image)
+            image = messages.image_from_msg(frame.image)
             height, width = image.shape[:2]
-            camera = camera_from_msg(frame.camera_info, (width, height), parameters.rectified)
-            given = detections_from_msg(frame.detections, parse_class_map(parameters.class_map))
             image_frame, info = frame.image.header.frame_id, frame.camera_info
+            camera = messages.camera_from_msg(info, (width, height), parameters.rectified)
+            given = messages.detections_from_msg(
+                frame.detections, messages.parse_class_map(parameters.class_map))
             faults = [
-                *faults_of_headers(image_frame, info.header.frame_id,
-                                   frame.detections.header.frame_id),
-                *faults_of_camera_info(info, camera, parameters.rectified),
-                *faults_of_rectified(frame.image_topic, parameters.rectified, info),
+                *messages.faults_of_headers(image_frame, info.header.frame_id,
+                                            frame.detections.header.frame_id),
+                *messages.faults_of_camera_info(info, camera, parameters.rectified),
+                *messages.faults_of_rectified(frame.image_topic, parameters.rectified, info),
                 *(faults_of_axes(image_frame, state.camera_from_base)
                   if parameters.base_frame not in ('', image_frame) else [])]
             check_faults(faults)
@@ -293,7 +285,7 @@ class Instants:
         depths = None
         try:
             if frame.depth is not None:
-                depths = depths_from_msg(
+                depths = messages.depths_from_msg(
                     frame.depth, frame.image.header.frame_id, camera, detections.bboxes_xyxy,
                     frame.depth_camera_info, state.camera_from_depth)
             elif parameters.depth_transport != 'none':

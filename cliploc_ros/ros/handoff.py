@@ -78,8 +78,7 @@ class HandOff:
     `odometry` must be open: it detects motion of the robot. `transforms` looks up its frame.
     """
 
-    def __init__(self, node: Node, odometry: OdometrySource, transforms: CoordinateFrames
-                 ) -> None:
+    def __init__(self, node: Node, odometry: OdometrySource, transforms: CoordinateFrames) -> None:
         self._node, self._odometry, self._transforms = node, odometry, transforms
         self._base_frame = ''
         self._changed = threading.Condition()

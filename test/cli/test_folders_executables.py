@@ -102,8 +102,7 @@ def test_a_scaled_and_levelled_map_is_evaluated_on_its_own_recording(tmp_path, c
         up, detections.class_names)).explained > 0.5
     studio = open_studio(make_parser().parse_args([str(built)]))
     try:
-        assert np.allclose(studio.recording.detections.map_from_camera,
-                           detections.map_from_camera)
+        assert np.allclose(studio.recording.detections.map_from_camera, detections.map_from_camera)
         assert studio.recording.images.of_folder
         assert studio.recording.images.of(detections, 3).shape == (480, 640, 3)
     finally:

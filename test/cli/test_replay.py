@@ -388,8 +388,7 @@ def test_small_sequence_round_trip(sequence, tmp_path, run_here, storage, form):
         assert {topic.header.frame_id for topic in topics[name]} == {'camera_optical_frame'}
     for message, stamp in zip(topics[images], STAMPS, strict=True):
         file = sequence / f'rgb/{stamp}.png'
-        np.testing.assert_array_equal(image_from_msg(message),
-                                      cv2.imread(str(file))[:, :, ::-1])
+        np.testing.assert_array_equal(image_from_msg(message), cv2.imread(str(file))[:, :, ::-1])
         if form == 'compressed':
             assert message.format == 'rgb8; png compressed bgr8'
             assert message.data.tobytes() == file.read_bytes()

@@ -96,6 +96,5 @@ def nearest(rotations: NDArray[np.float64], translations: NDArray[np.float64],
 def verify(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]
            ) -> Verified:
     """Return the landmarks that a pose explains in one frame, by the kernel (a rig of one)."""
-    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None],
-                   np.zeros(len(scene.centers)))
+    rig = make_rig([scene], np.eye(4)[None], VERTICAL_UNKNOWN[None], np.zeros(len(scene.centers)))
     return verify_rig(rig, rotation, translation)

@@ -54,8 +54,7 @@ def place(x=0.0, inliers=200, confirmed=0.9, reach=1.0, **fields):
     """Return points over the middle of the image, within a share of its width and height."""
     rng, size = np.random.default_rng(0), np.array([CAMERA.width, CAMERA.height])
     pixels = size * (0.5 + reach * rng.uniform(-0.55, 0.55, (inliers, 2)))
-    return RecognizedPlace(moved(x), FINE, 0.5 * FINE, inliers, confirmed, pixels=pixels,
-                           **fields)
+    return RecognizedPlace(moved(x), FINE, 0.5 * FINE, inliers, confirmed, pixels=pixels, **fields)
 
 
 def ask(recognizer=None, objects=12, options=BY_CLASS, room=ROOM, **known):
@@ -179,8 +178,7 @@ def test_a_dozen_points_do_not_override_what_objects_lack(cause):
             looks = looks.with_look(Look(replace(seen, stamp_ns=stamp_ns), moved(9.0), 0.3))
     relocalizer = Relocalizer(ROOM, options)
     relocalizer.warm_up()
-    frame = relocalizer.search(
-        seen, Deadline(-1.0) if cause == 'a search cut short' else NEVER)
+    frame = relocalizer.search(seen, Deadline(-1.0) if cause == 'a search cut short' else NEVER)
     found = relocalizer.locate([frame], looks=looks, recognizer=Says(place(0.0, inliers=12)))
     assert not found.accepted, found
 

@@ -115,8 +115,7 @@ def see(landmark_map, pose, number=0, odom=True, rng=None, rows=None):
 
 
 def moved(pose, x, y, yaw_deg=0.0):
-    return make_transform(rigid(degrees=yaw_deg)[:3, :3] @ pose[:3, :3],
-                          pose[:3, 3] + [x, y, 0.0])
+    return make_transform(rigid(degrees=yaw_deg)[:3, :3] @ pose[:3, :3], pose[:3, 3] + [x, y, 0.0])
 
 
 @pytest.fixture

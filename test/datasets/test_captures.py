@@ -170,8 +170,7 @@ def test_the_scale_by_a_distance_and_by_objects(shots, look, original, tmp_path)
     frames = read_folder(folder, FolderOptions(
         known_distance=(first.path.name, f'walk/{last.path.name}', apart)))
     assert any('0.4 m' in note for note in frames.notes)
-    detections = record_every_frame(read_folder(folder, FolderOptions(any_unit=True)),
-                                    look)
+    detections = record_every_frame(read_folder(folder, FolderOptions(any_unit=True)), look)
     rows = [row for row, name in enumerate(original.class_ids) if name == 'book']
     metres = float(np.median(2.0 * original.semi_axes[rows].max(axis=1)))
     scale, objects = scale_of_objects(detections, OPTIONS, 'book', metres)
@@ -307,8 +306,7 @@ def test_the_unit_must_be_known(few, tmp_path):
     refuses(tmp_path / 'c', 'named z.jpg',
             FolderOptions(known_distance=('z.jpg', few[1].path.name, 1.0)))
     name = few[0].path.name
-    refuses(tmp_path / 'c', 'at the same place',
-            FolderOptions(known_distance=(name, name, 1.0)))
+    refuses(tmp_path / 'c', 'at the same place', FolderOptions(known_distance=(name, name, 1.0)))
     refuses(captures.write_nerf(tmp_path / 'z', few, applied_scale=0), 'applied_scale is 0')
     doubled = [shot._replace(pose=make_transform(shot.pose[:3, :3], 2.0 * shot.pose[:3, 3]))
                for shot in few]

@@ -69,8 +69,7 @@ def positions(frames):
 
 
 def test_poses_are_interpolated_within_a_gap(tmp_path):
-    bag = write_bag(tmp_path / 'bag', [250, 500, 710, 950],
-                    drive([0, 200, 300, 600, 1000]))
+    bag = write_bag(tmp_path / 'bag', [250, 500, 710, 950], drive([0, 200, 300, 600, 1000]))
     assert positions(bag_frames(bag, BagTopics(), PoseSource('/pose'))) == [None] * 4
     frames = bag_frames(bag, BagTopics(), PoseSource('/pose', topic_gap_ns=300 * MS))
     assert positions(frames) == [0.25, 0.5, None, None]
@@ -226,7 +225,6 @@ def test_compressed_depth(tmp_path):
     frames = bag_frames(bag, BagTopics(depth='/depth'), PoseSource('/pose')).read()
     np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 0.7], [1.5, np.nan]],
                                rtol=1e-6)
-    np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 1.5], [4.0, 9.0]],
-                               rtol=0.02)
+    np.testing.assert_allclose(next(frames).depth.depths_m, [[np.nan, 1.5], [4.0, 9.0]], rtol=0.02)
     with pytest.raises(DatasetError, match='/depth at 17'):
         next(frames)

@@ -120,8 +120,7 @@ def test_four_cameras_need_not_turn(tmp_path):
 
 @pytest.mark.clock  # a busy machine skips looks
 def test_a_kidnapped_robot_is_noticed_stops_and_gets_its_pose_back(tmp_path):
-    code, output, errors = run('--out', tmp_path, '--kidnapped', '--method',
-                               'class_auto')
+    code, output, errors = run('--out', tmp_path, '--kidnapped', '--method', 'class_auto')
     print(output)
     assert code == 0, errors
     steps = re.findall(r'^ *([0-9.]+) s +(\d+) looks: (\w+(?: \w+)?)', output, re.MULTILINE)

@@ -53,8 +53,7 @@ def test_boxes_are_where_the_ellipsoids_project(room, renderer):
             centers = np.array([entry['center']])
             outline = ellipsoid.project_ellipsoids(invert_transform(pose), centers, shape)
             box = ellipsoid.ellipse_bboxes(ellipsoid.ellipses_in_pixels(outline, CAMERA))[0]
-            overlaps.append(ellipsoid.box_ious(
-                box[None], np.array([seen['bbox_xyxy']])).item())
+            overlaps.append(ellipsoid.box_ious(box[None], np.array([seen['bbox_xyxy']])).item())
     assert len(overlaps) > 40
     assert np.median(overlaps) > 0.75
     assert np.percentile(overlaps, 5) > 0.5

@@ -276,8 +276,7 @@ def test_poses_of_another_program_have_errors_only(questions):
     ours = make_summary([[0.1] * 6 + [2.0] * 6] * 5, 'clip_ransac')
     rows = summary.table_rows([ours, theirs])
     assert rows[2] == ('theirs', '', '.17 / .17 / .17', 'inf, inf; 0.10', *[''] * 4, '.17')
-    _, row = csv.DictReader(summary.csv_text(
-        summary.csv_rows([ours, theirs])).splitlines())
+    _, row = csv.DictReader(summary.csv_text(summary.csv_rows([ours, theirs])).splitlines())
     assert (row['solved'], row['accepted'], row['mean_search_ms']) == ('0.166667', '', '')
     assert 'theirs: poses of another program; 10 of 12 queries have none' in '\n'.join(
         summary.notes([ours, theirs]))

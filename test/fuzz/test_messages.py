@@ -85,8 +85,7 @@ def boxes():
 def detections(most=40):
     hypothesis = st.builds(ObjectHypothesis, class_id=name, score=number)
     result = st.builds(ObjectHypothesisWithPose, hypothesis=hypothesis)
-    detection = st.builds(Detection2D, bbox=boxes(),
-                          results=st.lists(result, max_size=3), id=name)
+    detection = st.builds(Detection2D, bbox=boxes(), results=st.lists(result, max_size=3), id=name)
     return st.builds(Detection2DArray, detections=st.lists(detection, max_size=most))
 
 

@@ -46,8 +46,7 @@ class Manager:
 
     @property
     def state(self):
-        return self._tester.answer(
-            self._get.call_async(GetState.Request())).current_state.label
+        return self._tester.answer(self._get.call_async(GetState.Request())).current_state.label
 
     def close(self):
         for client in (self._change, self._get):

@@ -49,8 +49,7 @@ def test_an_answer_has_its_pose_and_evidence_in_fields(relocalizer, tester):
     tester.wait(lambda: heard, 'the last answer')
     (status,), header = heard[-1].status, heard[-1].header
     fields = {value.key: value.value for value in status.values}
-    assert (header.frame_id, header.stamp.sec, fields['stamp [s]']) == (
-        'map', 12, '12.500000000')
+    assert (header.frame_id, header.stamp.sec, fields['stamp [s]']) == ('map', 12, '12.500000000')
     pose = tester.poses[-1].pose
     assert [float(x), float(y), float(fields['z [m]'])] == [
         pose.pose.position.x, pose.pose.position.y, pose.pose.position.z]

@@ -69,8 +69,7 @@ def test_values_are_taken_and_changed_whole_numbers_too(declare):
     assert type(parameters.values.ratio) is float
     assert set_values(node, low=50, high=60).successful
     assert set_values(node, span=[2.0, 3.0]).successful
-    assert parameters.snapshot() == Probe(low=50, high=60, ratio=1.0, mode='wild',
-                                          span=[2.0, 3.0])
+    assert parameters.snapshot() == Probe(low=50, high=60, ratio=1.0, mode='wild', span=[2.0, 3.0])
 
 
 @pytest.mark.parametrize(('values', 'reason'), [

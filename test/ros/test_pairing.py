@@ -38,8 +38,7 @@ class Expected:
         while len(self.waiting[topic]) > 1 and (
                 len(self.waiting[topic]) > MAX_COUNT or self.size(topic) > LIMITS[topic]):
             del self.waiting[topic][0]
-        stamps = {name: [entry[0] for entry in waiting]
-                  for name, waiting in self.waiting.items()}
+        stamps = {name: [entry[0] for entry in waiting] for name, waiting in self.waiting.items()}
         if not all(stamp in seen for seen in stamps.values()):
             return None
         complete = {}

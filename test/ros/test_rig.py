@@ -105,8 +105,7 @@ def test_instants_are_passed_on_once_with_all_cameras_that_publish(rig, cameras,
             cameras(at_s, {name: late_s[name]}, (Detection2DArray,))
         time.sleep(0.05)
     found = passed(begun_s, now_s())
-    assert [names(frame) for frame in found] == [
-        [name for name in NAMES if name in order]] * 6
+    assert [names(frame) for frame in found] == [[name for name in NAMES if name in order]] * 6
     assert {frame.left_out for frame in found} == {tuple(
         name for name in NAMES if name not in order)}
 

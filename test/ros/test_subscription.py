@@ -51,8 +51,7 @@ class Ear:
     def wait_for_hearing(self, publisher, name):
         def heard():
             return any(msg.frame_id == name for msg in self.heard)
-        self.wait(heard, f'a message of {name}',
-                  lambda: publisher.publish(Header(frame_id=name)))
+        self.wait(heard, f'a message of {name}', lambda: publisher.publish(Header(frame_id=name)))
 
     def wait(self, condition, what, work=lambda: None):
         self._spin_until([self._listener, self._speaker], condition, what, work)

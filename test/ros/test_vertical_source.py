@@ -16,8 +16,7 @@ from cliploc_ros.ros.inputs.robot_state import NoVerticalError, VerticalSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
-CAMERA_FROM_BASE = np.linalg.inv(transform_from_pose(np.array(OPTICAL[:3]),
-                                                     np.array(OPTICAL[3:])))
+CAMERA_FROM_BASE = np.linalg.inv(transform_from_pose(np.array(OPTICAL[:3]), np.array(OPTICAL[3:])))
 AT = Time(sec=50)
 NOT_MEASURED = [-1.0] + 8 * [0.0]
 

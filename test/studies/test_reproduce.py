@@ -287,8 +287,7 @@ def test_the_form_of_the_shipped_sources():
         assert re.fullmatch('([0-9a-f]{64})?', download.sha256)
     networks = [*sources.options, *(word for network in sources.networks
                                     for word in (network.option, network.file))]
-    build_map.make_parser().parse_args(
-        ['--bag', 'a', '--out', 'b', *networks, *sources.mapping])
+    build_map.make_parser().parse_args(['--bag', 'a', '--out', 'b', *networks, *sources.mapping])
     for recording in sources.recordings.values():
         evaluate.make_parser().parse_args(
             ['--bag', 'a', '--map', 'b', *networks, *sources.asking, *recording.asking])

@@ -345,8 +345,7 @@ def test_replay_between_announcing_and_writing(path):
     """The studio was killed while saving: either content has the correct edits."""
     document = Document(path)
     document.edit(edits.set_fields, ['cup_1'], label='first')
-    document._journal.append({'writing': document.file.with_landmarks(
-        document.landmarks).digest})
+    document._journal.append({'writing': document.file.with_landmarks(document.landmarks).digest})
     written = document.file.with_landmarks(document.landmarks).text
     document._journal.close()
     again = Document(path)

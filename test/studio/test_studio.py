@@ -111,8 +111,7 @@ def test_the_review_goes_from_the_worst_to_the_end(office):
     document, review = office.document, office.review
     twin, moved = (document.landmarks[key] for key in ('book_2', 'tv_1'))
     document.edit(edits.create, 'a twin', 'book', twin.center + 0.01, twin.basis)
-    document.edit(edits.set_fields, ['tv_1'],
-                  center=moved.center + 0.4 * moved.semi_axes.max())
+    document.edit(edits.set_fields, ['tv_1'], center=moved.center + 0.4 * moved.semi_axes.max())
     assert 'serious' in review.check()
     severities = [review.severity(key) for key in review.order]
     assert severities == sorted(severities, reverse=True) and severities[0] > 1.0
@@ -136,8 +135,7 @@ def test_the_relocalizer_answers_and_an_edit_changes_the_figures(office):
     before = office.relocalize_all()
     accepted = sum(answer.verdict == 'accepted' for answer in office.answers.values())
     assert 'simulated' in before and '(was' not in before and accepted > 4
-    accepted_view = next(view for view, one in office.answers.items()
-                         if one.verdict == 'accepted')
+    accepted_view = next(view for view, one in office.answers.items() if one.verdict == 'accepted')
     office.show_view(accepted_view)
     assert f'view {accepted_view + 1}: accepted' in office.relocalize_here()
     (answer,) = office.answers.values()

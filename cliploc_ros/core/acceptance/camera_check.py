@@ -47,15 +47,9 @@ from cliploc_ros.core.fit.covariance import moves_with_cameras, shares_within
 from cliploc_ros.core.fit.finalists import Finalist
 from cliploc_ros.core.fit.refinement import one_to_one
 from cliploc_ros.core.fit.verification import camera_pose, verify_rig
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import box_ious
-from cliploc_ros.core.geometry.transforms import (
-    RIGHT_M,
-    SAME_BOXES,
-    SAME_PLACE,
-    invert_transform,
-    make_transform,
-)
 from cliploc_ros.core.observation import Observation
 
 _TERMS = CALIBRATION.camera
@@ -146,8 +140,8 @@ class CameraOdds(NamedTuple):
         weights /= weights.sum()
         added = moves @ self.squares @ moves.T
         added[0] = 0.0  # the covariance includes the errors of a right camera
-        near = shares_within(RIGHT_M, (CALIBRATION.covariance.caution * covariance
-                                       + added)[:, :3, :3])
+        near = shares_within(transforms.RIGHT_M, (CALIBRATION.covariance.caution * covariance
+                                                  + added)[:, :3, :3])
         mean, square = self.means[_UNKNOWN_INFO, 0], self.squares[_UNKNOWN_INFO]
         variance = square[0, 0] - mean**2
         # all distances grow by a factor, whose logarithm is the error of the focal length
@@ -207,7 +201,7 @@ def looks_of(joined: JoinedFrames, pose: Finalist) -> list[CameraLook]:
         careful = _limit(fit.information / noise, vector / noise) / noise
         looks.append(CameraLook(
             seen.camera_name, seen.stamp_ns == last.stamp_ns,
-            invert_transform(make_transform(rotation, translation)),
+            transforms.invert_transform(transforms.make_transform(rotation, translation)),
             weight * fit.information, weight * vector, careful / weight,
             moves[names == seen.camera_name].sum(axis=0)))
     return looks
@@ -229,7 +223,8 @@ class Views(NamedTuple):
 
     def with_look(self, look: CameraLook) -> 'Views':
         """Return these views with a look added; the oldest views are dropped if too many."""
-        same = np.nonzero(SAME_BOXES.agreeing(self.poses, look.map_from_camera[None])[:, 0])[0]
+        same = np.nonzero(transforms.SAME_BOXES.agreeing(
+            self.poses, look.map_from_camera[None])[:, 0])[0]
         if not len(same):
             new = (look.map_from_camera, 1, look.information, look.vector, look.careful)
             return self.joined(Views(*(np.array([field]) for field in new)))
@@ -266,7 +261,7 @@ class Views(NamedTuple):
         """Return whether the looks verify the camera, also without those of any one place."""
         return self.odds().log_odds < _TERMS.fits and all(
             Views(*(part[~near] for part in self)).odds().log_odds < _TERMS.fits
-            for near in SAME_PLACE.agreeing(self.poses))
+            for near in transforms.SAME_PLACE.agreeing(self.poses))
 
 
 class Extent(NamedTuple):
@@ -328,8 +323,7 @@ class _Record:
                     - odds_of(*self.views.sums).log_odds)
             if gain > _TERMS.view:
                 self.views, self.since = self.views.joined(self.since), Views()
-            elif (gain < -_TERMS.view and self.since.are_right
-                  and self.by_extent < -_TERMS.fits):
+            elif (gain < -_TERMS.view and self.since.are_right and self.by_extent < -_TERMS.fits):
                 self.views, self.since = self.since, Views()
         self.odds, self.by_looks = self.views.odds(self.by_extent), self.views.odds()
 
@@ -391,8 +385,7 @@ class CameraCheck:
 
     def __init__(self) -> None:
         self._records: dict[str, _Record] = {}
-        self._instants: deque[dict[str, tuple[int, int]]] = deque(
-            maxlen=int(_TERMS.most_instants))
+        self._instants: deque[dict[str, tuple[int, int]]] = deque(maxlen=int(_TERMS.most_instants))
 
     def copied(self) -> 'CameraCheck':
         """Return a copy that later looks do not change."""

@@ -174,8 +174,7 @@ def _of_group(centers: NDArray[np.float64], inliers: float, misfit: float) -> fl
             centers[:, None] - centers, axis=2).max(initial=0.0) > terms.extent_m:
         return 0.0
     share = np.interp(inliers, (terms.small, terms.large), (1.0, 0.0))
-    return float(share * (terms.unmapped
-                          + terms.misfit * max(0.0, misfit - terms.fits * inliers)))
+    return float(share * (terms.unmapped + terms.misfit * max(0.0, misfit - terms.fits * inliers)))
 
 
 def _contributions(landmark_map: LandmarkMap, frame: ComparedFrame,

@@ -11,17 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.acceptance.confidence import (
-    ComparedFrame,
-    Setting,
-    Support,
-    compared_frame,
-    none_right,
-    region_odds,
-    support,
-    tilt_handicaps,
-    utilities,
-)
+from cliploc_ros.core.acceptance import confidence
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Finalist, Match, instants_of, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
@@ -41,7 +31,7 @@ class Contender(NamedTuple):
     finalist: Finalist  #: The pose, found by the search of objects or by keyframes
     pose: NDArray[np.float64]  #: (4, 4): map_from_camera
     matches: list[tuple[Match, ...]]  #: Inliers in each of F frames
-    support: Support  #: Evidence of the objects
+    support: confidence.Support  #: Evidence of the objects
     is_upright: bool  #: Whether the pose uses the known vertical, or agrees with it
     handicap: float  #: Log odds that are subtracted for the attitude of the pose
     #: Log odds of the pose, up to a constant that all contenders share: the utility of its support
@@ -77,12 +67,11 @@ class JoinedFrames:
     cameras: NDArray[np.float64]  #: (F, 4, 4): camera_from_last of each frame
 
     @cached_property
-    def compared(self) -> list[ComparedFrame]:
+    def compared(self) -> list[confidence.ComparedFrame]:
         """Return the data of each frame that the supports of all poses need."""
-        return [compared_frame(self.landmark_map, frame.scene, frame.observation
-                               if self.options.needs_similarities
-                               else replace(frame.observation, similarities=None))
-                for frame in self.frames]
+        return [confidence.compared_frame(
+            self.landmark_map, frame.scene, frame.observation if self.options.needs_similarities
+            else replace(frame.observation, similarities=None)) for frame in self.frames]
 
     @property
     def knows_vertical(self) -> bool:
@@ -92,7 +81,7 @@ class JoinedFrames:
     @property
     def none_right(self) -> float:
         """Return the utility of the case that no pose is right."""
-        return none_right(Setting(
+        return confidence.none_right(confidence.Setting(
             len(self.landmark_map),
             self.options.vertical_deviation_deg if self.knows_vertical else math.inf))
 
@@ -115,20 +104,21 @@ class JoinedFrames:
         matches = [matches_of(self.rig, finalist) for finalist in finalists]
         supports = self.supports(poses, matches)
         handicaps = np.where(upright, 0.0, CALIBRATION.attitude.wrong_mount) \
-            if self.knows_vertical else tilt_handicaps(poses, self.options.tilt_deviation_deg)
+            if self.knows_vertical else confidence.tilt_handicaps(
+                poses, self.options.tilt_deviation_deg)
         region = self.frames[-1].observation.region
-        priors = np.zeros(len(poses)) if region is None else region_odds(
+        priors = np.zeros(len(poses)) if region is None else confidence.region_odds(
             self.landmark_map, region, poses)
         return list(map(Contender, finalists, poses, matches, supports, upright,
-                        handicaps.tolist(), (utilities(supports) - handicaps).tolist(),
+                        handicaps.tolist(), (confidence.utilities(supports) - handicaps).tolist(),
                         priors.tolist()))
 
     def supports(self, poses: NDArray[np.float64],
-                 matches: Sequence[list[tuple[Match, ...]]]) -> list[Support]:
+                 matches: Sequence[list[tuple[Match, ...]]]) -> list[confidence.Support]:
         """Return the support of each pose (m, 4, 4), from its matches in each frame."""
         last_from_cameras = np.linalg.inv(self.cameras)
-        return [support(self.landmark_map, self.compared, pose @ last_from_cameras, found)
-                for pose, found in zip(poses, matches, strict=True)]
+        return [confidence.support(self.landmark_map, self.compared, pose @ last_from_cameras,
+                                   found) for pose, found in zip(poses, matches, strict=True)]
 
     def refined(self, start: Finalist) -> Finalist:
         """Refine a pose that the search did not find, if the options ask for refinement."""

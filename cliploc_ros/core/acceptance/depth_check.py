@@ -17,14 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.calibration import CALIBRATION
+from cliploc_ros.core.fit import refinement
 from cliploc_ros.core.fit.finalists import Finalist
-from cliploc_ros.core.fit.refinement import (
-    Inliers,
-    one_to_one,
-    refine_rig,
-    residuals_of_rig,
-    robust_cost,
-)
 from cliploc_ros.core.fit.verification import Rig, camera_pose, verify_rig
 from cliploc_ros.core.geometry.depth import depth_odds
 
@@ -72,7 +66,7 @@ def check_depth(rig: Rig, pose: Finalist) -> DepthCheck | None:
     if not rig.scene.depths.any():
         return None
     found = verify_rig(rig, pose.rotation, pose.translation)
-    inliers = one_to_one(rig, found, pose.rotation, pose.translation)
+    inliers = refinement.one_to_one(rig, found, pose.rotation, pose.translation)
     known = inliers.pairs[:, 15] > 0.0
     if not known.any():
         return None
@@ -81,18 +75,19 @@ def check_depth(rig: Rig, pose: Finalist) -> DepthCheck | None:
     errors = np.column_stack([depths - inliers.pairs[:, 14], deviations, depths])
     lacking = depth_odds(errors * (0.0, 1.0, 1.0)) - depth_odds(errors)
     boxes = rig._replace(scene=rig.scene._replace(depths=np.zeros_like(rig.scene.depths)))
-    free = refine_rig(boxes, pose.rotation, pose.translation)
-    edges = one_to_one(boxes, found, pose.rotation, pose.translation)
-    costs = [robust_cost(residuals) if in_front else math.inf for in_front, residuals in (
-        residuals_of_rig(edges, fit.rotation, fit.translation) for fit in (pose, free))]
-    measured = one_to_one(rig, found, free.rotation, free.translation).pairs[:, 14]
+    free = refinement.refine_rig(boxes, pose.rotation, pose.translation)
+    edges = refinement.one_to_one(boxes, found, pose.rotation, pose.translation)
+    costs = [refinement.robust_cost(residuals) if in_front else math.inf
+             for in_front, residuals in (refinement.residuals_of_rig(
+                 edges, fit.rotation, fit.translation) for fit in (pose, free))]
+    measured = refinement.one_to_one(rig, found, free.rotation, free.translation).pairs[:, 14]
     return DepthCheck(
         int(known.sum()), float(lacking.sum()), costs[0] - costs[1],
         float(np.median((measured / _depths(inliers, free.rotation, free.translation))[known])))
 
 
-def _depths(inliers: Inliers, rotation: NDArray[np.float64], translation: NDArray[np.float64]
-            ) -> NDArray[np.float64]:
+def _depths(inliers: refinement.Inliers, rotation: NDArray[np.float64],
+            translation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the depth (m,) of each match's landmark in its camera."""
     depths = np.empty(len(inliers.pairs))
     for (first, last), camera in zip(pairwise(inliers.starts), inliers.cameras, strict=True):

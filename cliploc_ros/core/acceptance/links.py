@@ -52,8 +52,7 @@ def weakest_link(joined: JoinedFrames, pose: NDArray[np.float64], seen: Recognit
     `seen` has the places of the newest image by keyframes. `meet` returns the best poses of some
     of the frames, see search_contenders.
     """
-    instants, stamps = joined.instants, [
-        frame.observation.stamp_ns for frame in joined.frames]
+    instants, stamps = joined.instants, [frame.observation.stamp_ns for frame in joined.frames]
     starts = [row for row in range(1, len(stamps)) if instants[row] != instants[row - 1]]
     if not starts:
         return Link()

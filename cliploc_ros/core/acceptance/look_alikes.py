@@ -29,19 +29,13 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.acceptance.confidence import Support, utilities
 from cliploc_ros.core.calibration import CALIBRATION
-from cliploc_ros.core.geometry.transforms import (
-    RIGHT_M,
-    SAME_ANSWER,
-    SAME_MOVE,
-    first_of_each,
-    invert_transform,
-)
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.pairs import find_repeats
 
 _TERMS = CALIBRATION.twins
-_SAME_TURN = np.cos(np.radians(SAME_MOVE.angle_deg))
-_OWN_TURN = np.cos(np.radians(SAME_ANSWER.angle_deg))
+_SAME_TURN = np.cos(np.radians(transforms.SAME_MOVE.angle_deg))
+_OWN_TURN = np.cos(np.radians(transforms.SAME_ANSWER.angle_deg))
 # Both places are upright, so a turn about the vertical maps one onto the other.
 _MOST_TILT = np.cos(np.radians(_TERMS.most_tilt_deg))
 # How near a moved landmark must lie to a landmark of its class, in successive fits of a move [m].
@@ -130,7 +124,7 @@ def find_alike(landmark_map: LandmarkMap, position: NDArray[np.float64],
     misses = np.linalg.norm(ends + moves[:, None, :3, 3] - landmark_map.centers[others], axis=2)
     order = np.lexsort([(misses * found).sum(axis=1), -shares])
     order = order[alike[order]]
-    order = order[first_of_each(_are_same(moves[order], position), int(_TERMS.most))]
+    order = order[transforms.first_of_each(_are_same(moves[order], position), int(_TERMS.most))]
     return Alike(moves[order], rows, others[order], found[order])
 
 
@@ -155,7 +149,7 @@ def find_twins(landmark_map: LandmarkMap, map_from_camera: NDArray[np.float64],
         These places.
     """
     position = map_from_camera[:3, 3]
-    moves = others[:int(_TERMS.others)] @ invert_transform(map_from_camera)
+    moves = others[:int(_TERMS.others)] @ transforms.invert_transform(map_from_camera)
     moves = moves[moves[:, 2, 2] > _MOST_TILT]
     upright = _upright_moves(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]), position,
                              moves[:, :3, :3] @ position + moves[:, :3, 3])
@@ -265,7 +259,7 @@ def _moves_of_map(landmark_map: LandmarkMap, rows: NDArray[np.int64]) -> NDArray
     ends = weights @ (moves[:, :3, :3] @ middle + moves[:, :3, 3]) / votes[:, None]
     moves = _upright_moves(np.arctan2(weights @ moves[:, 1, 0], weights @ moves[:, 0, 0]),
                            middle, ends)[np.argsort(-votes, kind='stable')]
-    return moves[first_of_each(_are_same(moves, middle), int(_TERMS.moves))]
+    return moves[transforms.first_of_each(_are_same(moves, middle), int(_TERMS.moves))]
 
 
 def _upright_moves(turns: NDArray[np.float64], before: NDArray[np.float64],
@@ -286,7 +280,8 @@ def _are_same(moves: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray
     """Return which pairs of moves (m, m) take a point to the same place with the same turn."""
     ends = moves[:, :3, :3] @ point + moves[:, :3, 3]
     cosines = moves[:, :2, 0] @ moves[:, :2, 0].T
-    return np.asarray((cdist(ends, ends) < SAME_MOVE.distance_m) & (cosines > _SAME_TURN))
+    return np.asarray((cdist(ends, ends) < transforms.SAME_MOVE.distance_m)
+                      & (cosines > _SAME_TURN))
 
 
 def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray[np.float64],
@@ -313,6 +308,6 @@ def _verified(landmark_map: LandmarkMap, rows: NDArray[np.int64], moves: NDArray
                                (weights * (x * u + y * v)).sum(axis=1))
             moves = _upright_moves(turns, first, second)
     steps = moves[:, :3, :3] @ position + moves[:, :3, 3] - position
-    elsewhere = ((np.linalg.norm(steps, axis=1) > RIGHT_M)
+    elsewhere = ((np.linalg.norm(steps, axis=1) > transforms.RIGHT_M)
                  | (moves[:, 0, 0] < _OWN_TURN))
     return moves[elsewhere], others[elsewhere], found[elsewhere]

@@ -121,8 +121,7 @@ def fit_camera(pairs, is_edge, vertical, rotation, translation, deviations):
         Standard deviations of the errors before any box is seen.
     """
     errors, damping = np.zeros(ERRORS), _FIRST_DAMPING
-    residuals, cost = _cost(pairs, is_edge, vertical, errors, rotation, translation,
-                             deviations)
+    residuals, cost = _cost(pairs, is_edge, vertical, errors, rotation, translation, deviations)
     information, gradient = _equations(pairs, is_edge, vertical, errors, rotation, translation,
                                        residuals)
     step = np.zeros(6 + ERRORS)

@@ -248,8 +248,7 @@ def _change_without_each(information: NDArray[np.float64], noise: NDArray[np.flo
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-def _sandwich(information: NDArray[np.float64], noise: NDArray[np.float64]
-              ) -> NDArray[np.float64]:
+def _sandwich(information: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
     inverse = np.linalg.inv(information)
     covariance = inverse @ noise @ inverse
     return np.asarray((covariance + covariance.T) / 2)
@@ -299,8 +298,7 @@ def _cross(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def _sums(rows: NDArray[np.float64], groups: NDArray[np.int64], count: int
-          ) -> NDArray[np.float64]:
+def _sums(rows: NDArray[np.float64], groups: NDArray[np.int64], count: int) -> NDArray[np.float64]:
     """Return the sums (count, ...) of the rows of each group."""
     sums = np.zeros((count, *rows.shape[1:]))
     np.add.at(sums, groups, rows)

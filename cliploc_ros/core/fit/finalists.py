@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.verification import Rig, scores_of, verify_rig
-from cliploc_ros.core.geometry.transforms import (
-    SAME_MINIMUM,
-    SAME_PLACE,
-    invert_transform,
-    make_transform,
-)
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.options import NEVER, Deadline
 from cliploc_ros.core.search.frame_search import REFINED, SearchedFrame
 from cliploc_ros.core.search.strategies import MAX_DISTINCT
@@ -59,7 +54,8 @@ class Finalist(NamedTuple):
     @property
     def map_from_camera(self) -> NDArray[np.float64]:
         """Return the pose as a transform (4, 4)."""
-        return invert_transform(make_transform(self.rotation, self.translation))
+        return transforms.invert_transform(
+            transforms.make_transform(self.rotation, self.translation))
 
 
 def poses_of(found: Sequence[Finalist]) -> NDArray[np.float64]:
@@ -83,7 +79,7 @@ def find_with_rivals(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, de
         return [], np.empty(0, dtype=np.bool_)
     tilted = find_finalists([frame._replace(leaders=frame.tilted) for frame in frames], rig,
                             refine, MAX_DISTINCT, deadline)
-    same = SAME_PLACE.agreeing(poses_of(tilted), poses_of(upright)).any(axis=1)
+    same = transforms.SAME_PLACE.agreeing(poses_of(tilted), poses_of(upright)).any(axis=1)
     finalists = upright + [tilted[row] for row in np.nonzero(~same)[0]]
     return finalists, np.arange(len(finalists)) < len(upright)
 
@@ -104,7 +100,7 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
                            np.stack([pose.translation for pose in found]))
         order = np.argsort(-scores, kind='stable')
         found = [found[row]._replace(score=float(scores[row])) for row in order[
-            SAME_PLACE.distinct(poses_of(found)[order], count)]]
+            transforms.SAME_PLACE.distinct(poses_of(found)[order], count)]]
     if not refine:
         return found[:MAX_DISTINCT]
     improved: list[Finalist] = []
@@ -114,7 +110,8 @@ def find_finalists(frames: Sequence[SearchedFrame], rig: Rig, refine: bool, coun
                      for pose in batch] if in_time else batch
     improved.sort(key=lambda pose: -pose.score)
     # keep the best pose of each minimum
-    return [improved[row] for row in SAME_MINIMUM.distinct(poses_of(improved), _COMPARED)]
+    return [improved[row] for row in transforms.SAME_MINIMUM.distinct(
+        poses_of(improved), _COMPARED)]
 
 
 def _leaders_of(frames: Sequence[SearchedFrame], rig: Rig, frame: int) -> list[Finalist]:

@@ -83,5 +83,4 @@ def succeed(known: FilterState | None, odom_from_camera: NDArray[np.float64],
     given = np.asarray((axes / information) @ axes.T)
     gain = np.linalg.solve(prior + given, prior).T
     step, after = gain @ innovation, prior - gain @ prior
-    return given, FilterState(odom_from_camera, moved_pose(before, step),
-                              (after + after.T) / 2)
+    return given, FilterState(odom_from_camera, moved_pose(before, step), (after + after.T) / 2)

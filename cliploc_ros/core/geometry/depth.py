@@ -176,8 +176,7 @@ def depth_from_counts(counts: NDArray[np.generic], unit_m: float | None, where: 
         raise DatasetError(f'{where}: {counts.dtype} with shape {counts.shape} is not a depth '
                            'image of 16-bit integers or floats')
     is_integer = counts.dtype == np.uint16
-    depths = counts.astype(np.float32) * np.float32(
-        unit_m or (MILLIMETRE if is_integer else 1.0))
+    depths = counts.astype(np.float32) * np.float32(unit_m or (MILLIMETRE if is_integer else 1.0))
     with np.errstate(invalid='ignore'):
         valid = np.isfinite(depths) & (depths > 0.0)
     if is_integer:

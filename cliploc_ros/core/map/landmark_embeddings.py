@@ -135,8 +135,7 @@ def load_landmark_embeddings(path: str | os.PathLike[str]) -> LandmarkEmbeddings
         arrays['medoid_offsets'].astype(np.int64), str(arrays.get('set', '')))
 
 
-def save_landmark_embeddings(path: str | os.PathLike[str], embeddings: LandmarkEmbeddings
-                             ) -> None:
+def save_landmark_embeddings(path: str | os.PathLike[str], embeddings: LandmarkEmbeddings) -> None:
     """Write landmark embeddings atomically.
 
     Raises MapError if the embeddings are malformed or the file cannot be written.

@@ -24,19 +24,8 @@ from cliploc_ros.core.map.landmark_map import ClassIndex, LandmarkMap
 from cliploc_ros.core.map.similarities import Similarities, nearest_landmarks
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import Deadline, RelocalizerOptions
+from cliploc_ros.core.search import strategies
 from cliploc_ros.core.search.scene import VERTICAL_UNKNOWN, Constraint, Scene, make_scene
-from cliploc_ros.core.search.strategies import (
-    MAX_DISTINCT,
-    SAMPLE_SIZE,
-    Leaders,
-    Progress,
-    compatible_pairs,
-    draw_prosac,
-    draw_ransac,
-    search_exhaustively,
-    search_progressively,
-    search_samples,
-)
 from cliploc_ros.errors import OptionsError
 
 #: Maximum number of candidates of auto. Their compatibility mask takes the square of this number
@@ -262,9 +251,10 @@ class SearchedFrame(NamedTuple):
     observation: Observation
     scene: Scene  #: Scene of the observation
     vertical: NDArray[np.float64]  #: (7,): see VERTICAL_UNKNOWN
-    leaders: Leaders  #: The best hypotheses, as poses of this frame's camera
-    tilted: Leaders  #: The best hypotheses found without the vertical; unused if it is unknown
-    progress: Progress
+    leaders: strategies.Leaders  #: The best hypotheses, as poses of this frame's camera
+    #: The best hypotheses found without the vertical; unused if it is unknown
+    tilted: strategies.Leaders
+    progress: strategies.Progress
     #: (t, 3): the samples tried; None: all samples of the first candidates, see progress.reach
     samples: NDArray[np.int64] | None = None
     firsts: tuple[int, ...] = (0,)  #: Row of the first landmark of each map
@@ -272,7 +262,7 @@ class SearchedFrame(NamedTuple):
     @property
     def sample_size(self) -> int:
         """Return the number of candidates in a minimal sample."""
-        return SAMPLE_SIZE - 1 if self.vertical[6] > 0.0 else SAMPLE_SIZE
+        return strategies.SAMPLE_SIZE - 1 if self.vertical[6] > 0.0 else strategies.SAMPLE_SIZE
 
     @property
     def has_samples(self) -> bool:
@@ -306,14 +296,16 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
     scene, left_out = match_frame(landmark_map, observation, options)
     frame = SearchedFrame(
         observation, scene, vertical_of(observation, options),
-        Leaders.none_yet(REFINED if options.refine else MAX_DISTINCT), Leaders.none_yet(),
-        Progress(0, 1.0), None, tuple(part.first for part in parts_of(landmark_map)))
+        strategies.Leaders.none_yet(REFINED if options.refine else strategies.MAX_DISTINCT),
+        strategies.Leaders.none_yet(), strategies.Progress(0, 1.0), None,
+        tuple(part.first for part in parts_of(landmark_map)))
     if not frame.has_samples:
         return frame
     samples, constraint = None, constraint_of(observation, options)
     if options.algorithm == 'auto':
-        try_all = partial(search_progressively, scene, compatible_pairs(scene),
-                          constraint=constraint, limit=options.iterations)
+        try_all = partial(
+            strategies.search_progressively, scene, strategies.compatible_pairs(scene),
+            constraint=constraint, limit=options.iterations)
         progress = _run(try_all(frame.leaders, size=frame.sample_size), deadline)
         if frame.vertical[6] > 0.0:
             # The vertical may be wrong, for example because the stated camera mount is wrong. Then
@@ -321,15 +313,16 @@ def search_frame(landmark_map: LandmarkMap, observation: Observation,
             free = _run(try_all(frame.tilted), deadline)
             progress = progress._replace(tried=progress.tried + free.tried)
     elif options.algorithm == 'bf':
-        progress = _run(search_exhaustively(scene, frame.leaders, constraint), deadline)
+        progress = _run(strategies.search_exhaustively(scene, frame.leaders, constraint), deadline)
     else:
-        draw = draw_ransac if options.algorithm == 'ransac' else draw_prosac
+        draw = strategies.draw_ransac if options.algorithm == 'ransac' else strategies.draw_prosac
         seed = options.random_seed if options.random_seed >= 0 else None
         samples = draw(scene.pairs, options.iterations, np.random.default_rng(seed))
-        progress = _run(search_samples(scene, samples, frame.leaders, constraint), deadline)
+        progress = _run(strategies.search_samples(scene, samples, frame.leaders, constraint),
+                        deadline)
     if left_out:  # kept: the share of samples without dropped candidates
-        kept = comb(len(scene.pairs), SAMPLE_SIZE) / max(
-            comb(len(scene.pairs) + left_out, SAMPLE_SIZE), 1)
+        kept = comb(len(scene.pairs), strategies.SAMPLE_SIZE) / max(
+            comb(len(scene.pairs) + left_out, strategies.SAMPLE_SIZE), 1)
         progress = progress._replace(coverage=progress.coverage * kept)
     return frame._replace(progress=progress, samples=samples)
 
@@ -360,9 +353,9 @@ def vertical_of(observation: Observation, options: RelocalizerOptions) -> NDArra
     return np.array([*up, *_UP_IN_MAP, np.radians(options.vertical_deviation_deg)])
 
 
-def _run(search: Iterator[Progress], deadline: Deadline) -> Progress:
+def _run(search: Iterator[strategies.Progress], deadline: Deadline) -> strategies.Progress:
     """Run a search to its end or to a deadline; return its progress."""
-    progress = Progress(0, 1.0)
+    progress = strategies.Progress(0, 1.0)
     for step in search:
         progress = step
         if deadline.is_over:

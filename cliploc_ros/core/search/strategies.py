@@ -64,8 +64,7 @@ def prosac_growth(candidate_count: int, iterations: int) -> NDArray[np.int64]:
     sizes = np.arange(SAMPLE_SIZE, candidate_count)
     drawn = iterations * np.prod([(SAMPLE_SIZE - i) / (candidate_count - i)
                                   for i in range(SAMPLE_SIZE)])
-    expected = drawn * np.cumprod(np.concatenate(
-        [[1.0], (sizes + 1) / (sizes + 1 - SAMPLE_SIZE)]))
+    expected = drawn * np.cumprod(np.concatenate([[1.0], (sizes + 1) / (sizes + 1 - SAMPLE_SIZE)]))
     # The tolerance prevents floating-point error from rounding whole numbers up.
     steps = np.ceil(np.diff(expected) - 1e-9).astype(np.int64)
     return 1 + np.concatenate([[0], np.cumsum(steps)])

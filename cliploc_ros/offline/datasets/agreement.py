@@ -129,14 +129,12 @@ def _pairs(views: Sequence[View], given: Reading) -> Iterator[tuple[View, View]]
     for start in np.unique(np.linspace(0, max(0, last - 1), _TRIED).astype(int)).tolist():
         angles = [transforms.rotation_angle_deg(turns[start].T @ turn)
                   for turn in turns[start + 1:start + 1 + _REACH]]
-        fit = [place for place, angle in enumerate(angles)
-               if _TURN_DEG[0] < angle < _TURN_DEG[1]]
+        fit = [place for place, angle in enumerate(angles) if _TURN_DEG[0] < angle < _TURN_DEG[1]]
         if fit:
             yield views[start], views[start + 1 + fit[0]]
 
 
-def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]
-                     ) -> dict[str, float]:
+def _epipolar_errors(pair: tuple[View, View], readings: Mapping[str, Reading]) -> dict[str, float]:
     """Return the median epipolar error of two images under each reading, by its name [px].
 
     It is negative if the points lie behind both cameras, as in mirrored images.

@@ -236,8 +236,7 @@ def _depth_of_its_camera(reader: BagReader, topics: BagTopics, form: DepthFormat
                        '`depth_baseline`')
 
 
-def _sampled(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Cameras
-             ) -> list[View]:
+def _sampled(reader: BagReader, topics: BagTopics, poses: Poses, cameras: _Cameras) -> list[View]:
     """Return a sample of the images of a recording; each image is read on demand."""
     views, last = [], np.iinfo(np.int64).min
     for begin in np.linspace(reader.start_ns, reader.end_ns, _COMPARED_PARTS, endpoint=False):

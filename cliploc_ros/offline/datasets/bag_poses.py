@@ -357,8 +357,7 @@ def plain_name(frame_id: str) -> str:
     return frame_id.removeprefix('/')
 
 
-def bag_odometry(bag: Path, image_topic: str, source: PoseSource, camera_info: str = ''
-                 ) -> Poses:
+def bag_odometry(bag: Path, image_topic: str, source: PoseSource, camera_info: str = '') -> Poses:
     """Read the poses of a recording's camera in the odometry frame.
 
     DatasetError: the topic or tf is missing or invalid, or does not overlap the images in time.

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from rosbags import interfaces
@@ -125,8 +124,7 @@ class BagReader:
             raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the recording."""
         self._reader.close()
 
@@ -298,8 +296,7 @@ class BagWriter:
             self._removal = begun.pop_all()  # of the folder, at the end
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Complete the recording and move it to its final path, or remove it."""
         with self._removal:
             if kind is None:

@@ -41,8 +41,7 @@ def read_polycam(folder: Path, options: frames.FolderOptions) -> frames.Capture:
     for path in sorted((root / f'{kind}cameras').glob('*.json')):
         fields = parsing.Fields.of_file(path)
         pose = np.eye(4)
-        pose[:3] = [[fields.number(f't_{row}{column}') for column in range(4)]
-                    for row in range(3)]
+        pose[:3] = [[fields.number(f't_{row}{column}') for column in range(4)] for row in range(3)]
         camera = parsing.camera_of(str(path), *fields.size('width', 'height'), *(
             fields.number(name) for name in ('fx', 'fy', 'cx', 'cy')))
         is_stamp = path.stem.isdecimal() and len(path.stem) < 20

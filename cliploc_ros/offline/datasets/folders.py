@@ -116,8 +116,7 @@ def read_sequence(folder: Path, intrinsics: str | None) -> tuple[TumSequence, Ca
             file.number is not None for file in capture.files):
         raise DatasetError(f'{folder}: {layout.name} with {len(cameras)} cameras: a recording '
                            'needs image files of one camera, and poses in metres')
-    files = _place_images(capture.files, capture.axes,
-                                 map_from_stored=_UP[capture.up or 'z'])
+    files = _place_images(capture.files, capture.axes, map_from_stored=_UP[capture.up or 'z'])
     posed = {file.stamp_ns: file.pose for file in files if file.pose is not None}
     trajectory = TimedPoses.from_samples(
         list(posed), [[*pose[:3, 3], *transforms.quaternion_from_transform(pose)]

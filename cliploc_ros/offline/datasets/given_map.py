@@ -248,8 +248,7 @@ def _row(header: Sequence[str], cells: Sequence[str], delimiter: str, where: str
     return row
 
 
-def _landmark_of_row(row: Mapping[str, str], number: int, where: str
-                     ) -> GivenLandmark:
+def _landmark_of_row(row: Mapping[str, str], number: int, where: str) -> GivenLandmark:
     class_id = _text(row, 'class_id', where)
     landmark_id = row.get('id') or make_id(class_id, number)
     if '.' in landmark_id or len(landmark_id) > MAX_LENGTH:

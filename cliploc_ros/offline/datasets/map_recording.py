@@ -17,13 +17,7 @@ import numpy as np
 from cliploc_ros.core.geometry.transforms import is_rigid, make_transform
 from cliploc_ros.core.map.parameter_file import check_set, set_of
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.files.storage import (
-    open_file,
-    parse_json,
-    read_file,
-    resolve_cache_dir,
-    write_text,
-)
+from cliploc_ros.files import storage
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 
@@ -66,7 +60,7 @@ class MapRecording:
 def recordings_folder() -> Path:
     """Return the folder of the observation files that no option names."""
     named = os.environ.get('CLIPLOC_RECORDINGS')
-    return Path(named or resolve_cache_dir('') / 'recordings').resolve()
+    return Path(named or storage.resolve_cache_dir('') / 'recordings').resolve()
 
 
 def recording_path(map_file: Path) -> Path:
@@ -87,7 +81,7 @@ def save_recording(map_file: Path, recording: MapRecording, place: Path | None =
             path = values[name].resolve()
             values[name] = str(path) if path.is_relative_to(recordings_folder()) else (
                 os.path.relpath(path, folder))
-    write_text(place or recording_path(map_file), json.dumps(values, indent=1))
+    storage.write_text(place or recording_path(map_file), json.dumps(values, indent=1))
 
 
 def load_recording(map_file: Path) -> MapRecording | None:
@@ -99,10 +93,10 @@ def load_recording(map_file: Path) -> MapRecording | None:
     if not path.is_file():
         return None
     try:
-        values = parse_json(read_file(path))
+        values = storage.parse_json(storage.read_file(path))
         digest = str(values.pop('set', ''))
         if digest and map_file.exists():
-            with open_file(map_file) as file:
+            with storage.open_file(map_file) as file:
                 check_set(digest, set_of(file.read(_HEAD).decode(errors='replace')).digest)
         paths = {name: map_file.resolve().parent / values[name] for name in _PATHS
                  if values.get(name) is not None}

@@ -130,8 +130,7 @@ def parse_stamp_ns(text: str, where: str, unit_s: Decimal = Decimal(1)) -> int:
     return int((seconds * NS_PER_S).to_integral_value())
 
 
-def unit_quaternion(quat: Sequence[float], where: str, tolerance: float
-                    ) -> NDArray[np.float64]:
+def unit_quaternion(quat: Sequence[float], where: str, tolerance: float) -> NDArray[np.float64]:
     """Normalize a quaternion (4,); DatasetError: its norm is not 1 within the tolerance."""
     norm = math.hypot(*quat)
     if not abs(norm - 1.0) <= tolerance:

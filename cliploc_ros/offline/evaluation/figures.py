@@ -304,8 +304,7 @@ def _top_view(landmark_map: LandmarkMap, queries: Sequence[PosedQuery], results:
               color='#222222', label='true pose', zorder=6)
     for label, color, marker, verdict in (('accepted', '#0072B2', 'o', True),
                                           ('refused', '#D55E00', 'X', False)):
-        chosen = [result for result in first
-                  if result.solved and result.accepted == verdict]
+        chosen = [result for result in first if result.solved and result.accepted == verdict]
         ends = [[truth[result.query][:2, 3], np.array(result.map_from_camera)[:2, 3],
                  np.full(2, np.nan)] for result in chosen]  # a line with gaps is faster than many
         if chosen:

@@ -154,10 +154,9 @@ class Recording:
         assert merged is not None
         boxes = self.boxes_of(landmarks)
         rows = np.unique(np.concatenate([boxes[key] for key in landmark_ids]))
-        fit = (fit_ellipsoid(self.views, rows, merged.center, merged.basis)
-               if len(rows) >= LEAST_BOXES else None)
-        if fit is None:
+        if len(rows) < LEAST_BOXES:
             return change, 'by volume'
+        fit = fit_ellipsoid(self.views, rows, merged.center, merged.basis)
         return edits.merge(landmarks, landmark_ids, (fit.center, fit.basis)), 'by boxes'
 
     def relocalize(self, landmarks: Landmarks, views: Sequence[int],

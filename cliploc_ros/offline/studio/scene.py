@@ -106,8 +106,7 @@ class Ellipsoids:
                 setattr(handle, key, value)
 
     def _added(self, arrays: dict[str, Any], colors: NDArray[np.uint8]) -> list[Any]:
-        add: Any = partial(self._scene.add_batched_meshes_simple, cast_shadow=False,
-                           receive_shadow=False, **arrays)
+        add: Any = partial(self._scene.add_batched_meshes_simple, **_NO_SHADOW, **arrays)
         body = add(self._name, _SPHERE.vertices, _SPHERE.faces, opacity=self._opacity,
                    batched_colors=_linear(colors))
         for modifier in (None, 'shift'):
@@ -179,9 +178,8 @@ def draw_image(scene: viser.SceneApi, picture: NDArray[np.uint8], camera: Camera
                                         (camera.height / 2.0 - camera.cy) / camera.fy, 1.0])
     return [scene.add_image(
         '/view/image', picture, camera.width / camera.fx * _IMAGE_DEPTH_M,
-        camera.height / camera.fy * _IMAGE_DEPTH_M, format='jpeg', cast_shadow=False,
-        receive_shadow=False, wxyz=wxyz_of(map_from_camera),
-        position=map_from_camera[:3, :3] @ middle + map_from_camera[:3, 3])]
+        camera.height / camera.fy * _IMAGE_DEPTH_M, format='jpeg', wxyz=wxyz_of(map_from_camera),
+        position=map_from_camera[:3, :3] @ middle + map_from_camera[:3, 3], **_NO_SHADOW)]
 
 
 def draw_floor(scene: viser.SceneApi, extent: Bounds) -> None:

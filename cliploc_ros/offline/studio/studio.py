@@ -173,8 +173,7 @@ class ReviewQueue:
 
     # ---------------------------------------------------------------------------------------------
 
-    def _decide(self, ids: Sequence[str], decision: str, what: str, gesture: object = None
-                ) -> str:
+    def _decide(self, ids: Sequence[str], decision: str, what: str, gesture: object = None) -> str:
         """Store a decision, and select the next landmark without a decision."""
         self._document.edit(edits.mark, ids, decision, decision=decision, gesture=gesture)
         return self._go_on(ids[-1], what)
@@ -273,8 +272,7 @@ class Studio:
     @property
     def map_from_camera(self) -> NDArray[np.float64]:
         """The pose (4, 4) of the selected view."""
-        pose: NDArray[np.float64] = self.seen().detections.map_from_camera[self.view]
-        return pose
+        return np.asarray(self.seen().detections.map_from_camera[self.view])
 
     @property
     def camera(self) -> Camera:

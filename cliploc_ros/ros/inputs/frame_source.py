@@ -192,8 +192,7 @@ class FrameSource:
 
         The caller holds the condition.
         """
-        if self._subscriptions and time.monotonic() >= max(
-                [self._wanted_until, *self._deadlines]):
+        if self._subscriptions and time.monotonic() >= max([self._wanted_until, *self._deadlines]):
             self._unsubscribe()
         return bool(self._subscriptions)
 

@@ -16,13 +16,7 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 
-from cliploc_ros.core.geometry.transforms import (
-    SAME_SPOT,
-    invert_transform,
-    make_transform,
-    pose_error,
-    transform_from_pose,
-)
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.errors import CliplocError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
@@ -38,7 +32,7 @@ _MAX_GAP_NS = NS_PER_S // 2
 # A message this late, or more late messages in a row than this, means that time was set back.
 _MAX_LATE_NS, _MOST_LATE = NS_PER_S, 5
 # Tolerance of moves [m] and turns [rad]: slipping wheels, pose noise and stamps cause less.
-_SLACK = np.array([SAME_SPOT.distance_m, np.radians(SAME_SPOT.angle_deg)])
+_SLACK = np.array([transforms.SAME_SPOT.distance_m, np.radians(transforms.SAME_SPOT.angle_deg)])
 # Greatest speeds of a robot of unknown speed [m/s], [rad/s]; greatest accelerations [m/s^2],
 # [rad/s^2]; longest time of an acceleration [s]. Not measured. With these values no run of a Husky
 # is cut at 5 Hz or more, see python -m studies.sensors.
@@ -138,7 +132,7 @@ class OdometryWindow:
         if not np.isfinite(values).all() or abs(length - 1.0) > _UNIT_TOLERANCE \
                 or np.abs(position).max() > _FARTHEST_M:
             return False
-        pose = _Pose(stamp_ns, transform_from_pose(position, quat_xyzw))
+        pose = _Pose(stamp_ns, transforms.transform_from_pose(position, quat_xyzw))
         poses = self._poses
         self._late = self._late + 1 if poses and stamp_ns < poses[-1].stamp_ns else 0
         row = bisect_left(poses, stamp_ns, key=_stamp_of)
@@ -209,8 +203,9 @@ class OdometryWindow:
         share = (stamp_ns - before.stamp_ns) / gap_ns
         first, last = before.odom_from_body, after.odom_from_body
         turn = share * _step(before, after)[1]
-        return make_transform(first[:3, :3] @ cv2.Rodrigues(turn)[0],
-                              first[:3, 3] + share * (last[:3, 3] - first[:3, 3]))
+        return transforms.make_transform(
+            first[:3, :3] @ cv2.Rodrigues(turn)[0],
+            first[:3, 3] + share * (last[:3, 3] - first[:3, 3]))
 
     def _fits(self, pose: _Pose, row: int) -> bool:
         """Return whether a robot could move through a pose that is inserted at a row."""
@@ -356,8 +351,7 @@ class OdometrySource(qos.Listener):
         wait if odometry has no publisher.
         """
         def is_recent() -> bool:
-            return (self._newest is not None
-                    and time.monotonic() - self._newest_at <= max_age_s)
+            return (self._newest is not None and time.monotonic() - self._newest_at <= max_age_s)
         with self._heard:
             if self.is_published:
                 self._heard.wait_for(is_recent, patience_s)
@@ -378,7 +372,7 @@ class OdometrySource(qos.Listener):
         if moment is None:
             return None
         before, now, seconds = moment
-        distance_m, angle_deg = pose_error(before, now)
+        distance_m, angle_deg = transforms.pose_error(before, now)
         return distance_m / seconds, math.radians(angle_deg) / seconds
 
     def _last_moment(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
@@ -421,7 +415,7 @@ class OdometrySource(qos.Listener):
             self._heard.wait_for(lambda: not self._window.is_ahead(max(first_ns, last_ns)),
                                  patience_s)
             first, last = self._window.pose_at(first_ns), self._window.pose_at(last_ns)
-            return invert_transform(first) @ last, self._frames[1]
+            return transforms.invert_transform(first) @ last, self._frames[1]
 
     def covers_soon(self, stamp: Time, patience_s: float) -> bool:
         """Return whether odometry covers roughly the stamp of an image, and so the next image.

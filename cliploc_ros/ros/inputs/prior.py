@@ -175,8 +175,7 @@ class PriorSource:
         self._warned = text
 
 
-def planar_of(msg: PoseWithCovarianceStamped
-              ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def planar_of(msg: PoseWithCovarianceStamped) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a pose (4, 4) and the covariance (3, 3) of x, y and yaw.
 
     The covariances of yaw with x and y are set to 0. CliplocError: pose or covariance is invalid.

@@ -176,8 +176,7 @@ class VerticalSource(qos.Listener):
         return np.asarray(camera_from_imu[:3, :3] @ up_in_imu)
 
 
-def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str
-            ) -> NDArray[np.float64]:
+def mean_up(near: Sequence[Sample], samples: Sequence[Sample], topic: str) -> NDArray[np.float64]:
     """Return the mean vertical (3,), a unit vector in the IMU's frame, of samples near an image.
 
     It is the mean of their orientations, or without orientations, of their accelerations. The

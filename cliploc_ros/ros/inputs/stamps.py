@@ -69,8 +69,7 @@ class TimeJumps:
         if not name:
             return
         ahead_ns = stamp_ns(stamp) - self._clock.now().nanoseconds
-        if received_at <= seen_at or (self._clock.ros_time_is_active
-                                      and ahead_ns > _MAX_AHEAD_NS):
+        if received_at <= seen_at or (self._clock.ros_time_is_active and ahead_ns > _MAX_AHEAD_NS):
             raise TimeJumpError(f'{name}: the frame is from before the jump')
 
     def _on_jump(self, jump: TimeJump) -> None:

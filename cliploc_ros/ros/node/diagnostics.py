@@ -156,8 +156,7 @@ class Diagnostics:
         Returns the name of its lifecycle state.
     """
 
-    def __init__(self, node: Node, health: Callable[[], Health], state: Callable[[], str]
-                 ) -> None:
+    def __init__(self, node: Node, health: Callable[[], Health], state: Callable[[], str]) -> None:
         self._node = node
         self._health = health
         self._state = state

@@ -32,15 +32,9 @@ from rclpy.signals import SignalHandlerOptions
 
 from cliploc_ros.command import Interruption, split_ros_args
 from cliploc_ros.errors import CliplocError, OptionsError, StoppedError
+from cliploc_ros.ros.node import threads
 from cliploc_ros.ros.node.diagnostics import Diagnostics, Health, Stages
 from cliploc_ros.ros.node.parameters import NodeParameters, Parameters
-from cliploc_ros.ros.node.threads import (
-    BoundedCallbackGroup,
-    NodeExecutor,
-    Worker,
-    log_failure,
-    steady_timer,
-)
 from cliploc_ros.units import NS_PER_S
 
 #: Least time between two log lines of one cause that recurs with each frame [s].
@@ -127,11 +121,11 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
             raise OptionsError('a parameter has no value: correct the parameter file; a map of '
                                f'keyframes alone is given as map_file ({error})') from error
         LifecycleNodeMixin.__init__(
-            self, callback_group=BoundedCallbackGroup(_MAX_TRANSITION_REQUESTS))
+            self, callback_group=threads.BoundedCallbackGroup(_MAX_TRANSITION_REQUESTS))
         self._log_handler = RosLogHandler(self)
         _PACKAGE_LOGGER.setLevel(logging.INFO)
         _PACKAGE_LOGGER.addHandler(self._log_handler)
-        self.worker = Worker(self.report)
+        self.worker = threads.Worker(self.report)
         self.settings = NodeParameters(self, parameters, others)
         self.active = False
         #: Values that the diagnostics report in every state
@@ -147,7 +141,7 @@ class ManagedNode[P: Parameters](LifecycleNodeMixin, Node):
         self._start: Future[None] | None = None
         self._start_lock = threading.Lock()
         self._pause_s = _FIRST_PAUSE_S
-        self._starter = steady_timer(self, 0.0, self._start_by_itself)
+        self._starter = threads.steady_timer(self, 0.0, self._start_by_itself)
 
     # ---- what a node implements -----------------------------------------------------------------
 
@@ -405,7 +399,7 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
     except Exception as error:  # rcl raises different types for arguments and for folders
         sys.exit(f'error: ROS does not start: {error}; correct the arguments, or set HOME or '
                  'ROS_LOG_DIR to a writable folder')
-    executor = NodeExecutor()
+    executor = threads.NodeExecutor()
     node = None
     try:
         try:
@@ -418,7 +412,7 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], about: str) -> NoR
             try:
                 executor.spin_once(timeout_sec=_SPIN_S)
             except Exception as error:
-                log_failure(error, node)
+                threads.log_failure(error, node)
     except Exception:
         if rclpy.ok():
             raise
