@@ -4,17 +4,14 @@
 
 A reader is defined by a table of fields. Files are untrusted: an invalid file causes an error that
 names the file, the array and the row. Pickles are refused, checksums are verified, and no array
-takes more memory than the file declares. Large arrays may stay in the file, which is then replaced
-but never overwritten.
+takes more memory than the file declares.
 """
 
 import math
 import os
-import weakref
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
-from functools import cached_property
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -30,8 +27,6 @@ Arrays = Mapping[str, NDArray[Any]]
 # Groups of NumPy types by their kind codes. A field may also name a single NumPy type.
 _KINDS = {'text': 'U', 'numbers': 'fiu', 'floats': 'f', 'integers': 'iu', 'booleans': 'b'}
 _ROWS_AT_ONCE = 10_000
-# A larger array may stay in its file; one read returns up to 2 GiB.
-_STAYS_BYTES, _READ_BYTES = 16 * 2**20, 2**30
 # Maximum memory of the arrays: this number of bytes, or this multiple of the file's size on disk.
 # A small or sparse file may declare arrays of any size.
 _MOST_BYTES, _MOST_GROWTH = 512 * 2**20, 8
@@ -41,67 +36,6 @@ _MOST = 1e10
 
 class ArrayError(Exception):
     """A fault of an array; the schema adds the file's name."""
-
-
-@dataclass(frozen=True)
-class StoredArray:
-    """An array (n, ...) that stays in its file: each access reads the rows that it needs.
-
-    Its pickle has the path, not the values. The file may be replaced: it stays open.
-    """
-
-    path: Path
-    start: int  #: Position of the values in the file
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    stamp: tuple[int, int]  #: Size and time of the last change of the file
-
-    def __len__(self) -> int:
-        """Return the number of rows."""
-        return self.shape[0]
-
-    @property
-    def ndim(self) -> int:
-        """Return the number of dimensions."""
-        return len(self.shape)
-
-    def __getitem__(self, rows: Any) -> NDArray[Any]:
-        """Read rows, best as a slice; CliplocError: the file changed or cannot be read."""
-        if not isinstance(rows, slice):
-            return np.asarray(self)[rows]
-        first, last, step = rows.indices(len(self))
-        row_bytes = math.prod(self.shape[1:]) * self.dtype.itemsize
-        place, end = (self.start + row_bytes * row for row in (first, max(first, last)))
-        try:
-            content = b''.join(os.pread(self._number, min(_READ_BYTES, end - begin), begin)
-                               for begin in range(place, end, _READ_BYTES))
-            is_same = stamp_of(self._number) == self.stamp and len(content) == end - place
-        except OSError as error:
-            raise CliplocError(f'{self.path}: cannot be read: {error.strerror}') from error
-        if not is_same:
-            raise CliplocError(f'{self.path}: was overwritten while it was in use; load the map '
-                               'again, and replace files with mv')
-        return np.frombuffer(content, self.dtype).reshape(-1, *self.shape[1:])[::step]
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """Read the whole array."""
-        return self[:].astype(dtype or self.dtype, copy=False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state without the open file."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
-
-    @cached_property
-    def _number(self) -> int:
-        number = os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
-        weakref.finalize(self, os.close, number)
-        return number
-
-
-def stamp_of(descriptor: int) -> tuple[int, int]:
-    """Return size and time of the last change of an open file."""
-    status = os.fstat(descriptor)
-    return status.st_size, status.st_mtime_ns
 
 
 @dataclass(frozen=True)
@@ -138,9 +72,8 @@ class Offsets:
 def _is_not_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
     """Check blocks of rows: their copies as floats take up to eight times the memory."""
     within_row = tuple(range(1, values.ndim))
-    return np.concatenate([
-        ~(np.abs(values[start:start + _ROWS_AT_ONCE].astype(float)) <= _MOST).all(axis=within_row)
-        for start in range(0, len(values) or 1, _ROWS_AT_ONCE)])
+    return np.concatenate([~(np.abs(rows.astype(float)) <= _MOST).all(axis=within_row)
+                           for rows in np.array_split(values, len(values) // _ROWS_AT_ONCE + 1)])
 
 
 FINITE = Check(f'is beyond {_MOST:g} or not finite', _is_not_finite)
@@ -163,7 +96,6 @@ class Field:
     #: Checks that take the name and all arrays, and raise ArrayError
     checks: tuple[Callable[[str, Arrays], None], ...] = ()
     is_optional: bool = False
-    may_stay: bool = False  #: Whether a large array stays in the file, see StoredArray
 
 
 @dataclass(frozen=True)
@@ -247,7 +179,7 @@ class Schema:
             with open_file(path) as file, zipfile.ZipFile(file) as archive:
                 for member in archive.infolist():
                     archive.open(member).close()  # a damaged name would hide an array
-                return self._arrays_of(path, file, archive)
+                return self._arrays_of(file, archive)
         except ArrayError:
             raise
         except OSError as error:
@@ -255,8 +187,7 @@ class Schema:
         except Exception as error:  # zipfile may raise any exception for a damaged file
             raise ArrayError(f'is not a complete npz file ({error})') from error
 
-    def _arrays_of(self, path: Path, file: BinaryIO, archive: zipfile.ZipFile
-                   ) -> dict[str, NDArray[Any]]:
+    def _arrays_of(self, file: BinaryIO, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
         members = {member.filename.removesuffix('.npy'): member for member in archive.infolist()
                    if member.filename.endswith('.npy')}
         for name, entry in self.fields.items():
@@ -271,44 +202,27 @@ class Schema:
         if unpacked > max(_MOST_BYTES, _MOST_GROWTH * on_disk):
             raise ArrayError(f'unpacks to {unpacked >> 20} MiB, more than {_MOST_GROWTH} times '
                              'its size on disk')
-        arrays = dict[str, NDArray[Any]]()
+        arrays = {}
         for name, member in wanted.items():
             try:
-                arrays[name] = _array(archive, member, *(
-                    (file, path) if self.fields[name].may_stay else ()))
+                arrays[name] = _array(archive, member)
             except Exception as error:  # NumPy and zipfile may raise any exception, see above
                 raise ArrayError(f'array {name} cannot be read: {error}') from error
         return arrays
 
 
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, file: BinaryIO | None = None,
-           path: Path = Path()) -> Any:
-    """Read an array of a file; it takes no more memory than the archive declares.
-
-    If the file is given, a large array stays in it; its checksum is verified.
-    """
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    """Read an array of a file; it takes no more memory than the archive declares."""
     with archive.open(member) as stream:
         version = np.lib.format.read_magic(stream)
         read = (np.lib.format.read_array_header_1_0 if version == (1, 0)
                 else np.lib.format.read_array_header_2_0)
-        shape, is_by_columns, dtype = read(stream)
+        shape, _, dtype = read(stream)
         size, expected = member.file_size - stream.tell(), math.prod(shape) * dtype.itemsize
         if dtype.hasobject:
             raise ValueError('it contains Python objects')
         if size != expected:
             raise ValueError(f'it has {size} bytes, expected {expected}')
-        if file is not None and size > _STAYS_BYTES and not (
-                is_by_columns or member.compress_type):
-            # after the local header (30 bytes and two texts) and that of NumPy
-            name, extra = np.frombuffer(os.pread(
-                file.fileno(), 4, member.header_offset + 26), '<u2').tolist()
-            stored = StoredArray(
-                path.absolute(), member.header_offset + 30 + name + extra + stream.tell(), shape,
-                dtype, stamp_of(file.fileno()))
-            while stream.read(_ROWS_AT_ONCE):  # the end verifies the checksum
-                pass
-            _ = stored[:1]  # opens the file, unless it was just replaced
-            return stored
         stream.seek(0)
         array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
     return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array
