@@ -16,15 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry import depth
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults, check_faults
-from cliploc_ros.core.geometry.depth import (
-    PLAUSIBLE_DEPTH_M,
-    DepthCamera,
-    DepthImage,
-    depth_from_counts,
-    depths_of_boxes,
-)
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
@@ -375,7 +369,7 @@ def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDA
     CliplocError
         The message is invalid, or does not belong to the image.
     """
-    depths_m = depth_from_counts(depth_counts_from_msg(msg), None, 'depth')
+    depths_m = depth.depth_from_counts(depth_counts_from_msg(msg), None, 'depth')
     height, width = depths_m.shape
     own = None
     if msg.header.frame_id != image_frame:
@@ -389,12 +383,13 @@ def depths_from_msg(msg: Any, image_frame: str, camera: Camera, bboxes_xyxy: NDA
         if not seen_by.is_pinhole:
             raise ImageError('depth is not rectified according to its camera_info: publish '
                              'rectified depth')
-        own = DepthCamera(seen_by.fx, seen_by.fy, seen_by.cx, seen_by.cy, color_from_depth)
+        own = depth.DepthCamera(seen_by.fx, seen_by.fy, seen_by.cx, seen_by.cy, color_from_depth)
     elif abs(width * camera.height / (height * camera.width) - 1.0) > _SAME_ASPECT:
         raise ImageError(f'depth has {width}x{height} px, the image {camera.width}x'
                          f'{camera.height}: publish depth registered to the image')
-    depths = depths_of_boxes(DepthImage(depths_m, own), camera, bboxes_xyxy)[0].astype(np.float64)
-    known, (least, greatest) = depths[np.isfinite(depths)], PLAUSIBLE_DEPTH_M
+    image = depth.DepthImage(depths_m, own)
+    depths = depth.depths_of_boxes(image, camera, bboxes_xyxy)[0].astype(np.float64)
+    known, (least, greatest) = depths[np.isfinite(depths)], depth.PLAUSIBLE_DEPTH_M
     if len(known) and not least < np.median(known) < greatest:
         raise ImageError(f'the median depth of the boxes is {np.median(known):.3g} m: publish '
                          '16UC1 in millimetres, 32FC1 in metres')

@@ -8,8 +8,17 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry import ellipsoid, transforms
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.ellipsoid import (
+    ellipse_bboxes,
+    ellipses_in_pixels,
+    project_ellipsoids,
+)
+from cliploc_ros.core.geometry.transforms import (
+    invert_transform,
+    make_transform,
+    transform_from_pose,
+)
 from cliploc_ros.core.keyframes.features import DIMENSIONS
 from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
 from cliploc_ros.core.map import map_file
@@ -21,8 +30,8 @@ from cliploc_ros.offline.recording.layer_words import with_words
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 #: Looks along the map's z axis, not level: rotate room and pose first if a vertical matters.
-MAP_FROM_CAMERA = transforms.transform_from_pose(np.array([0.3, -0.2, -0.5]),
-                                                 np.array([0.02, -0.05, 0.03, 0.99794]))
+MAP_FROM_CAMERA = transform_from_pose(np.array([0.3, -0.2, -0.5]),
+                                      np.array([0.02, -0.05, 0.03, 0.99794]))
 
 
 def unit_rows(rows):
@@ -32,14 +41,14 @@ def unit_rows(rows):
 
 def rigid(position=(0.0, 0.0, 0.0), axis='z', degrees=0.0):
     """Return a transform (4, 4): a turn about an axis, then a shift [m]."""
-    return transforms.make_transform(Rotation.from_euler(axis, degrees, degrees=True).as_matrix(),
-                                     np.array(position, dtype=float))
+    return make_transform(Rotation.from_euler(axis, degrees, degrees=True).as_matrix(),
+                          np.array(position, dtype=float))
 
 
 def level(x=0.0, y=0.0, yaw_deg=0.0, z=1.0):
     """Return the pose of a level camera; with yaw 0 it looks along the x axis."""
     axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    return rigid((x, y, z), degrees=yaw_deg) @ transforms.make_transform(axes, np.zeros(3))
+    return rigid((x, y, z), degrees=yaw_deg) @ make_transform(axes, np.zeros(3))
 
 
 def map_of(class_ids, centers, semi_axes=0.2) -> LandmarkMap:
@@ -79,9 +88,9 @@ def with_others(landmark_map: LandmarkMap, count: int) -> LandmarkMap:
 
 def boxes_of(landmarks: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, camera=CAMERA):
     """Return the boxes (n, 4) of landmarks from a perfect detector; NaN behind the camera."""
-    outlines = ellipsoid.project_ellipsoids(
-        transforms.invert_transform(map_from_camera), landmarks.centers, landmarks.shapes)
-    return ellipsoid.ellipse_bboxes(ellipsoid.ellipses_in_pixels(outlines, camera))
+    outlines = project_ellipsoids(invert_transform(map_from_camera), landmarks.centers,
+                                  landmarks.shapes)
+    return ellipse_bboxes(ellipses_in_pixels(outlines, camera))
 
 
 def see_room(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA) -> Detections:
@@ -101,7 +110,8 @@ SEEN = see_room(ROOM)
 BY_CLASS = RelocalizerOptions(matching='class')
 
 
-def observe(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, rows=None, **known) -> Observation:
+def observe(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, rows=None, **known
+            ) -> Observation:
     """Return a perfect observation of some landmarks, in the order of their rows."""
     seen = see_room(room, map_from_camera)
     rows = np.arange(len(room)) if rows is None else np.array(rows, dtype=np.int64)
@@ -110,7 +120,7 @@ def observe(room: LandmarkMap, map_from_camera=MAP_FROM_CAMERA, rows=None, **kno
 
 def depth_image(room: LandmarkMap, map_from_camera, bboxes_xyxy):
     """Return depth (h, w) [m]: boxes (n, 4) at the near side of objects, and a wall at 8 m."""
-    camera_from_map = transforms.invert_transform(map_from_camera)
+    camera_from_map = invert_transform(map_from_camera)
     centers = room.centers @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
     with np.errstate(invalid='ignore', divide='ignore'):
         pixels = CAMERA.fx * centers[:, :2] / centers[:, 2:] + (CAMERA.cx, CAMERA.cy)

@@ -103,7 +103,9 @@ def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
         random_seed=options.seed)
     thresholds = Thresholds(**{field.name: getattr(options, field.name)
                                for field in fields(Thresholds)})
-    image_of = None if detections is None or images is None else partial(images.of, detections)
+    image_of = None
+    if detections is not None and images is not None:
+        image_of = partial(images.of, detections)
     layer = read_layer(options.map, landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)

@@ -311,8 +311,9 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     wanted = options.keyframes
     if wanted is None and not case.report.get('parameters', {}).get('keyframes_file', True):
         wanted = False
-    layer = None if len(options.map) > 1 else shared.read_layer(
-        options.map[0], landmark_map, wanted)
+    layer = None
+    if len(options.map) == 1:
+        layer = shared.read_layer(options.map[0], landmark_map, wanted)
     again = repeat(case, Localizer(Relocalizer(landmark_map, case.options),
                                    None if layer is None else KeyframeLocalizer(layer)), observer)
     is_same = again.accepted == (case.report.get('found') == 'accepted')

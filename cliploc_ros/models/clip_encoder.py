@@ -34,14 +34,9 @@ from cliploc_ros.core.map.similarities import LabelEmbeddings
 from cliploc_ros.errors import MapError, ModelError
 from cliploc_ros.files.arrays import Check, Field, Schema
 from cliploc_ros.files.storage import MAKE_ROOM, check_owners, resolve_cache_dir, warn_not_kept
+from cliploc_ros.models import onnx_clip
 from cliploc_ros.models.files import new_entry
 from cliploc_ros.models.observer import crop_bounds
-from cliploc_ros.models.onnx_clip import (
-    ClipWeights,
-    OnnxTextTower,
-    OnnxTower,
-    resolve_clip_weights,
-)
 from cliploc_ros.models.onnx_network import free_memory
 from cliploc_ros.models.protocols import ClipOptions
 
@@ -72,7 +67,7 @@ def load_encoder_for_map(options: ClipOptions, landmark_map: LandmarkMap,
     """
     started = time.monotonic()
     embeddings = embed_map(options, landmark_map, map_files, compare)
-    weights = resolve_clip_weights(options)
+    weights = onnx_clip.resolve_clip_weights(options)
     encoder = ClipEncoder(weights, options)
     logger.info('CLIP %s is ready after %.1f s', weights.model, time.monotonic() - started)
     return encoder, embeddings
@@ -89,7 +84,7 @@ def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequen
 
     ModelError: the weights cannot be found or loaded.
     """
-    weights = resolve_clip_weights(options)
+    weights = onnx_clip.resolve_clip_weights(options)
     # Unique and sorted, so that moving or reordering landmarks needs no new embeddings.
     unique = sorted(set(landmark_map.weighted_labels))
     rows = {description: row for row, description in enumerate(unique)}
@@ -105,8 +100,8 @@ def embed_map(options: ClipOptions, landmark_map: LandmarkMap, map_files: Sequen
     return labels
 
 
-def _images_of_all(weights: ClipWeights, landmark_map: LandmarkMap, map_files: Sequence[str]
-                   ) -> LandmarkEmbeddings | None:
+def _images_of_all(weights: onnx_clip.ClipWeights, landmark_map: LandmarkMap,
+                   map_files: Sequence[str]) -> LandmarkEmbeddings | None:
     """Return the image embeddings of all maps; None unless each map has some of this encoder."""
     parts = parts_of(landmark_map)
     if len(map_files) != len(parts):
@@ -126,7 +121,7 @@ def _images_of_all(weights: ClipWeights, landmark_map: LandmarkMap, map_files: S
     return concatenated(known, landmark_map.landmark_ids)
 
 
-def _images(weights: ClipWeights, landmark_map: LandmarkMap, map_file: str
+def _images(weights: onnx_clip.ClipWeights, landmark_map: LandmarkMap, map_file: str
             ) -> LandmarkEmbeddings | None:
     """Return the image embeddings of a map by this encoder; None if there are none."""
     try:
@@ -162,9 +157,9 @@ class ClipEncoder:
     ModelError: the files do not hold a CLIP, or embeddings are not finite.
     """
 
-    def __init__(self, weights: ClipWeights, options: ClipOptions) -> None:
+    def __init__(self, weights: onnx_clip.ClipWeights, options: ClipOptions) -> None:
         self._weights = weights
-        self._tower = OnnxTower(weights, options.cache_dir)
+        self._tower = onnx_clip.OnnxTower(weights, options.cache_dir)
         #: Equal keys (model and weights) give equal label embeddings.
         self.key = weights.key
         self.embed_dim = weights.embed_dim  #: The length d of an embedding
@@ -188,7 +183,7 @@ class ClipEncoder:
                           self._weights)
 
 
-def encode_labels(weights: ClipWeights, labels: Sequence[str], options: ClipOptions
+def encode_labels(weights: onnx_clip.ClipWeights, labels: Sequence[str], options: ClipOptions
                   ) -> NDArray[np.float32]:
     """Return the embeddings (L, d) of labels, float32 rows of unit length.
 
@@ -198,7 +193,8 @@ def encode_labels(weights: ClipWeights, labels: Sequence[str], options: ClipOpti
     """
     features = []
     if labels:
-        tower, ends = OnnxTextTower(weights, options.cache_dir), 2  # the tokens of start and end
+        ends = 2  # the tokens of start and end
+        tower = onnx_clip.OnnxTextTower(weights, options.cache_dir)
         for label in labels:
             if (count := tower.count(label)) > tower.context:
                 logger.warning("label '%s' has %d tokens: CLIP reads the first %d and ignores the "
@@ -209,7 +205,7 @@ def encode_labels(weights: ClipWeights, labels: Sequence[str], options: ClipOpti
     return _unit_rows(features, weights)
 
 
-def _unit_rows(features: Sequence[NDArray[np.float32]], weights: ClipWeights
+def _unit_rows(features: Sequence[NDArray[np.float32]], weights: onnx_clip.ClipWeights
                ) -> NDArray[np.float32]:
     """Scale features to rows of unit length."""
     rows = np.concatenate([np.empty((0, weights.embed_dim), dtype=np.float32), *features])

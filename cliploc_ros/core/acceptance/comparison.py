@@ -23,8 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance import confidence
 from cliploc_ros.core.acceptance.camera_check import CALIBRATED
+from cliploc_ros.core.acceptance.confidence import (
+    confidences,
+    objects_utility,
+    points_utility,
+    utilities,
+)
 from cliploc_ros.core.acceptance.contenders import Contender, JoinedFrames, join_frames, unrefined
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, compare_motion, signs_of
 from cliploc_ros.core.acceptance.look_alikes import find_twins, lead_over_twin, turned_about_axis
@@ -136,9 +141,10 @@ class Comparison:
             or self._by_points >= self._joined.options.min_confidence)
         return None if is_sure else self.by_objects
 
-    def _confidences(self, rows: NDArray[np.int64], odds: Sequence[float]) -> NDArray[np.float64]:
+    def _confidences(self, rows: NDArray[np.int64], odds: Sequence[float]
+                     ) -> NDArray[np.float64]:
         """Return the probabilities (r,) of the contenders of some rows, given their odds."""
-        return confidence.confidences(np.array(odds), self.poses[rows], self._none, prior=np.array(
+        return confidences(np.array(odds), self.poses[rows], self._none, prior=np.array(
             [self.contenders[row].prior for row in rows]))
 
     def proposed(self, seen: Recognition, met: Sequence[Contender]) -> list[Contender]:
@@ -154,8 +160,7 @@ class Comparison:
             [place.tilt_error <= most for place in seen.places])
         proposed = []
         for contender, place in zip(found, seen.places, strict=True):
-            points = confidence.points_utility(place)
-            objects = confidence.objects_utility(contender.support)
+            points, objects = points_utility(place), objects_utility(contender.support)
             alone = self._none + points - contender.handicap
             agreeing = [other.odds for other in met
                         if SAME_ANSWER.agree(contender.pose, other.pose)]
@@ -274,10 +279,9 @@ class Comparison:
         found = [mirrored.refined(start) for start in starts]
         supports = mirrored.supports(np.array([pose.map_from_camera for pose in found]),
                                      [matches_of(mirrored.rig, pose) for pose in found])
-        own, = confidence.utilities([best.support] if len(joined.frames) == len(best.matches)
-                                    else joined.supports(best.pose[None], [matches]))
-        most = confidence.utilities(supports).max()
-        lead = CALIBRATION.attitude.not_mirrored + float(own - most)
+        own, = utilities([best.support] if len(joined.frames) == len(best.matches)
+                         else joined.supports(best.pose[None], [matches]))
+        lead = CALIBRATION.attitude.not_mirrored + float(own - utilities(supports).max())
         return 1.0 / (1.0 + math.exp(-max(lead, -50.0)))
 
     def _uncontradicted(self) -> float:
@@ -286,8 +290,7 @@ class Comparison:
         Only confident recognitions count here. The comparison itself includes the evidence of a
         dozen points.
         """
-        chance = max((1.0 / (1.0 + math.exp(-max(
-            confidence.points_utility(contender.recognized), -50.0)))
+        chance = max((1.0 / (1.0 + math.exp(-max(points_utility(contender.recognized), -50.0)))
                       for contender in self.contenders if contender.recognized is not None),
                      default=0.0)
         return 1.0 if self.place or chance < self._joined.options.min_confidence else 1.0 - chance
@@ -368,10 +371,10 @@ class Comparison:
         covered = np.array([self._recognizer.coverage(pose) for pose in [leading.pose, *twins]])
         known = np.where(are_rooms, np.minimum(1.0, covered[1:] / max(covered[0], 1e-9)), 1.0)
         theirs = np.array([max([0.0] + [
-            confidence.points_utility(contender.recognized) for contender in self.contenders
+            points_utility(contender.recognized) for contender in self.contenders
             if contender.recognized is not None and SAME_ANSWER.agree(contender.pose, pose)])
             for pose in twins])
-        leads = np.maximum(0.0, known * max(0.0, confidence.points_utility(self.place)) - theirs)
+        leads = np.maximum(0.0, known * max(0.0, points_utility(self.place)) - theirs)
         is_sure = 1.0 / (1.0 + np.exp(-leads)) >= self._joined.options.min_confidence
         return np.where(is_sure, np.inf, leads)
 
