@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.visibility import log_evidence, log_odds_there
+from cliploc_ros.core.map.presence import STAYS, probability_there
 from cliploc_ros.offline.mapping.association import associate, find_overlaps
 from cliploc_ros.offline.mapping.building import LeftOut, NothingFoundError, build_map, rounded
 from cliploc_ros.offline.mapping.doubles import Relation, close_pairs, relation
@@ -30,17 +29,10 @@ from cliploc_ros.offline.mapping.views import Views
 # less often than before.
 _FACTOR_RANGE = (0.3, 2.0)
 _RATIO_RANGE = (0.02, 0.95)
-# Least number of landmarks, and of viewpoints of each, to estimate the scatter of the ratios;
-# least weight of a usual ratio [views]. Chosen.
-_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
-_FEW_LANDMARKS, _FEW_VIEWS, _LEAST_WORTH = 5, 3, 0.5
 # Share of the objects that are usually still in their place; share of the views in which an object
 # is detected, if neither map nor recording give it; share of the views with a false detection in
 # an empty place. Chosen, like all values below.
-_STAYS, _SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.9, 0.03
-# The seen ratio counts as this number of views at most: an object may be hard to see from one
-# side.
-_PRIOR_VIEWS = 4.0
+_SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.03
 # An object is gone if its probability of being there is below the first number, or the second one
 # if another object was found in its place. It is there if the probability is above the third one.
 _GONE_BELOW, _GONE_BELOW_IF_TAKEN, _THERE_ABOVE = 0.05, 0.5, 0.95
@@ -154,7 +146,7 @@ def judge(detections: PosedDetections, views: Views, known: alignment.OldMap,
                 & (refits.is_known | (_probability_there(known, own) > _THERE_ABOVE)))
     # boxes place it elsewhere, but may not suffice for a find there: then it may not be gone
     is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
-        ~is_there & ~is_gone & (is_rare | _is_absent(known, own, _STAYS))
+        ~is_there & ~is_gone & (is_rare | _is_absent(known, own, STAYS))
         & (known.landmarks.classes >= 0))
     return Judgement(shown, finds, sight, is_gone, is_there, is_doubtful)
 
@@ -190,19 +182,7 @@ def _probability_there(known: alignment.OldMap, sight: Sight) -> NDArray[np.floa
         factor = np.clip(sight.seen[told].sum() / max(expected, 1e-9), *_FACTOR_RANGE)
         ratios = np.where(np.isnan(given), ratios, factor * ratios)
     ratios = np.clip(ratios, *_RATIO_RANGE)
-    # the usual ratios count as few views if this recording scatters about them: a beta variable
-    # of mean r and n views has the variance r (1 - r) / (n + 1)
-    certainty, rows = _PRIOR_VIEWS, seen & (sight.expected >= _FEW_VIEWS)
-    if np.count_nonzero(rows) >= _FEW_LANDMARKS:
-        shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
-        # the median excludes objects that are gone, which are not scatter
-        scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
-        certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH,
-                                  _PRIOR_VIEWS))
-    there, away = (log_evidence(views * share, views * (1.0 - share), sight.seen,
-                                sight.expected - sight.seen)
-                   for views, share in ((certainty, ratios), (_PRIOR_VIEWS, _CHANCE_RATIO)))
-    return np.asarray(expit(log_odds_there(_STAYS, there, away)))
+    return probability_there(sight.seen, sight.expected, ratios, _CHANCE_RATIO)
 
 
 def _look(views: Views, known: alignment.OldMap, finds: Finds, is_gone: NDArray[np.bool_]
