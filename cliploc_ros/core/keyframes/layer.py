@@ -82,10 +82,18 @@ class KeyframeLayer:
         """Return the number of keyframes."""
         return len(self.map_from_camera)
 
-    def select(self, chosen: NDArray[np.bool_]) -> 'KeyframeLayer':
+    def plain(self) -> 'KeyframeLayer':
+        return self
+
+    def select(self, chosen: NDArray[np.bool_], points: NDArray[np.bool_] | None = None
+               ) -> 'KeyframeLayer':
         """Return a layer of the keyframes that a mask (K,) selects, without their small images."""
         counts = np.diff(self.offsets)
         rows = np.repeat(chosen, counts)
+        if points is not None:
+            owners = np.repeat(np.arange(len(self)), counts)
+            counts = np.bincount(owners, points, len(self)).astype(np.int64)
+            rows &= points
         return replace(
             self, map_from_camera=self.map_from_camera[chosen],
             offsets=np.cumsum([0, *counts[chosen]]), images=None, image_offsets=None,

@@ -29,9 +29,9 @@ from cliploc_ros.errors import MapError
 # Number of keyframes to match: the most similar, the most similar at other places (so that places
 # that look alike are found), and keyframes near each pose that objects propose.
 _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
-# With fewer agreeing points, more keyframes are matched: this many near the pose, and as many of
+#: With fewer agreeing points, more keyframes are matched: this many near the pose, and as many of
 # the next similar keyframes.
-_ENOUGH_INLIERS, _MORE = 100, 5
+ENOUGH_INLIERS, _MORE = 100, 5
 # An image's words may resemble those of the wrong keyframes. If none of the above shows the place,
 # the strongest 600 features are matched with the next 25 keyframes. A chance pose has up to 8
 # inliers among these matches, so 20 are required.
@@ -231,7 +231,7 @@ class KeyframeLocalizer:
                        if keyframe not in chosen]
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
-        if first is None or first.agreed < _ENOUGH_INLIERS:
+        if first is None or first.agreed < ENOUGH_INLIERS:
             # also match keyframes near the pose, and the next similar keyframes
             near = keyframes_near(poses, first.map_from_camera)[:_MORE].tolist() if first else []
             more = [rank for rank in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
@@ -429,11 +429,12 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
     return max(places, key=lambda place: place.agreed, default=None)
 
 
-def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
+def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64], most: float = 1.0
+                   ) -> NDArray[np.int64]:
     """Return the keyframes whose views overlap the view of a pose, the closest first."""
     costs = _distances(poses, guess)
     order = np.argsort(costs, kind='stable')
-    return np.asarray(order[costs[order] < 1.0])
+    return np.asarray(order[costs[order] < most])
 
 
 def _distances(poses: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:

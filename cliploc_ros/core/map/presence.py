@@ -22,14 +22,15 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.visibility import SIDES, Expected
 
 Values = float | NDArray[Any]
-#: Share of the objects that are usually still in their place. Chosen, like the number of looks that a usual
-# share counts as at most: an object may be hard to see from one side. Chosen.
-STAYS, _MOST_WORTH = 0.9, 4.0
+#: Share of the objects that are usually still in their place. Chosen.
+STAYS = 0.9
+# A usual share counts as this number of looks at most: an object may be hard to see from one side.
+_MOST_WORTH = 4.0
 # Median of the square of a standard normal variable; least worth of a usual share [looks], and
 # least number of places and of looks at each to estimate the worth. Chosen.
 _MEDIAN_SQUARE, _LEAST_WORTH, _FEW_PLACES, _FEW_LOOKS = 0.455, 0.5, 5, 3
-# The watch: prior of the share of looks that find a present landmark: mean over all landmarks, weight of this
-# mean in looks, and weight of the overall share (or of the map's seen_ratio) in looks where a
+# The watch: prior of the share of looks that find a present landmark: mean over all landmarks,
+# weight of this mean in looks, and weight of the overall share (or of the map's seen_ratio) in looks where a
 # single landmark is judged. Chosen.
 _FOUND, _OF_FOUND, _OF_SHARE = 0.75, 10.0, 3.0
 # Limits of this share.
@@ -64,7 +65,7 @@ def log_odds_there(stays: float, there: Values, away: Values) -> Values:
 
 
 def probability_there(seen: NDArray[Any], expected: NDArray[Any], shares: Values, chance: float,
-                      most_worth: float = MOST_WORTH) -> NDArray[np.float64]:
+                      most_worth: float = _MOST_WORTH) -> NDArray[np.float64]:
     """Return for each place (L,) the probability that its object is there.
 
     Parameters

@@ -29,9 +29,8 @@ from cliploc_ros.offline.mapping.views import Views
 # less often than before.
 _FACTOR_RANGE = (0.3, 2.0)
 _RATIO_RANGE = (0.02, 0.95)
-# Share of the objects that are usually still in their place; share of the views in which an object
-# is detected, if neither map nor recording give it; share of the views with a false detection in
-# an empty place. Chosen, like all values below.
+# Share of the views in which an object is detected, if neither map nor recording give it; share of
+# the views with a false detection in an empty place. Chosen, like all values below.
 _SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.03
 # An object is gone if its probability of being there is below the first number, or the second one
 # if another object was found in its place. It is there if the probability is above the third one.

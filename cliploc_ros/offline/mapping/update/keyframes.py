@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Decide which keyframes, and which of their points, a recording confirms, retires or adds.
+
+The keyframes of the recording look for the points of old keyframes with nearly the same view. A
+point is found if a feature at its projection matches. The points of a keyframe, and those of each
+cube of the room in all keyframes, are gone if hardly any look finds them, while others are found.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cliploc_ros.core.geometry.ellipsoid import normalized_lengths
+from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
+from cliploc_ros.core.keyframes.localization import ENOUGH_INLIERS, keyframes_near
+from cliploc_ros.core.map.presence import probability_there
+from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.mapping.landmarks import Landmarks
+from cliploc_ros.offline.recording.keyframe_layer import LEAST_POINTS, join_layers
+
+# A keyframe is looked for in this number of nearest views, up to this distance of views: 1.2 m or
+# 24 degrees. A feature is at the projection of a point up to this angle: 8 px at f = 525 px.
+_VIEWS, _NEAR, _AT_PLACE = 6, 0.6, 8.0 / 525.0
+# A point is out of view without features within this angle, or if the nearest of them are nearer
+# to the camera by this share of its depth.
+_BESIDE, _NEIGHBOURS, _HIDING = 40.0 / 525.0, 3, 0.8
+# Edge of the cubes [m]; share of looks that find a point that is gone; greatest worth of the usual
+# share [looks]; a place below this probability is gone. Measured on the kitchen in thirds: .2 of
+# the looks find points that are there, at least .035 in each cube with 100 looks; at most .011
+# find points 1 m from their place.
+_CUBE_M, _CHANCE, _WORTH, _GONE_BELOW = 0.5, 0.005, 15.0, 0.05
+# With a smaller share of found points, the recording does not show the place of the keyframes.
+# Least number of looks at a keyframe that confirm it.
+_LEAST_SHARE, _FEW_LOOKS = 0.03, 20
+
+
+class KeyframeFate(NamedTuple):
+    """What became of a keyframe."""
+
+    keyframe: int  #: Its number in the old layer; in that of the recording if it is added
+    fate: str  #: 'confirmed', 'retired', 'not observed' or 'added'
+    position: list[float]  #: Of the camera in the map [m]
+    points: int  #: Number of its points
+    removed: int = 0  #: Number of points that were removed
+    looks: int = 0  #: Number of looks for its points
+    found: int = 0  #: Number of these looks that found the point
+
+
+class UpdatedLayer(NamedTuple):
+    """A layer after an update."""
+
+    layer: KeyframeLayer
+    removed: KeyframeLayer | None  #: The points that were removed; None without any
+    fates: tuple[KeyframeFate, ...]
+
+    def line(self) -> str:
+        """Return the numbers of keyframes as text."""
+        fates = [fate.fate for fate in self.fates]
+        counts = (f'{fates.count(name)} {name}' for name in
+                  ('confirmed', 'retired', 'added', 'not observed'))
+        return f'keyframes: {", ".join(counts)}; {sum(fate.removed for fate in self.fates)} ' \
+               'points removed'
+
+
+class _Looks(NamedTuple):
+    """Looks for points of old keyframes in keyframes of a recording."""
+
+    points: NDArray[np.int64]  #: (l,): row of the old point
+    partners: NDArray[np.int64]  #: (l,): row of the new point that it matches; -1: not found
+
+    def are_gone(self, places: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return a mask of the points (n,) whose places are gone; `places` (n,) has numbers."""
+        expected, found = (np.bincount(places[self.points], weights, places.max() + 1)
+                           for weights in (None, self.partners >= 0))
+        are_seen = found > 2.0 * _CHANCE * expected
+        share = found[are_seen].sum() / max(1.0, expected[are_seen].sum())
+        return np.asarray(probability_there(found, expected, share, _CHANCE, _WORTH)
+                          < _GONE_BELOW)[places]
+
+
+_NO_LOOKS = _Looks(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
+
+
+def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks) -> UpdatedLayer:
+    """Update the keyframes of a map.
+
+    Parameters
+    ----------
+    new : KeyframeLayer, optional
+        Of the recording, with poses in the map. None: the recording has no images.
+    gone : Landmarks
+        Objects that are no longer in these places.
+
+    Raises
+    ------
+    MappingError
+        The recording does not show the place of the keyframes.
+    """
+    old, count = old.plain(), len(old)
+    sizes = np.diff(old.offsets)
+    owners = np.repeat(np.arange(count), sizes)
+    points = np.concatenate([old.points_in_map(keyframe) for keyframe in range(count)])
+    is_gone, looks = np.zeros(len(points), dtype=np.bool_), _NO_LOOKS
+    for center, basis in zip(gone.centers, gone.bases, strict=True):
+        is_gone |= normalized_lengths(points - center, (basis @ basis.T)[None]) < 1.0
+    if new is not None:
+        looks = _look_for(old, new)
+        _, cubes = np.unique(np.floor(points / _CUBE_M), axis=0, return_inverse=True)
+        is_gone |= looks.are_gone(cubes.ravel()) | looks.are_gone(owners)
+    expected, found = (np.bincount(owners[looks.points], weights, count).astype(np.int64)
+                       for weights in (None, looks.partners >= 0))
+    # a keyframe that lost points stays by the others, unless they were looked for and not found
+    removed = np.bincount(owners, is_gone, count)
+    is_kept = (removed == 0) | ((sizes - removed >= LEAST_POINTS) & (
+        (expected < _FEW_LOOKS) | (found >= LEAST_POINTS)))
+    is_gone |= ~is_kept[owners]
+    names = np.where(expected >= _FEW_LOOKS, 'confirmed', 'not observed')
+    layers, fates = [old.select(is_kept, ~is_gone)], [KeyframeFate(*row) for row in zip(
+        range(count), np.where(is_kept, names, 'retired').tolist(), old.map_from_camera[:, :3, 3].round(3).tolist(), sizes.tolist(),
+        np.bincount(owners, is_gone, count).astype(np.int64).tolist(), expected.tolist(),
+        found.tolist(), strict=True)]
+    if new is not None:
+        shown = np.unique(looks.partners[(looks.partners >= 0) & ~is_gone[looks.points]])
+        agreed = np.diff(np.searchsorted(shown, new.offsets))
+        layers.append(new.select(agreed < ENOUGH_INLIERS))
+        fates += [KeyframeFate(row, 'added', new.map_from_camera[row, :3, 3].round(3).tolist(),
+                           int(np.diff(new.offsets)[row]))
+                  for row in np.nonzero(agreed < ENOUGH_INLIERS)[0].tolist()]
+    went = np.bincount(owners, is_gone, count) > 0
+    return UpdatedLayer(join_layers(layers), old.select(went, is_gone) if went.any() else None,
+                        tuple(fates))
+
+
+def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Looks:
+    """Look for the points of old keyframes in the nearest views of a recording."""
+    seen = [np.asarray(new.points[new.rows(view)], dtype=np.float64) for view in range(len(new))]
+    bearings = [points[:, :2] / points[:, 2:] for points in seen]
+    trees = [*map(cKDTree, bearings)]
+    looks = [_NO_LOOKS]
+    for keyframe, pose in enumerate(old.map_from_camera):
+        points, start = old.points_in_map(keyframe), old.rows(keyframe).start
+        for view in keyframes_near(new.map_from_camera, pose, _NEAR)[:_VIEWS].tolist():
+            camera_from_map = invert_transform(new.map_from_camera[view])
+            inside = points @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
+            depths = np.maximum(inside[:, 2], 1e-6)
+            places = inside[:, :2] / depths[:, None]
+            _, beside = trees[view].query(places, _NEIGHBOURS, distance_upper_bound=_BESIDE)
+            in_view = (beside[:, -1] < len(bearings[view])) & (_HIDING * depths < np.median(
+                np.append(seen[view][:, 2], 0.0)[beside], axis=1))
+            pairs, _ = old.kind.match(old.unit_descriptors(keyframe), new.unit_descriptors(view))
+            in_view[pairs[:, 0]] = True  # it may be elsewhere in the image
+            pairs = pairs[np.linalg.norm(places[pairs[:, 0]] - bearings[view][pairs[:, 1]], axis=1)
+                          < _AT_PLACE]
+            partners = np.full(len(points), -1)
+            partners[pairs[:, 0]] = new.offsets[view] + pairs[:, 1]
+            looked = np.nonzero(in_view)[0]
+            looks.append(_Looks(start + looked, partners[looked]))
+    return _Looks(*map(np.concatenate, zip(*looks, strict=True)))
