@@ -30,8 +30,8 @@ _MOST_WORTH = 4.0
 # least number of places and of looks at each to estimate the worth. Chosen.
 _MEDIAN_SQUARE, _LEAST_WORTH, _FEW_PLACES, _FEW_LOOKS = 0.455, 0.5, 5, 3
 # The watch: prior of the share of looks that find a present landmark: mean over all landmarks,
-# weight of this mean in looks, and weight of the overall share (or of the map's seen_ratio) in looks where a
-# single landmark is judged. Chosen.
+# weight of this mean in looks, and weight of the overall share (or of the map's seen_ratio) in
+# looks where a single landmark is judged. Chosen.
 _FOUND, _OF_FOUND, _OF_SHARE = 0.75, 10.0, 3.0
 # Limits of this share.
 _SHARES = (0.1, 0.95)

@@ -115,6 +115,7 @@ class Aligned(NamedTuple):
     """The recording in the coordinate frame of the map."""
 
     views: Views
+    map_from_given: NDArray[np.float64]  #: (4, 4): the offset that was corrected
     #: Offset of the recording's coordinate frame, at the mean of the landmarks
     offset_m: float
     offset_deg: float

@@ -7,6 +7,7 @@ point is found if a feature at its projection matches. The points of a keyframe,
 cube of the room in all keyframes, are gone if hardly any look finds them, while others are found.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,9 +19,9 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import ENOUGH_INLIERS, keyframes_near
 from cliploc_ros.core.map.presence import probability_there
-from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import Landmarks
-from cliploc_ros.offline.recording.keyframe_layer import LEAST_POINTS, join_layers
+from cliploc_ros.offline.recording.keyframe_layer import LEAST_POINTS
+from cliploc_ros.offline.recording.layer_words import join_layers
 
 # A keyframe is looked for in this number of nearest views, up to this distance of views: 1.2 m or
 # 24 degrees. A feature is at the projection of a point up to this angle: 8 px at f = 525 px.
@@ -33,9 +34,8 @@ _BESIDE, _NEIGHBOURS, _HIDING = 40.0 / 525.0, 3, 0.8
 # the looks find points that are there, at least .035 in each cube with 100 looks; at most .011
 # find points 1 m from their place.
 _CUBE_M, _CHANCE, _WORTH, _GONE_BELOW = 0.5, 0.005, 15.0, 0.05
-# With a smaller share of found points, the recording does not show the place of the keyframes.
-# Least number of looks at a keyframe that confirm it.
-_LEAST_SHARE, _FEW_LOOKS = 0.03, 20
+# Least number of looks for the points of a keyframe that can retire it.
+_FEW_LOOKS = 20
 
 
 class KeyframeFate(NamedTuple):
@@ -43,11 +43,11 @@ class KeyframeFate(NamedTuple):
 
     keyframe: int  #: Its number in the old layer; in that of the recording if it is added
     fate: str  #: 'confirmed', 'retired', 'not observed' or 'added'
-    position: list[float]  #: Of the camera in the map [m]
+    position: tuple[float, ...]  #: Of the camera in the map [m]
     points: int  #: Number of its points
-    removed: int = 0  #: Number of points that were removed
-    looks: int = 0  #: Number of looks for its points
-    found: int = 0  #: Number of these looks that found the point
+    removed: int  #: Number of points that were removed
+    looks: int  #: Number of looks for its points
+    found: int  #: Number of these looks that found the point
 
 
 class UpdatedLayer(NamedTuple):
@@ -78,8 +78,8 @@ class _Looks(NamedTuple):
                            for weights in (None, self.partners >= 0))
         are_seen = found > 2.0 * _CHANCE * expected
         share = found[are_seen].sum() / max(1.0, expected[are_seen].sum())
-        return np.asarray(probability_there(found, expected, share, _CHANCE, _WORTH)
-                          < _GONE_BELOW)[places]
+        likely = probability_there(found, expected, max(share, _CHANCE), _CHANCE, _WORTH)
+        return np.asarray(likely < _GONE_BELOW)[places]
 
 
 _NO_LOOKS = _Looks(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
@@ -94,11 +94,6 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
         Of the recording, with poses in the map. None: the recording has no images.
     gone : Landmarks
         Objects that are no longer in these places.
-
-    Raises
-    ------
-    MappingError
-        The recording does not show the place of the keyframes.
     """
     old, count = old.plain(), len(old)
     sizes = np.diff(old.offsets)
@@ -118,21 +113,27 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
     is_kept = (removed == 0) | ((sizes - removed >= LEAST_POINTS) & (
         (expected < _FEW_LOOKS) | (found >= LEAST_POINTS)))
     is_gone |= ~is_kept[owners]
-    names = np.where(expected >= _FEW_LOOKS, 'confirmed', 'not observed')
-    layers, fates = [old.select(is_kept, ~is_gone)], [KeyframeFate(*row) for row in zip(
-        range(count), np.where(is_kept, names, 'retired').tolist(), old.map_from_camera[:, :3, 3].round(3).tolist(), sizes.tolist(),
-        np.bincount(owners, is_gone, count).astype(np.int64).tolist(), expected.tolist(),
-        found.tolist(), strict=True)]
+    went = np.bincount(owners, is_gone, count).astype(np.int64)
+    names = np.where(is_kept, np.where(found >= LEAST_POINTS, 'confirmed', 'not observed'),
+                     'retired')
+    layers = [old.select(is_kept, ~is_gone)]
+    fates = _fates(old, range(count), names, went, expected, found)
     if new is not None:
         shown = np.unique(looks.partners[(looks.partners >= 0) & ~is_gone[looks.points]])
-        agreed = np.diff(np.searchsorted(shown, new.offsets))
-        layers.append(new.select(agreed < ENOUGH_INLIERS))
-        fates += [KeyframeFate(row, 'added', new.map_from_camera[row, :3, 3].round(3).tolist(),
-                           int(np.diff(new.offsets)[row]))
-                  for row in np.nonzero(agreed < ENOUGH_INLIERS)[0].tolist()]
-    went = np.bincount(owners, is_gone, count) > 0
-    return UpdatedLayer(join_layers(layers), old.select(went, is_gone) if went.any() else None,
+        is_needed = np.diff(np.searchsorted(shown, new.offsets)) < ENOUGH_INLIERS
+        layers.append(new.select(is_needed))
+        zeros, added = np.zeros(len(new), dtype=np.int64), np.nonzero(is_needed)[0].tolist()
+        fates += _fates(new, added, np.full(len(new), 'added'), zeros, zeros, zeros)
+    return UpdatedLayer(join_layers(layers), old.select(went > 0, is_gone) if went.any() else None,
                         tuple(fates))
+
+
+def _fates(layer: KeyframeLayer, keyframes: Iterable[int], names: NDArray[np.str_],
+           *counts: NDArray[np.int64]) -> list[KeyframeFate]:
+    return [KeyframeFate(keyframe, str(names[keyframe]), tuple(
+        layer.map_from_camera[keyframe, :3, 3].round(3).tolist()),
+        *(int(column[keyframe]) for column in (np.diff(layer.offsets), *counts)))
+        for keyframe in keyframes]
 
 
 def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Looks:
