@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,8 +94,6 @@ def build(options: argparse.Namespace) -> int:
     """Build or update the map that the command line names; return the exit code."""
     # Imported late, so that --help is fast.
     from cliploc_ros.cli import sources
-    from cliploc_ros.core.keyframes.layer import layer_path
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.datasets.frames import move_frames
     from cliploc_ros.offline.mapping import make_map
 
@@ -104,9 +102,6 @@ def build(options: argparse.Namespace) -> int:
     command.check_output(options.out)
     layer, note = layer_options(options)
     _refuse_conflicts(options)
-    if update is not None and not len(LandmarkMap.from_file(update)):
-        raise OptionsError(f'--update {update}: is a map of keyframes alone, which cannot be '
-                           'updated; build a new one')
     mapping = _mapping_options(options, f'build_map {name}')
     recorded, file, images = sources.read_source(options)
     _tell_misspelt(mapping.moving_classes, recorded.class_names)
@@ -119,13 +114,14 @@ def build(options: argparse.Namespace) -> int:
     labeller = make_map.find_labeller(
         detections, partial(sources.clip_options, options) if options.clip else None,
         options.vocabulary)
+    frames = images and move_frames(images, scale, rotation)
     try:
         if update is not None:
-            made = make_map.update_map(update, detections, labeller, mapping)
-            note = ('the new map has no keyframes, which need all images: it localizes by objects '
-                    'alone; build a new map to have both') if layer_path(update).exists() else ''
+            made = make_map.update_map(update, detections, labeller, mapping, frames, layer)
+            note = made.note or note
+            if options.keyframe_layer is False:
+                made = replace(made, layer=None, keyframes=None)
         else:
-            frames = images and move_frames(images, scale, rotation)
             with command.StageBar() as bar:
                 made = make_map.make_map(detections, labeller, mapping, frames, layer, bar.show)
             note = note or made.note
@@ -136,7 +132,8 @@ def build(options: argparse.Namespace) -> int:
         _write_report(options.report, {'failure': str(error),
                                        'left_out': [asdict(landmark) for landmark in left_out]})
         raise
-    _write_report(options.report, asdict(made.report))
+    _write_report(options.report, asdict(made.report) | ({} if made.keyframes is None else {
+        'keyframes': [fate._asdict() for fate in made.keyframes.fates]}))
     recording = sources.recording_of(options, file, scale, rotation)
     path, is_poor = _write(options, made, name, recording, [labeller.note, note], begin)
     try:
@@ -163,6 +160,8 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
     from cliploc_ros.offline.mapping.make_map import write_made_map
 
     lines = made.report.lines()
+    if made.keyframes is not None:
+        lines.insert(1, made.keyframes.line())
     head = [f'built by build_map from {name}', *lines[:2]] if options.update is None else [
         f'{options.update.name}, updated by build_map from {name}', lines[0]]
     if made.mount is not None:

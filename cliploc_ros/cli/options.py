@@ -177,10 +177,9 @@ def layer_options(options: argparse.Namespace) -> 'tuple[LayerOptions | None, st
     from cliploc_ros.models.xfeat import load_xfeat
     from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
-    problem = next((
-        f'--{name}: keyframes need the images of the recording that the map is built from; give '
-        '--bag or a folder' for name in ('observations', 'update')
-        if getattr(options, name) is not None),
+    problem = (
+        '--observations: keyframes need the images of the recording; give --bag or a folder'
+        if options.observations is not None else
         '--every: choose frames with --keyframes METRES DEGREES' if options.every > 1 else
         '--refine-mount: build again with the corrected --mount' if options.refine_mount else '')
     if options.keyframe_layer and problem:

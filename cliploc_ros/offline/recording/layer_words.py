@@ -5,6 +5,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,20 +30,21 @@ def join_layers(layers: Sequence[KeyframeLayer]) -> KeyframeLayer:
     """Join layers of the same kind and coordinate frame, without images, and learn new words."""
     layers = [layer.plain() for layer in layers]
     names = [layer.sources or (Source(''),) for layer in layers]
-    cameras, sources = (tuple(dict.fromkeys(chain.from_iterable(values))) for values in (
-        (layer.cameras for layer in layers), names))
+    cameras = tuple(dict.fromkeys(chain.from_iterable(layer.cameras for layer in layers)))
+    sources = tuple(dict.fromkeys(chain.from_iterable(names)))
     rows = [np.zeros(len(layer), np.int64) if layer.source_rows is None else layer.source_rows
             for layer in layers]
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(layer, name) for layer in layers])
+        for name in ('map_from_camera', 'pixels', 'points', 'descriptors')}
     return with_words(replace(
-        layers[0], cameras=cameras, sources=sources, images=None, image_offsets=None,
+        layers[0], **columns, cameras=cameras, sources=sources, images=None, image_offsets=None,
         offsets=np.cumsum([0, *chain.from_iterable(np.diff(layer.offsets) for layer in layers)]),
         camera_rows=np.array([cameras.index(layer.camera_of(row))
                               for layer in layers for row in range(len(layer))], np.int64),
         source_rows=np.array([sources.index(own[row]) for own, theirs in zip(
             names, rows, strict=True) for row in theirs], np.int64),
-        deviation_per_metre=np.concatenate([layer.deviations() for layer in layers]), **{
-            name: np.concatenate([getattr(layer, name) for layer in layers]) for name in (
-                'map_from_camera', 'pixels', 'points', 'descriptors')}))
+        deviation_per_metre=np.concatenate([layer.deviations() for layer in layers])))
 
 
 def with_words(layer: KeyframeLayer) -> KeyframeLayer:

@@ -149,7 +149,7 @@ def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
         found = refit(views, known.landmarks, shown, options.min_viewpoints)
         errors = estimated = joint.significant_pose_errors(views, found.landmarks, shown)
     refined = views if errors is None else _refine(views, known, errors, options)
-    return Aligned(refined, offset_m, offset_deg, *joint.pose_changes(views, refined),
+    return Aligned(refined, total, offset_m, offset_deg, *joint.pose_changes(views, refined),
                    joint.pose_errors(views, refined), estimated)
 
 

@@ -19,6 +19,7 @@ from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import ENOUGH_INLIERS, keyframes_near
 from cliploc_ros.core.map.presence import probability_there
+from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import Landmarks
 from cliploc_ros.offline.recording.keyframe_layer import LEAST_POINTS
 from cliploc_ros.offline.recording.layer_words import join_layers
@@ -36,6 +37,8 @@ _BESIDE, _NEIGHBOURS, _HIDING = 40.0 / 525.0, 3, 0.8
 _CUBE_M, _CHANCE, _WORTH, _GONE_BELOW = 0.5, 0.005, 15.0, 0.05
 # Least number of looks for the points of a keyframe that can retire it.
 _FEW_LOOKS = 20
+# Least share of the keyframes that a recording of the place confirms.
+_MIN_CONFIRMED_SHARE = 0.3
 
 
 class KeyframeFate(NamedTuple):
@@ -83,6 +86,20 @@ class _Looks(NamedTuple):
 
 
 _NO_LOOKS = _Looks(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
+
+
+def check_belongs(updated: UpdatedLayer) -> None:
+    """Refuse a recording that confirms too few of the keyframes that it shows, or none.
+
+    Without landmarks, nothing else shows that its poses are in the coordinate frame of the map.
+    """
+    fates = [fate.fate for fate in updated.fates]
+    there = fates.count('confirmed')
+    if there < max(1.0, _MIN_CONFIRMED_SHARE * (there + fates.count('retired'))):
+        raise MappingError(
+            f'the recording does not belong to this map: it confirms {there} keyframes, and '
+            f'{fates.count("retired")} are not where the map says; check the frame of the poses, '
+            'or build a new map')
 
 
 def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks) -> UpdatedLayer:

@@ -111,6 +111,7 @@ class UpdatedMap:
     first_new: int  #: Row of the first new landmark
     #: (F, 4, 4): the poses in the coordinate frame of the map
     map_from_camera: NDArray[np.float64]
+    map_from_given: NDArray[np.float64]  #: (4, 4): the offset of the recording's coordinate frame
     embeddings: LandmarkEmbeddings | None  #: Image embeddings of the new map
     #: Landmarks that are missing now, or were before; a returning object gets its old id
     removed: LandmarkMap
@@ -188,6 +189,7 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
                               key=lambda landmark: -landmark.support)),
         notes=tuple(notes))
     return UpdatedMap(without_doubles, report, shown, first_new, aligned.views.poses,
+                      aligned.map_from_given,
                       identity.renew_embeddings(embeddings, without_doubles.landmark_ids,
                                                 detections, shown),
                       old.select(np.setdiff1d(np.arange(len(old)), kept).tolist()))
