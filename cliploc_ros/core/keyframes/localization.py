@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, TAKEN, invert_transform
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
@@ -155,6 +155,8 @@ class _Place(NamedTuple):
     inliers: _Matched
     agreed: int
     cells: NDArray[np.int64]
+    #: Number of other features that agree on a pose nearby, see RecognizedPlace.parted
+    parted: int = 0
 
 
 class KeyframeLocalizer:
@@ -348,7 +350,8 @@ class KeyframeLocalizer:
             aspect, of_aspect, look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
             tuple(shares.tolist()), look.features.pixels[place.inliers.features],
             place.inliers.rows, place.inliers.points, is_thorough,
-            float(_distances(self.layer.map_from_camera[used], pose).min()))
+            float(_distances(self.layer.map_from_camera[used], pose).min()),
+            place.parted / (place.agreed + place.parted))
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:
@@ -396,8 +399,12 @@ def _places(first: _Place | None, matched: _Matched, look: _Look
     while place is not None and (not places or place.agreed >= LEAST_INLIERS):
         if look.constraint.allows(place.map_from_camera):
             found += 1
-            if not any(SAME_ANSWER.agree(place.map_from_camera, other.map_from_camera)
-                       for other in places):
+            pose = place.map_from_camera
+            places = [other._replace(parted=max(place.agreed, other.parted))
+                      if SAME_SIGHT.agree(pose, other.map_from_camera)
+                      and not TAKEN.agree(pose, other.map_from_camera) else other
+                      for other in places]
+            if not any(SAME_ANSWER.agree(pose, other.map_from_camera) for other in places):
                 places.append(place)
         elif outside_m is None and place.agreed >= LEAST_INLIERS:
             outside_m = look.constraint.outside_m(place.map_from_camera)

@@ -64,8 +64,24 @@ def log_odds_there(stays: float, there: Values, away: Values) -> Values:
     return log(stays / (1.0 - stays)) + there - away
 
 
-def probability_there(seen: NDArray[Any], expected: NDArray[Any], shares: Values, chance: float,
-                      most_worth: float = _MOST_WORTH) -> NDArray[np.float64]:
+def worth_of(seen: NDArray[Any], expected: NDArray[Any], shares: NDArray[np.float64]) -> float:
+    """Return the number of looks that the usual shares (L,) count as, see probability_there.
+
+    They count as fewer looks if the places scatter about them.
+    """
+    rows = (seen > 0) & (expected >= _FEW_LOOKS)
+    if np.count_nonzero(rows) < _FEW_PLACES:
+        return _MOST_WORTH
+    # a beta variable of mean r and n looks has the variance r (1 - r) / (n + 1); the median
+    # excludes objects that are gone, which are not scatter
+    usual = shares[rows]
+    scatter = np.median(np.square(seen[rows] / expected[rows] - usual)
+                        / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
+    return float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH, _MOST_WORTH))
+
+
+def probability_there(seen: NDArray[Any], expected: NDArray[Any], shares: Values, worth: float,
+                      chance: float) -> NDArray[np.float64]:
     """Return for each place (L,) the probability that its object is there.
 
     Parameters
@@ -74,20 +90,11 @@ def probability_there(seen: NDArray[Any], expected: NDArray[Any], shares: Values
         Numbers of looks that found the object, and of looks that should have.
     shares : float or ndarray (L,)
         Usual share of the looks that find an object in its place.
+    worth : float
+        Number of looks that a usual share counts as.
     chance : float
         Share of the looks that find an object that is gone.
-    most_worth : float
-        Greatest number of looks that a usual share counts as. It counts as fewer where the looks
-        scatter about it.
     """
-    worth, rows = most_worth, (seen > 0) & (expected >= _FEW_LOOKS)
-    if np.count_nonzero(rows) >= _FEW_PLACES:
-        # a beta variable of mean r and n looks has the variance r (1 - r) / (n + 1); the median
-        # excludes objects that are gone, which are not scatter
-        usual = np.broadcast_to(shares, seen.shape)[rows]
-        scatter = np.median(np.square(seen[rows] / expected[rows] - usual)
-                            / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
-        worth = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH, most_worth))
     there, away = (log_evidence(looks * share, looks * (1.0 - share), seen, expected - seen)
                    for looks, share in ((worth, shares), (_MOST_WORTH, chance)))
     return np.asarray(expit(log_odds_there(STAYS, there, away)))

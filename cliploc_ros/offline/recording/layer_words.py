@@ -28,7 +28,7 @@ _ROWS = 1 << 16
 
 def join_layers(layers: Sequence[KeyframeLayer]) -> KeyframeLayer:
     """Join layers of the same kind and coordinate frame, without images, and learn new words."""
-    layers = [layer.plain() for layer in layers]
+    layers = [layer.plain() for layer in layers if len(layer)]
     names = [layer.sources or (Source(''),) for layer in layers]
     cameras = tuple(dict.fromkeys(chain.from_iterable(layer.cameras for layer in layers)))
     sources = tuple(dict.fromkeys(chain.from_iterable(names)))

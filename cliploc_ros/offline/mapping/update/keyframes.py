@@ -8,6 +8,7 @@ cube of the room in all keyframes, are gone if hardly any look finds them, while
 """
 
 from collections.abc import Iterable
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -27,16 +28,16 @@ from cliploc_ros.offline.recording.layer_words import join_layers
 # A keyframe is looked for in this number of nearest views, up to this distance of views: 1.2 m or
 # 24 degrees. A feature is at the projection of a point up to this angle: 8 px at f = 525 px.
 _VIEWS, _NEAR, _AT_PLACE = 6, 0.6, 8.0 / 525.0
-# A point is out of view without features within this angle, or if the nearest of them are nearer
-# to the camera by this share of its depth.
-_BESIDE, _NEIGHBOURS, _HIDING = 40.0 / 525.0, 3, 0.8
+# A point is out of view without a feature within this angle.
+_BESIDE = 40.0 / 525.0
 # Edge of the cubes [m]; share of looks that find a point that is gone; greatest worth of the usual
 # share [looks]; a place below this probability is gone. Measured on the kitchen in thirds: .2 of
 # the looks find points that are there, at least .035 in each cube with 100 looks; at most .011
 # find points 1 m from their place.
-_CUBE_M, _CHANCE, _WORTH, _GONE_BELOW = 0.5, 0.005, 15.0, 0.05
-# Least number of looks for the points of a keyframe that can retire it.
-_FEW_LOOKS = 20
+_CUBE_M, _CHANCE, _WORTH, _GONE_BELOW = 0.5, 0.005, 8.0, 0.05
+# Least number of looks for the points of a keyframe that can retire it. A keyframe that lost a
+# greater share of its points shows a changed place. Chosen.
+_FEW_LOOKS, _LOST = 20, 0.05
 # Least share of the keyframes that a recording of the place confirms.
 _MIN_CONFIRMED_SHARE = 0.3
 
@@ -69,19 +70,28 @@ class UpdatedLayer(NamedTuple):
                'points removed'
 
 
+# A point without partner: not found, found elsewhere in the image, out of view.
+_MISSED, _ELSEWHERE, _UNSEEN = -1, -2, -3
+
+
 class _Looks(NamedTuple):
     """Looks for points of old keyframes in keyframes of a recording."""
 
     points: NDArray[np.int64]  #: (l,): row of the old point
-    partners: NDArray[np.int64]  #: (l,): row of the new point that it matches; -1: not found
+    partners: NDArray[np.int64]  #: (l,): row of the new point that it matches, or see above
+
+    @property
+    def matched(self) -> '_Looks':
+        """Return the looks that found the point, at its place or elsewhere."""
+        return _Looks(*(column[self.partners != _MISSED] for column in self))
 
     def are_gone(self, places: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return a mask of the points (n,) whose places are gone; `places` (n,) has numbers."""
         expected, found = (np.bincount(places[self.points], weights, places.max() + 1)
                            for weights in (None, self.partners >= 0))
-        are_seen = found > 2.0 * _CHANCE * expected
-        share = found[are_seen].sum() / max(1.0, expected[are_seen].sum())
-        likely = probability_there(found, expected, max(share, _CHANCE), _CHANCE, _WORTH)
+        found = np.where(found > 2.0 * _CHANCE * expected, found, 0.0)
+        share = found.sum() / max(1.0, expected[found > 0.0].sum())
+        likely = probability_there(found, expected, max(share, _CHANCE), _WORTH, _CHANCE)
         return np.asarray(likely < _GONE_BELOW)[places]
 
 
@@ -122,13 +132,18 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
     if new is not None:
         looks = _look_for(old, new)
         _, cubes = np.unique(np.floor(points / _CUBE_M), axis=0, return_inverse=True)
-        is_gone |= looks.are_gone(cubes.ravel()) | looks.are_gone(owners)
+        for seen, places in product((looks, looks.matched), (
+                owners, cubes.ravel(), cubes.ravel() * count + owners)):
+            is_gone |= seen.are_gone(places)
     expected, found = (np.bincount(owners[looks.points], weights, count).astype(np.int64)
                        for weights in (None, looks.partners >= 0))
-    # a keyframe that lost points stays by the others, unless they were looked for and not found
-    removed = np.bincount(owners, is_gone, count)
-    is_kept = (removed == 0) | ((sizes - removed >= LEAST_POINTS) & (
-        (expected < _FEW_LOOKS) | (found >= LEAST_POINTS)))
+    # a keyframe of a changed place keeps the points that were found, if these are enough
+    removed, is_searched = np.bincount(owners, is_gone, count), expected >= _FEW_LOOKS
+    is_changed = is_searched & (removed > _LOST * sizes)
+    is_gone |= is_changed[owners] & ~np.isin(np.arange(len(points)), looks.points[
+        looks.partners >= 0])
+    is_kept = (removed == 0) | ((sizes - np.bincount(owners, is_gone, count) >= LEAST_POINTS) & (
+        ~is_searched | (found >= LEAST_POINTS)))
     is_gone |= ~is_kept[owners]
     went = np.bincount(owners, is_gone, count).astype(np.int64)
     names = np.where(is_kept, np.where(found >= LEAST_POINTS, 'confirmed', 'not observed'),
@@ -155,7 +170,7 @@ def _fates(layer: KeyframeLayer, keyframes: Iterable[int], names: NDArray[np.str
 
 def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Looks:
     """Look for the points of old keyframes in the nearest views of a recording."""
-    seen = [np.asarray(new.points[new.rows(view)], dtype=np.float64) for view in range(len(new))]
+    seen = [new.points[new.rows(view)].astype(np.float64) for view in range(len(new))]
     bearings = [points[:, :2] / points[:, 2:] for points in seen]
     trees = [*map(cKDTree, bearings)]
     looks = [_NO_LOOKS]
@@ -164,17 +179,14 @@ def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Looks:
         for view in keyframes_near(new.map_from_camera, pose, _NEAR)[:_VIEWS].tolist():
             camera_from_map = invert_transform(new.map_from_camera[view])
             inside = points @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
-            depths = np.maximum(inside[:, 2], 1e-6)
-            places = inside[:, :2] / depths[:, None]
-            _, beside = trees[view].query(places, _NEIGHBOURS, distance_upper_bound=_BESIDE)
-            in_view = (beside[:, -1] < len(bearings[view])) & (_HIDING * depths < np.median(
-                np.append(seen[view][:, 2], 0.0)[beside], axis=1))
+            places = inside[:, :2] / np.maximum(inside[:, 2:], 1e-6)
+            in_view = np.isfinite(trees[view].query(
+                places, distance_upper_bound=_BESIDE)[0]) & (inside[:, 2] > 0.0)
             pairs, _ = old.kind.match(old.unit_descriptors(keyframe), new.unit_descriptors(view))
-            in_view[pairs[:, 0]] = True  # it may be elsewhere in the image
-            pairs = pairs[np.linalg.norm(places[pairs[:, 0]] - bearings[view][pairs[:, 1]], axis=1)
-                          < _AT_PLACE]
-            partners = np.full(len(points), -1)
-            partners[pairs[:, 0]] = new.offsets[view] + pairs[:, 1]
-            looked = np.nonzero(in_view)[0]
+            is_found = np.linalg.norm(
+                places[pairs[:, 0]] - bearings[view][pairs[:, 1]], axis=1) < _AT_PLACE
+            partners = np.where(in_view, _MISSED, _UNSEEN)
+            partners[pairs[:, 0]] = np.where(is_found, new.offsets[view] + pairs[:, 1], _ELSEWHERE)
+            looked = np.nonzero(partners != _UNSEEN)[0]
             looks.append(_Looks(start + looked, partners[looked]))
     return _Looks(*map(np.concatenate, zip(*looks, strict=True)))
