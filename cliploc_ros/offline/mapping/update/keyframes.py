@@ -7,7 +7,6 @@ point is found if a feature at its projection matches. The points of a keyframe,
 cube of the room in all keyframes, are gone if hardly any look finds them, while others are found.
 """
 
-from collections.abc import Iterable
 from itertools import product
 from typing import NamedTuple
 
@@ -35,6 +34,8 @@ _BESIDE = 40.0 / 525.0
 # the looks find points that are there, at least .035 in each cube with 100 looks; at most .011
 # find points 1 m from their place.
 _CUBE_M, _CHANCE, _WORTH, _GONE_BELOW = 0.5, 0.005, 8.0, 0.05
+# Limits of the usual share.
+_SHARES = (0.02, 0.95)
 # Least number of looks for the points of a keyframe that can retire it. A keyframe that lost a
 # greater share of its points shows a changed place. Chosen.
 _FEW_LOOKS, _LOST = 20, 0.05
@@ -45,13 +46,12 @@ _MIN_CONFIRMED_SHARE = 0.3
 class KeyframeFate(NamedTuple):
     """What became of a keyframe."""
 
-    keyframe: int  #: Its number in the old layer; in that of the recording if it is added
     fate: str  #: 'confirmed', 'retired', 'not observed' or 'added'
-    position: tuple[float, ...]  #: Of the camera in the map [m]
+    position: list[float]  #: Of the camera in the map [m]
     points: int  #: Number of its points
-    removed: int  #: Number of points that were removed
-    looks: int  #: Number of looks for its points
-    found: int  #: Number of these looks that found the point
+    removed: int = 0  #: Number of points that were removed
+    looks: int = 0  #: Number of looks for its points
+    found: int = 0  #: Number of these looks that found the point
 
 
 class UpdatedLayer(NamedTuple):
@@ -59,7 +59,7 @@ class UpdatedLayer(NamedTuple):
 
     layer: KeyframeLayer
     removed: KeyframeLayer | None  #: The points that were removed; None without any
-    fates: tuple[KeyframeFate, ...]
+    fates: tuple[KeyframeFate, ...]  #: Of the old keyframes in their order, then of new ones
 
     def line(self) -> str:
         """Return the numbers of keyframes as text."""
@@ -91,7 +91,7 @@ class _Looks(NamedTuple):
                            for weights in (None, self.partners >= 0))
         found = np.where(found > 2.0 * _CHANCE * expected, found, 0.0)
         share = found.sum() / max(1.0, expected[found > 0.0].sum())
-        likely = probability_there(found, expected, max(share, _CHANCE), _WORTH, _CHANCE)
+        likely = probability_there(found, expected, np.clip(share, *_SHARES), _WORTH, _CHANCE)
         return np.asarray(likely < _GONE_BELOW)[places]
 
 
@@ -123,49 +123,38 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
         Objects that are no longer in these places.
     """
     old, count = old.plain(), len(old)
-    sizes = np.diff(old.offsets)
+    new = old.select(np.zeros(count, dtype=np.bool_)) if new is None else new
+    sizes, looks = np.diff(old.offsets), _look_for(old, new)
     owners = np.repeat(np.arange(count), sizes)
     points = np.concatenate([old.points_in_map(keyframe) for keyframe in range(count)])
-    is_gone, looks = np.zeros(len(points), dtype=np.bool_), _NO_LOOKS
+    _, cubes = np.unique(np.floor(points / _CUBE_M), axis=0, return_inverse=True)
+    cubes, is_gone = cubes.ravel(), np.zeros(len(points), dtype=np.bool_)
     for center, basis in zip(gone.centers, gone.bases, strict=True):
         is_gone |= normalized_lengths(points - center, (basis @ basis.T)[None]) < 1.0
-    if new is not None:
-        looks = _look_for(old, new)
-        _, cubes = np.unique(np.floor(points / _CUBE_M), axis=0, return_inverse=True)
-        for seen, places in product((looks, looks.matched), (
-                owners, cubes.ravel(), cubes.ravel() * count + owners)):
-            is_gone |= seen.are_gone(places)
-    expected, found = (np.bincount(owners[looks.points], weights, count).astype(np.int64)
-                       for weights in (None, looks.partners >= 0))
+    for seen, places in product((looks, looks.matched), (owners, cubes, cubes * count + owners)):
+        is_gone |= seen.are_gone(places)
+    is_found = looks.partners >= 0
+    expected, found = (np.bincount(owners[rows], minlength=count) for rows in (
+        looks.points, looks.points[is_found]))
     # a keyframe of a changed place keeps the points that were found, if these are enough
-    removed, is_searched = np.bincount(owners, is_gone, count), expected >= _FEW_LOOKS
-    is_changed = is_searched & (removed > _LOST * sizes)
-    is_gone |= is_changed[owners] & ~np.isin(np.arange(len(points)), looks.points[
-        looks.partners >= 0])
-    is_kept = (removed == 0) | ((sizes - np.bincount(owners, is_gone, count) >= LEAST_POINTS) & (
+    is_searched, removed = expected >= _FEW_LOOKS, np.bincount(owners, is_gone, count)
+    is_gone |= (is_searched & (removed > _LOST * sizes))[owners] & ~np.isin(
+        np.arange(len(points)), looks.points[is_found])
+    is_kept = (removed == 0) | ((np.bincount(owners, ~is_gone, count) >= LEAST_POINTS) & (
         ~is_searched | (found >= LEAST_POINTS)))
     is_gone |= ~is_kept[owners]
-    went = np.bincount(owners, is_gone, count).astype(np.int64)
-    names = np.where(is_kept, np.where(found >= LEAST_POINTS, 'confirmed', 'not observed'),
-                     'retired')
-    layers = [old.select(is_kept, ~is_gone)]
-    fates = _fates(old, range(count), names, went, expected, found)
-    if new is not None:
-        shown = np.unique(looks.partners[(looks.partners >= 0) & ~is_gone[looks.points]])
-        is_needed = np.diff(np.searchsorted(shown, new.offsets)) < ENOUGH_INLIERS
-        layers.append(new.select(is_needed))
-        zeros, added = np.zeros(len(new), dtype=np.int64), np.nonzero(is_needed)[0].tolist()
-        fates += _fates(new, added, np.full(len(new), 'added'), zeros, zeros, zeros)
-    return UpdatedLayer(join_layers(layers), old.select(went > 0, is_gone) if went.any() else None,
-                        tuple(fates))
-
-
-def _fates(layer: KeyframeLayer, keyframes: Iterable[int], names: NDArray[np.str_],
-           *counts: NDArray[np.int64]) -> list[KeyframeFate]:
-    return [KeyframeFate(keyframe, str(names[keyframe]), tuple(
-        layer.map_from_camera[keyframe, :3, 3].round(3).tolist()),
-        *(int(column[keyframe]) for column in (np.diff(layer.offsets), *counts)))
-        for keyframe in keyframes]
+    removed = np.bincount(owners, is_gone, count).astype(np.int64)
+    names = np.where(found >= LEAST_POINTS, 'confirmed', 'not observed')
+    shown = np.unique(looks.partners[is_found & ~is_gone[looks.points]])
+    is_needed = np.diff(np.searchsorted(shown, new.offsets)) < ENOUGH_INLIERS
+    kept, added = old.select(is_kept, ~is_gone), new.select(is_needed)
+    fates = [KeyframeFate(*row) for row in zip(
+        np.where(is_kept, names, 'retired').tolist(), old.map_from_camera[:, :3, 3].tolist(),
+        *(column.tolist() for column in (sizes, removed, expected, found)), strict=True)]
+    fates += [KeyframeFate('added', pose[:3, 3].tolist(), size) for pose, size in zip(
+        added.map_from_camera, np.diff(added.offsets).tolist(), strict=True)]
+    return UpdatedLayer(join_layers([kept, added]), old.select(
+        removed > 0, is_gone) if is_gone.any() else None, tuple(fates))
 
 
 def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Looks:
