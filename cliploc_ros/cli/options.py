@@ -189,7 +189,8 @@ def layer_options(options: argparse.Namespace) -> 'tuple[LayerOptions | None, st
                                (options.keyframe_features == XFEAT, '--keyframe-features')):
             if is_given:
                 raise OptionsError(f'{name} is for --keyframe-layer')
-        return None, '' if options.keyframe_layer is False else f'no keyframes with {problem}'
+        return None, '' if options.keyframe_layer is False else (
+            f'{"keyframes are not compared" if options.update else "no keyframes"} with {problem}')
     distance_m, angle_deg = options.keyframes
     return LayerOptions(
         distance_m, angle_deg, options.keyframe_points, options.keyframe_images,

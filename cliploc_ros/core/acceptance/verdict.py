@@ -53,8 +53,7 @@ class RefusalKind(StrEnum):
 
 
 # Factors of the confidence other than likely and found. A refusal names the first of equal ones.
-_FACTORS = ('distinct', 'near', 'camera', 'genuine', 'whole', 'not_mirrored', 'uncontradicted',
-            'linked')
+_FACTORS = ('distinct', 'near', 'camera', 'genuine', 'not_mirrored', 'uncontradicted', 'linked')
 # Kind and message of a refusal, by the weakest factor of its Evidence.
 _ADVICE = {
     'near': (RefusalKind.UNCERTAIN_POSITION, 'position uncertain by {0.deviation_m:.2g} m; turn '
@@ -64,8 +63,6 @@ _ADVICE = {
                'objects, or check camera_info'),
     'genuine': (RefusalKind.CHANGED, '{0.recognized.inliers} points of keyframes look like a '
                                      'picture or a changed place; move and request again'),
-    'whole': (RefusalKind.CHANGED, '{0.recognized.parted:.0%} of the points of keyframes fit '
-                                   'another pose nearby: the place changed; update the map'),
     'not_mirrored': (RefusalKind.AMBIGUOUS, 'the mirrored image fits another pose; turn the '
                                             'camera to more objects'),
     'linked': (RefusalKind.FRAMES_DISAGREE, 'the newest image does not fit the earlier '
@@ -152,14 +149,9 @@ class Evidence:
     @property
     def genuine(self) -> float:
         """Return the probability that the place is real, not a picture, and unchanged."""
+        if self.recognized and self.recognized.parted >= CALIBRATION.genuine.least_parted:
+            return 0.5
         return 1.0 if self.signs is None else chance_genuine(self.signs, self.motion)
-
-    @property
-    def whole(self) -> float:
-        """Return the probability that the place is unchanged, by the share of points elsewhere."""
-        is_parted = self.recognized is not None and (
-            self.recognized.parted >= CALIBRATION.genuine.least_parted)
-        return 0.5 if is_parted else 1.0
 
     @property
     def certainty(self) -> float:

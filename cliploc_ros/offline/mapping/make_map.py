@@ -31,12 +31,12 @@ from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.map_recording import MapRecording, recording_path, save_recording
 from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map
 from cliploc_ros.offline.mapping.labelling import embed_landmarks, embed_phrases, label_landmarks
-from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of, landmarks_of_map
+from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection
 from cliploc_ros.offline.mapping.update.keyframes import UpdatedLayer, check_belongs, update_layer
-from cliploc_ros.offline.mapping.update.updating import UpdateReport
+from cliploc_ros.offline.mapping.update.updating import UpdatedMap, UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.offline.recording.layer_words import join_layers
@@ -188,14 +188,20 @@ def make_map(detections: PosedDetections, labeller: Labeller,
         made = MadeMap(LandmarkMap.empty(options.frame_id), MappingReport(
             len(detections), 0, len(detections.classes), 0, 0.0, 0.0, 0.0, 0.0, 0.0,
             getattr(error, 'left_out', ()), (str(error),)))
-    try:
-        if frames is not None and layer is not None:
-            return replace(made, layer=build_layer(frames, made.landmark_map, layer))
-    except MappingError as error:
-        made = replace(made, note=f'no keyframes: {error}')
-    if failure is not None:
+    made = _with_layer(made, frames, layer)
+    if failure is not None and made.layer is None:
         raise failure
     return made
+
+
+def _with_layer(made: MadeMap, frames: Frames | None, layer: LayerOptions | None) -> MadeMap:
+    """Return a map with the keyframes of a recording, or with a note why there are none."""
+    if frames is None or layer is None:
+        return made
+    try:
+        return replace(made, layer=build_layer(frames, made.landmark_map, layer))
+    except MappingError as error:
+        return replace(made, note=f'no keyframes: {error}')
 
 
 def scale_of_objects(detections: PosedDetections, options: MappingOptions, class_name: str,
@@ -243,62 +249,46 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
         The map is invalid, the recording does not belong to it, or the text tower cannot be
         loaded.
     """
-    old, place = LandmarkMap.from_file(path), layer_path(path)
-    kinds, gone, new = feature_kinds(), Landmarks.none(), None
+    old, place, kinds = LandmarkMap.from_file(path), layer_path(path), feature_kinds()
     old_layer = load_layer_of_map(place, old, kinds) if place.exists() else None
     if layer is not None and old_layer is not None:
         layer = replace(layer, kind=old_layer.kind)
     if len(old):
-        made, map_from_given = _update_landmarks(path, old, detections, labeller, options)
-        assert isinstance(made.report, UpdateReport)
-        away = {one.landmark_id for one in (*made.report.moved, *made.report.missing)}
-        gone = landmarks_of_map(old.select([row for row, name in enumerate(old.landmark_ids)
-                                            if name in away]), detections.class_names)
-        try:
-            if frames is not None and layer is not None:
-                new = build_layer(frames, made.landmark_map, layer)
-                new = replace(new, map_from_camera=map_from_given @ new.map_from_camera)
-        except MappingError as error:
-            made = replace(made, note=f'no keyframes were added: {error}')
+        found = update_landmarks(old, detections, options, load_embeddings_of_map(
+            path, old.landmark_ids, old.map_set), load_removed(path, old.map_set.family))
+        gone = found.gone
+        made = _with_layer(_label_new(found, detections, labeller), frames, layer)
+        if made.layer is not None:
+            made = replace(made, layer=replace(made.layer, map_from_camera=(
+                found.map_from_given @ made.layer.map_from_camera)))
     else:
-        made = make_map(detections, labeller, options, frames, layer)
-        new = made.layer
-    made = replace(made, updated=old.map_set, layer=new)
+        made, gone = make_map(detections, labeller, options, frames, layer), Landmarks.none()
+    made = replace(made, updated=old.map_set)
     if old_layer is None:
         return made
-    keyframes = update_layer(old_layer, new, gone)
+    keyframes = update_layer(old_layer, made.layer, gone, made.landmark_map)
     if not len(old):
         check_belongs(keyframes)
-    removed = [keyframes.removed] if keyframes.removed is not None else []
+    removed = [] if keyframes.removed is None else [keyframes.removed]
     with suppress(MapError):  # there is none, or it is of another map
-        removed.insert(0, load_layer_of_map(layer_path(removed_path(path)), old, kinds))
-    map_now = made.landmark_map
-    return replace(made, layer=replace(
-        keyframes.layer, landmark_ids=map_now.landmark_ids,
-        landmark_centers=map_now.centers.astype(np.float32)), keyframes=keyframes._replace(
-            removed=join_layers(removed) if removed else None))
+        removed.append(load_layer_of_map(layer_path(removed_path(path)), old, kinds))
+    return replace(made, layer=keyframes.layer, keyframes=keyframes._replace(
+        removed=join_layers(removed) if removed else None))
 
 
-def _update_landmarks(path: Path, old: LandmarkMap, detections: PosedDetections,
-                      labeller: Labeller, options: MappingOptions
-                      ) -> tuple[MadeMap, NDArray[np.float64]]:
-    """Update the landmarks of a map; return also the offset of the recording's poses (4, 4)."""
-    old_embeddings = load_embeddings_of_map(path, old.landmark_ids, old.map_set)
-    updated = update_landmarks(old, detections, options, old_embeddings,
-                               load_removed(path, old.map_set.family))
+def _label_new(updated: UpdatedMap, detections: PosedDetections, labeller: Labeller) -> MadeMap:
+    """Label the new landmarks of an updated map; the others keep their labels."""
     landmark_map, first, report = updated.landmark_map, updated.first_new, updated.report
     if first < len(landmark_map):
-        # only new landmarks are labelled; the others keep their labels
-        new, _ = labeller.describe(landmark_map.select(range(first, len(landmark_map))),
-                                   detections, np.where(updated.shown >= first,
-                                                        updated.shown - first, -1))
+        new, _ = labeller.describe(
+            landmark_map.select(range(first, len(landmark_map))), detections,
+            np.where(updated.shown >= first, updated.shown - first, -1))
         texts = dict(zip(new.landmark_ids, new.labels, strict=True))
         landmark_map = replace(landmark_map, labels=landmark_map.labels[:first] + new.labels,
                                details=landmark_map.details[:first] + new.details)
         report = replace(report, new=tuple(replace(landmark, label=texts[landmark.landmark_id])
                                            for landmark in report.new))
-    return (MadeMap(landmark_map, report, updated.embeddings, removed=updated.removed),
-            updated.map_from_given)
+    return MadeMap(landmark_map, report, updated.embeddings, removed=updated.removed)
 
 
 def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording: MapRecording,

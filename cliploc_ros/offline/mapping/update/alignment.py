@@ -16,7 +16,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.ellipsoid import normalized_lengths
-from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping import joint
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
@@ -65,10 +64,9 @@ class OldMap(NamedTuple):
 
 def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
     """Return the landmarks of a map, with the classes of a recording."""
-    details = old.details or (LandmarkDetails(),) * len(old)
     sigmas = np.array([_UNKNOWN_SIGMA_M if detail.position_sigma is None
-                       else detail.position_sigma for detail in details])
-    return OldMap(replace(old, details=details), landmarks_of_map(old, class_names),
+                       else detail.position_sigma for detail in old.every_detail])
+    return OldMap(replace(old, details=old.every_detail), landmarks_of_map(old, class_names),
                   np.maximum(sigmas, _LEAST_SIGMA_M))
 
 

@@ -77,25 +77,33 @@ class Finds(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """The evidence from a recording with n boxes for L old landmarks and m finds."""
+    """The evidence from a recording with n boxes for L old landmarks and m finds.
 
-    #: (n,): the old landmark that each box shows in its place, L + the find, or -1 for none
+    They are the objects of the recording, in this order.
+    """
+
+    #: (n,): the object that each box shows in its place, -1 for none
     shown: NDArray[np.int64]
+    refits: alignment.Refits  #: Of the objects
+    sight: Sight  #: Of the objects
     finds: Finds
-    sight: Sight  #: Of the old places, then of the finds
     is_gone: NDArray[np.bool_]  #: (L,)
     is_there: NDArray[np.bool_]  #: (L,): if neither, the recording is inconclusive
     #: (L,): not proven to be gone, although boxes place it elsewhere, or hardly any show it
     is_doubtful: NDArray[np.bool_]
+    #: Pairs of a find and an old landmark that it may be although it is slightly off its place
+    near: frozenset[tuple[int, int]]
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """Return the objects as landmarks."""
+        return self.refits.landmarks
 
 
-def judge(detections: PosedDetections, views: Views, known: alignment.OldMap,
+def judge(detections: PosedDetections, aligned: alignment.Aligned, known: alignment.OldMap,
           options: MappingOptions) -> Judgement:
-    """Judge each place of the map by the recording, and find the other objects that it shows.
-
-    The views have poses in the coordinate frame of the map.
-    """
-    count = len(known.landmarks.centers)
+    """Judge each place of the map by the recording, and find the other objects that it shows."""
+    count, views = len(known.landmarks.centers), aligned.views
     finds = _find_new(detections, views, _free(views, known), options)
     # weak finds beside an old landmark would take its boxes
     _, sight = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
@@ -109,45 +117,48 @@ def judge(detections: PosedDetections, views: Views, known: alignment.OldMap,
     displaced = alignment.has_moved(known.landmarks, known.sigmas, refits)
     finds = _with_displaced(finds, refits, displaced, known.map.class_ids)
     shown, sight = _look(views, known, finds, displaced)
-    is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
+    limits = np.full(count, _GONE_BELOW)
     # a new object may be in the place of an old landmark that still has a false detection
-    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0)
-    _, sight = _look(views, known, finds, is_gone)
-    # finds should be seen about as often as the old landmarks, which come first in `sight`
-    ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
+    for majority in (1.0, 0.0):
+        # objects that are gone hide nothing; new objects hide old places
+        is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
+        shown, sight = _look(views, known, finds, is_gone)
+        finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, majority)
+        shown, sight = _look(views, known, finds, is_gone)
+        # an old landmark is probably gone if a find with more boxes is in its place
+        boxes = np.bincount(shown[shown >= 0], minlength=count + len(finds.details))
+        for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
+            if boxes[count + new] > boxes[row]:
+                limits[row] = _GONE_BELOW_IF_TAKEN
+    own = sight.select(slice(count))
+    is_gone |= _is_absent(known, own, limits)
+    shown[np.isin(shown, np.nonzero(is_gone)[0])] = -1
+    # finds should be seen about as often as the old landmarks
+    ratios = own.seen_ratio[own.seen > 0]
     usual = float(np.median(ratios)) if len(ratios) else 1.0
     least = _MIN_NEW_SHARE * usual
     finds = finds._replace(weak=tuple(
         weak if weak or ratio >= least else f'seen in {100 * ratio:.1f} % of the frames that show '
         f'its place, less than {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of the usual rate'
         for weak, ratio in zip(finds.weak, sight.seen_ratio[count:], strict=True)))
-    # new objects hide old places
-    shown, sight = _look(views, known, finds, is_gone)
-    # an old landmark is probably gone if a find with more boxes is in its place
-    boxes = np.bincount(shown[shown >= 0], minlength=count + len(finds.details))
-    limits = np.full(count, _GONE_BELOW)
-    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
-        if boxes[count + new] > boxes[row]:
-            limits[row] = _GONE_BELOW_IF_TAKEN
-    is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
-    shown, sight = _look(views, known, finds, is_gone)
-    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 0.0)
-    # objects that are gone hide nothing
-    shown, sight = _look(views, known, finds, is_gone)
-    own = sight.select(slice(count))
-    is_gone |= _is_absent(known, own, limits)
-    shown[np.isin(shown, np.nonzero(is_gone)[0])] = -1
-    of_landmarks = np.where(shown < count, shown, -1)
-    refits = alignment.refit(views, known.landmarks, of_landmarks, options.min_viewpoints)
-    fits = gather_evidence(views, refits.landmarks, of_landmarks).median_iou
+    landmarks = Landmarks.joined(known.landmarks, finds.landmarks)
+    refits = alignment.refit(views, landmarks, shown, options.min_viewpoints)
+    left_m = left_by_poses(views, np.square(aligned.changes), shown, len(landmarks.centers))
+    refits = refits._replace(
+        covariances=refits.covariances + np.square(left_m)[:, None, None] * np.eye(3))
+    fits = gather_evidence(views, refits.landmarks, shown).median_iou[:count]
     is_rare = ((own.seen_ratio < _MIN_SHARE_IN_PLACE * usual) & (own.expected >= LEAST_VIEWS))
-    is_there = (~is_gone & ~is_rare & (fits >= MIN_MEDIAN_IOU)
-                & (refits.is_known | (_probability_there(known, own) > _THERE_ABOVE)))
+    is_there = (~is_gone & ~is_rare & (fits >= MIN_MEDIAN_IOU) & (
+        refits.is_known[:count] | (_probability_there(known, own) > _THERE_ABOVE)))
     # boxes place it elsewhere, but may not suffice for a find there: then it may not be gone
     is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
         ~is_there & ~is_gone & (is_rare | _is_absent(known, own, STAYS))
         & (known.landmarks.classes >= 0))
-    return Judgement(shown, finds, sight, is_gone, is_there, is_doubtful)
+    shown[np.isin(shown, np.nonzero(~is_there)[0])] = -1
+    near = frozenset(
+        (count + new, row) for new, row, _ in _pairs_between(finds.landmarks, known.landmarks)
+        if not is_there[row] and (row, int(finds.landmarks.classes[new])) in known.names)
+    return Judgement(shown, refits, sight, finds, is_gone, is_there, is_doubtful, near)
 
 
 def _is_absent(known: alignment.OldMap, sight: Sight, limits: NDArray[np.float64] | float
@@ -273,54 +284,3 @@ def _pairs_between(new: Landmarks, old: Landmarks) -> list[tuple[int, int, float
     count = len(new.centers)
     return [(first, second - count, distance) for first, second, distance
             in close_pairs(Landmarks.joined(new, old)) if first < count <= second]
-
-
-class Shown(NamedTuple):
-    """The m objects that the recording shows: old landmarks in their places, and finds."""
-
-    refits: alignment.Refits  #: Where they are
-    owners: NDArray[np.int64]  #: (m,): the old landmark in whose place it was seen, -1 for none
-    #: For each object, the old landmarks that it may be although it is slightly off their place
-    near: tuple[frozenset[int], ...]
-    shown: NDArray[np.int64]  #: (n,): the object that each box shows, -1 for none
-    sight: Sight
-    given: tuple[LandmarkDetails, ...]  #: Classes and source of the finds
-    weak: tuple[str, ...]  #: See Finds
-    class_ids: tuple[str, ...]  #: Of the finds; '' of old landmarks
-
-    @property
-    def landmarks(self) -> Landmarks:
-        """Return the objects as landmarks."""
-        return self.refits.landmarks
-
-    def left_out(self, chosen: NDArray[np.int64]) -> tuple[LeftOut, ...]:
-        """Return the weak finds that are not among the chosen objects."""
-        return tuple(LeftOut(self.class_ids[row], rounded(self.landmarks.centers[row]),
-                             int(self.sight.seen_frames[row]), int(self.sight.seen[row]), weak)
-                     for row, weak in enumerate(self.weak) if weak and row not in chosen)
-
-
-def gather_objects(aligned: alignment.Aligned, known: alignment.OldMap, judged: Judgement,
-                   options: MappingOptions) -> Shown:
-    """Return the objects that the recording shows."""
-    views, count, finds = aligned.views, len(known.sigmas), judged.finds
-    in_place = np.nonzero(judged.is_there)[0]
-    places = np.concatenate([in_place, count + np.arange(len(finds.details))])
-    numbers = np.full(count + len(finds.details) + 1, -1, dtype=np.int64)
-    numbers[places] = np.arange(len(places))
-    shown = numbers[judged.shown]
-    landmarks = Landmarks.joined(known.landmarks.select(in_place), finds.landmarks)
-    refits = alignment.refit(views, landmarks, shown, options.min_viewpoints)
-    left_m = left_by_poses(views, np.square(aligned.changes), shown, len(places))
-    refits = refits._replace(
-        covariances=refits.covariances + np.square(left_m)[:, None, None] * np.eye(3))
-    near: list[set[int]] = [set() for _ in places]
-    names = known.names
-    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
-        if not judged.is_there[row] and (row, int(finds.landmarks.classes[new])) in names:
-            near[len(in_place) + new].add(row)
-    return Shown(
-        refits, np.concatenate([in_place, np.full(len(finds.details), -1, dtype=np.int64)]),
-        tuple(map(frozenset, near)), shown, judged.sight.select(places),
-        (LandmarkDetails(),) * len(in_place) + finds.details, ('',) * len(in_place) + finds.weak,
-        ('',) * len(in_place) + finds.class_ids)

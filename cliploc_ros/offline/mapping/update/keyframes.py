@@ -7,6 +7,7 @@ point is found if a feature at its projection matches. The points of a keyframe,
 cube of the room in all keyframes, are gone if hardly any look finds them, while others are found.
 """
 
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from cliploc_ros.core.geometry.ellipsoid import normalized_lengths
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import ENOUGH_INLIERS, keyframes_near
+from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.presence import probability_there
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import Landmarks
@@ -112,7 +114,8 @@ def check_belongs(updated: UpdatedLayer) -> None:
             'or build a new map')
 
 
-def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks) -> UpdatedLayer:
+def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks,
+                 landmark_map: LandmarkMap) -> UpdatedLayer:
     """Update the keyframes of a map.
 
     Parameters
@@ -121,6 +124,8 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
         Of the recording, with poses in the map. None: the recording has no images.
     gone : Landmarks
         Objects that are no longer in these places.
+    landmark_map : LandmarkMap
+        The updated map.
     """
     old, count = old.plain(), len(old)
     new = old.select(np.zeros(count, dtype=np.bool_)) if new is None else new
@@ -149,12 +154,15 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
     is_needed = np.diff(np.searchsorted(shown, new.offsets)) < ENOUGH_INLIERS
     kept, added = old.select(is_kept, ~is_gone), new.select(is_needed)
     fates = [KeyframeFate(*row) for row in zip(
-        np.where(is_kept, names, 'retired').tolist(), old.map_from_camera[:, :3, 3].tolist(),
-        *(column.tolist() for column in (sizes, removed, expected, found)), strict=True)]
-    fates += [KeyframeFate('added', pose[:3, 3].tolist(), size) for pose, size in zip(
+        *(column.tolist() for column in (
+            np.where(is_kept, names, 'retired'), old.map_from_camera[:, :3, 3].round(3), sizes,
+            removed, expected, found)), strict=True)]
+    fates += [KeyframeFate('added', pose[:3, 3].round(3).tolist(), size) for pose, size in zip(
         added.map_from_camera, np.diff(added.offsets).tolist(), strict=True)]
-    return UpdatedLayer(join_layers([kept, added]), old.select(
-        removed > 0, is_gone) if is_gone.any() else None, tuple(fates))
+    layer = replace(join_layers([kept, added]), landmark_ids=landmark_map.landmark_ids,
+                    landmark_centers=landmark_map.centers.astype(np.float32))
+    return UpdatedLayer(layer, old.select(removed > 0, is_gone) if is_gone.any() else None,
+                        tuple(fates))
 
 
 def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Looks:
