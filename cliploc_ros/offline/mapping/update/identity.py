@@ -70,7 +70,7 @@ def decide_fates(known: OldMap, judged: Judgement, looks: 'Likeness | None', her
                                 judged.refits.select(numbers[away]))
     is_lost = ~found & (rows < here)
     missing = is_lost & ((judged.is_gone & ~judged.is_doubtful) | judged.is_there)
-    new = len(rows) + np.nonzero([not weak for weak in judged.finds.weak])[0]
+    new = len(rows) + np.nonzero([not find.weak for find in judged.finds.each])[0]
     return Fates(rows[found & ~elsewhere], rows[elsewhere], rows[missing],
                  rows[is_lost & ~missing], rows[found | (is_lost & ~missing)],
                  np.setdiff1d(new, numbers[found]), numbers, rivals)

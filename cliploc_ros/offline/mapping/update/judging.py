@@ -32,9 +32,8 @@ _RATIO_RANGE = (0.02, 0.95)
 # Share of the views in which an object is detected, if neither map nor recording give it; share of
 # the views with a false detection in an empty place. Chosen, like all values below.
 _SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.03
-# An object is gone if its probability of being there is below the first number, or the second one
-# if another object was found in its place. It is there if the probability is above the third one.
-_GONE_BELOW, _GONE_BELOW_IF_TAKEN, _THERE_ABOVE = 0.05, 0.5, 0.95
+# An object is gone, or there, if its probability of being there is below or above these numbers.
+_GONE_BELOW, _THERE_ABOVE = 0.05, 0.95
 # An object is also gone if it was never seen, and usually would have been seen from this number of
 # viewpoints: how often an object is seen differs more between recordings than the map's seen_ratio
 # predicts. Measured with studies.updates.
@@ -50,15 +49,20 @@ _MIN_NEW_SHARE, _MIN_SHARE_IN_PLACE = 0.4, 0.15
 _MIN_MOVED_BASELINE_DEG = 10.0
 
 
+class Find(NamedTuple):
+    """An object that no old landmark explains in its place."""
+
+    class_id: str
+    details: LandmarkDetails
+    weak: str = ''  #: Why it may be a moved landmark, but not a new one; '' if it may be a new one
+
+
 class Finds(NamedTuple):
-    """The m finds: objects that no old landmark explains in its place."""
+    """The m finds."""
 
     landmarks: Landmarks
-    class_ids: tuple[str, ...]
-    details: tuple[LandmarkDetails, ...]
-    left_out: tuple[LeftOut, ...]  #: Objects not good enough for a map, or old landmarks
-    #: Why each find may be a moved landmark, but not a new one; '' if it may be a new one
-    weak: tuple[str, ...] = ()
+    each: tuple[Find, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()  #: Objects not good enough for a map, or old landmarks
 
     def without(self, reasons: Sequence[str | None], sight: Sight) -> 'Finds':
         """Return the finds without those that have a reason (m,), which are left out.
@@ -69,9 +73,8 @@ class Finds(NamedTuple):
         own = sight.select(slice(len(sight.seen) - len(reasons), None))
         return Finds(
             self.landmarks.select(np.array(kept, dtype=np.int64)),
-            tuple(self.class_ids[row] for row in kept), tuple(self.details[row] for row in kept),
-            weak=tuple(self.weak[row] for row in kept), left_out=self.left_out + tuple(
-                LeftOut(self.class_ids[row], rounded(self.landmarks.centers[row]),
+            tuple(self.each[row] for row in kept), self.left_out + tuple(
+                LeftOut(self.each[row].class_id, rounded(self.landmarks.centers[row]),
                         int(own.seen_frames[row]), int(own.seen[row]), reason)
                 for row, reason in enumerate(reasons) if reason is not None))
 
@@ -108,39 +111,31 @@ def judge(detections: PosedDetections, aligned: alignment.Aligned, known: alignm
     # weak finds beside an old landmark would take its boxes
     _, sight = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
     beside = {new for new, _, _ in _pairs_between(finds.landmarks, known.landmarks)}
-    finds = finds.without([weak if weak and new in beside else None
-                           for new, weak in enumerate(finds.weak)], sight)
+    finds = finds.without([find.weak if find.weak and new in beside else None
+                           for new, find in enumerate(finds.each)], sight)
     # old landmarks and finds compete for the boxes: an old one may have boxes of a neighbour
     shown, _ = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
     refits = alignment.refit(views, known.landmarks, np.where(shown < count, shown, -1),
                              options.min_viewpoints)
     displaced = alignment.has_moved(known.landmarks, known.sigmas, refits)
-    finds = _with_displaced(finds, refits, displaced, known.map.class_ids)
-    shown, sight = _look(views, known, finds, displaced)
-    limits = np.full(count, _GONE_BELOW)
-    # a new object may be in the place of an old landmark that still has a false detection
-    for majority in (1.0, 0.0):
-        # objects that are gone hide nothing; new objects hide old places
-        is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
-        shown, sight = _look(views, known, finds, is_gone)
-        finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, majority)
-        shown, sight = _look(views, known, finds, is_gone)
-        # an old landmark is probably gone if a find with more boxes is in its place
-        boxes = np.bincount(shown[shown >= 0], minlength=count + len(finds.details))
-        for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
-            if boxes[count + new] > boxes[row]:
-                limits[row] = _GONE_BELOW_IF_TAKEN
+    _, sight = _look(views, known, finds, displaced)
+    # objects that are gone hide nothing; new objects hide old places
+    is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
+    shown, sight = _look(views, known, finds, is_gone)
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight)
+    shown, sight = _look(views, known, finds, is_gone)
     own = sight.select(slice(count))
-    is_gone |= _is_absent(known, own, limits)
+    is_gone |= _is_absent(known, own, _GONE_BELOW)
     shown[np.isin(shown, np.nonzero(is_gone)[0])] = -1
     # finds should be seen about as often as the old landmarks
     ratios = own.seen_ratio[own.seen > 0]
     usual = float(np.median(ratios)) if len(ratios) else 1.0
     least = _MIN_NEW_SHARE * usual
-    finds = finds._replace(weak=tuple(
-        weak if weak or ratio >= least else f'seen in {100 * ratio:.1f} % of the frames that show '
-        f'its place, less than {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of the usual rate'
-        for weak, ratio in zip(finds.weak, sight.seen_ratio[count:], strict=True)))
+    finds = finds._replace(each=tuple(
+        find if find.weak or ratio >= least else find._replace(
+            weak=f'seen in {100 * ratio:.1f} % of the frames that show its place, less than '
+            f'{100 * least:.1f} %, {_MIN_NEW_SHARE:g} of the usual rate')
+        for find, ratio in zip(finds.each, sight.seen_ratio[count:], strict=True)))
     landmarks = Landmarks.joined(known.landmarks, finds.landmarks)
     refits = alignment.refit(views, landmarks, shown, options.min_viewpoints)
     left_m = left_by_poses(views, np.square(aligned.changes), shown, len(landmarks.centers))
@@ -151,7 +146,7 @@ def judge(detections: PosedDetections, aligned: alignment.Aligned, known: alignm
     is_there = (~is_gone & ~is_rare & (fits >= MIN_MEDIAN_IOU) & (
         refits.is_known[:count] | (_probability_there(known, own) > _THERE_ABOVE)))
     # boxes place it elsewhere, but may not suffice for a find there: then it may not be gone
-    is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
+    is_doubtful = (is_gone & ~_is_absent(known, own, _GONE_BELOW)) | (
         ~is_there & ~is_gone & (is_rare | _is_absent(known, own, STAYS))
         & (known.landmarks.classes >= 0))
     shown[np.isin(shown, np.nonzero(~is_there)[0])] = -1
@@ -161,9 +156,8 @@ def judge(detections: PosedDetections, aligned: alignment.Aligned, known: alignm
     return Judgement(shown, refits, sight, finds, is_gone, is_there, is_doubtful, near)
 
 
-def _is_absent(known: alignment.OldMap, sight: Sight, limits: NDArray[np.float64] | float
-               ) -> NDArray[np.bool_]:
-    """Return a mask of the objects (L,) whose probability of being in place is below the limits.
+def _is_absent(known: alignment.OldMap, sight: Sight, limit: float) -> NDArray[np.bool_]:
+    """Return a mask of the objects (L,) whose probability of being in place is below a limit.
 
     Classes without a box are excluded: the detector may not know them, or not at these sizes.
     """
@@ -171,7 +165,7 @@ def _is_absent(known: alignment.OldMap, sight: Sight, limits: NDArray[np.float64
     seen = sight.seen > 0
     usual = np.median(sight.seen[seen] / sight.expected[seen]) if seen.any() else 0.0
     is_never_seen = ~seen & (usual * sight.expected >= _USUALLY_SEEN)
-    return np.asarray(is_told & (is_never_seen | (_probability_there(known, sight) < limits)))
+    return np.asarray(is_told & (is_never_seen | (_probability_there(known, sight) < limit)))
 
 
 def _probability_there(known: alignment.OldMap, sight: Sight) -> NDArray[np.float64]:
@@ -200,7 +194,7 @@ def _look(views: Views, known: alignment.OldMap, finds: Finds, is_gone: NDArray[
           ) -> tuple[NDArray[np.int64], Sight]:
     """Return the old landmark or new find that each box shows, and the sight of all places."""
     places = Landmarks.joined(known.landmarks, finds.landmarks)
-    is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
+    is_solid = np.concatenate([~is_gone, np.ones(len(finds.each), dtype=np.bool_)])
     shown = associate(views, places, among=is_solid)
     return shown, look_for(views, places, shown, is_solid)
 
@@ -227,53 +221,39 @@ def _free(views: Views, known: alignment.OldMap) -> NDArray[np.bool_]:
 def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool_],
               options: MappingOptions) -> Finds:
     """Return the landmarks that the free boxes show, with the poses of the views."""
-    no_finds = Finds(Landmarks.none(), (), (), ())
     if not is_free.any():
-        return no_finds
+        return Finds(Landmarks.none())
     posed = detections.with_poses(views.poses).select_boxes(is_free)
+    least = options.min_baseline_deg
     try:
-        built = build_map(posed, replace(options, pose_errors=None, estimate_pose_errors=False,
-                                         refine_mount=False, min_baseline_deg=min(
-                                             options.min_baseline_deg, _MIN_MOVED_BASELINE_DEG)))
+        built = build_map(posed, replace(
+            options, pose_errors=None, estimate_pose_errors=False, refine_mount=False,
+            min_baseline_deg=min(least, _MIN_MOVED_BASELINE_DEG)))
     except NothingFoundError as error:
-        return no_finds._replace(left_out=error.left_out)
-    return Finds(landmarks_of_map(built.landmark_map, detections.class_names),
-                 built.landmark_map.class_ids, built.landmark_map.details, built.report.left_out,
-                 tuple('' if (detail.baseline_deg or 0.0) >= options.min_baseline_deg else
-                       f'seen from one side only: {detail.baseline_deg:.1f} degrees, less than '
-                       f'{options.min_baseline_deg:g}' for detail in built.landmark_map.details))
-
-
-def _with_displaced(finds: Finds, refits: alignment.Refits, displaced: NDArray[np.bool_],
-                    class_ids: Sequence[str]) -> Finds:
-    """Add old landmarks that are slightly displaced to the finds, unless they are among them."""
-    rows = np.nonzero(displaced)[0]
-    again = {moved for moved, _, _ in _pairs_between(refits.landmarks.select(rows),
-                                                     finds.landmarks)}
-    rows = rows[[moved not in again for moved in range(len(rows))]]
-    return finds._replace(
-        landmarks=Landmarks.joined(finds.landmarks, refits.landmarks.select(rows)),
-        class_ids=finds.class_ids + tuple(class_ids[row] for row in rows.tolist()),
-        details=finds.details + (LandmarkDetails(),) * len(rows),
-        weak=finds.weak + ('',) * len(rows))
+        return Finds(Landmarks.none(), left_out=error.left_out)
+    found = built.landmark_map
+    return Finds(landmarks_of_map(found, detections.class_names), tuple(
+        Find(class_id, detail, '' if (detail.baseline_deg or 0.0) >= least else
+             f'seen from one side only: {detail.baseline_deg:.1f} degrees, less than {least:g}')
+        for class_id, detail in zip(found.class_ids, found.details, strict=True)),
+        built.report.left_out)
 
 
 def _without_copies(views: Views, finds: Finds, old: Landmarks, known: alignment.OldMap,
-                    shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
+                    shown: NDArray[np.int64], sight: Sight) -> Finds:
     """Return the finds without those that are an old landmark in its place.
 
-    An old landmark is in its place if it has a box, and at least `majority` boxes for each box of
-    the find. A find of its class that lies in it shows the same object. So does any other
-    overlapping find, as a part or under another name, unless frames show two objects at once.
+    An old landmark is in its place if it has a box. A find of its class that lies in it shows the
+    same object. So does any other overlapping find, as a part or under another name, unless frames
+    show two objects at once.
     """
     count = len(old.centers)
-    boxes = group_boxes(shown, count + len(finds.details))
-    reasons: list[str | None] = [None] * len(finds.details)
+    boxes = group_boxes(shown, count + len(finds.each))
+    reasons: list[str | None] = [None] * len(finds.each)
     every = Landmarks.joined(old, finds.landmarks)
     for new, row, distance in _pairs_between(finds.landmarks, old):
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
-        if len(boxes[row]) >= max(1.0, majority * len(boxes[count + new])) and (
-                (is_one_class and distance < alignment.LEAST_MOVE_SHAPES)
+        if len(boxes[row]) and ((is_one_class and distance < alignment.LEAST_MOVE_SHAPES)
                 or relation(views, every, boxes, (row, count + new)) is not Relation.TWO):
             reasons[new] = f'it is {known.map.landmark_ids[row]} in its place'
     return finds.without(reasons, sight)

@@ -181,8 +181,8 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
         **lists,
         left_out=tuple(sorted(judged.finds.without([
-            weak if weak and number not in fates.objects else None
-            for number, weak in enumerate(judged.finds.weak, len(old))], judged.sight).left_out,
+            find.weak if find.weak and number not in fates.objects else None
+            for number, find in enumerate(judged.finds.each, len(old))], judged.sight).left_out,
             key=lambda landmark: -landmark.support)),
         notes=tuple(notes))
     return UpdatedMap(without_doubles, report, shown, first_new, aligned.views.poses,
@@ -261,7 +261,7 @@ def _renew(known: alignment.OldMap, views: Views, judged: judging.Judgement,
     added = LandmarkMap(
         old.frame_id, unused_ids(names, old.landmark_ids), names, names,
         judged.landmarks.centers[fates.new], new_axes[fates.new], new_quats[fates.new],
-        tuple(_in_new_place(judged.finds.details[number - len(old)], judged.sight, evidence,
+        tuple(_in_new_place(judged.finds.each[number - len(old)].details, judged.sight, evidence,
                             number) for number in fates.new))
     return replace(old, centers=centers, semi_axes=semi_axes, quats_xyzw=quats, details=tuple(
         details)).select(fates.kept.tolist()).with_more(added)
