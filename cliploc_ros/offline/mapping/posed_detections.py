@@ -123,9 +123,10 @@ class PosedDetections:
         """Return the same detections with other poses (F, 4, 4)."""
         return replace(self, map_from_camera=map_from_camera)
 
-    def moved(self, scale: float, rotation: NDArray[np.float64]) -> 'PosedDetections':
-        """Return the same detections with scaled and rotated poses, see move_poses."""
-        return self.with_poses(move_poses(self.map_from_camera, scale, rotation))
+    def moved(self, scale: float, rotation: NDArray[np.float64],
+              shift: NDArray[np.float64] | float = 0.0) -> 'PosedDetections':
+        """Return the same detections with moved poses, see move_poses."""
+        return self.with_poses(move_poses(self.map_from_camera, scale, rotation, shift))
 
 
 def group_cameras(cameras: Sequence[Camera]
