@@ -38,6 +38,8 @@ examples:
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
   build_map --colmap office --known-distance a.jpg b.jpg 1.5 --level --out office.yaml
   build_map --rgbd kitchen --level --out kitchen.yaml --no-keyframe-layer
+  build_map --bag monday --bag tuesday --folder phone --out office.yaml
+  build_map --add office.yaml --bag wednesday --out office.yaml
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
 """
 
@@ -56,6 +58,10 @@ def make_parser() -> argparse.ArgumentParser:
     add_source_options(parser)
     option(parser, '--out YAML', 'the map to write', required=True)
     option(parser, '--update YAML', 'bring this map up to date; --out may be the same file')
+    option(parser, '--add YAML', 'build this map again from its recordings and those given here; '
+           '--out may be the same file')
+    option(parser, '--same-frame', 'the recordings have one coordinate frame: a shift between '
+           'them is named, but stays (default: recordings are placed by their keyframes)')
     option(parser, '--report JSON', 'also write what was found and left out, and why')
     option(parser, '--frame-id', 'coordinate frame of the map (%(default)s)', default='map')
     option(parser, '--every N', 'use only every N-th frame (%(default)s)', command.positive_int, 1)
@@ -96,24 +102,27 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.cli import sources
     from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.offline.datasets.frames import move_frames
     from cliploc_ros.offline.mapping import make_map
+    from cliploc_ros.offline.recording.keyframe_layer import build_layer
 
     begin = time.monotonic()
-    update, name = options.update, sources.source_of(options).name
+    recordings = sources.each_recording(options)
+    update, name = options.update, ', '.join(sources.source_of(own).name for own in recordings)
     command.check_output(options.out)
-    layer, note = layer_options(options)
-    _refuse_conflicts(options)
+    layer, note = layer_options(recordings[0])
+    is_several = len(recordings) > 1 or options.add is not None
+    _refuse_conflicts(options, is_several)
     if update is not None and not len(LandmarkMap.from_file(update)):
         raise OptionsError(f'--update {update}: is a map of keyframes alone, which cannot be '
                            'updated; build a new one')
     mapping = _mapping_options(options, f'build_map {name}')
-    recorded, file, images = sources.read_source(options)
-    _tell_misspelt(mapping.moving_classes, recorded.class_names)
-    detections, scale, rotation = _placed(recorded, options, mapping,
-                                          images is not None and images.of_tf)
-    if without := recorded.without_pose:
-        print(f'no pose: {without} of {recorded.images} images', flush=True)
+    detections, recording, frames, joined = _first(options, recordings, mapping)
+    if is_several:
+        if frames is not None and layer is not None:
+            joined = build_layer(frames, LandmarkMap.empty(mapping.frame_id), layer)
+        detections, recording, joined = sources.join_sources(
+            options, recordings, detections, recording, joined, layer)
+    _tell_misspelt(mapping.moving_classes, detections.class_names)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
     labeller = make_map.find_labeller(
@@ -125,9 +134,9 @@ def build(options: argparse.Namespace) -> int:
             note = ('the new map has no keyframes, which need all images: it localizes by objects '
                     'alone; build a new map to have both') if layer_path(update).exists() else ''
         else:
-            frames = images and move_frames(images, scale, rotation)
             with command.StageBar() as bar:
-                made = make_map.make_map(detections, labeller, mapping, frames, layer, bar.show)
+                made = make_map.make_map(detections, labeller, mapping, frames, joined or layer,
+                                         bar.show)
             note = note or made.note
             if options.keyframe_layer and note:
                 raise MappingError(note)
@@ -137,7 +146,6 @@ def build(options: argparse.Namespace) -> int:
                                        'left_out': [asdict(landmark) for landmark in left_out]})
         raise
     _write_report(options.report, asdict(made.report))
-    recording = sources.recording_of(options, file, scale, rotation)
     path, is_poor = _write(options, made, name, recording, [labeller.note, note], begin)
     try:
         if options.check:
@@ -182,10 +190,14 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
     return path, is_poor
 
 
-def _refuse_conflicts(options: argparse.Namespace) -> None:
+def _refuse_conflicts(options: argparse.Namespace, is_several: bool) -> None:
     """Refuse conflicting options, before any work is done."""
     is_update = options.update is not None
     for is_wrong, text in (
+            (is_update and is_several,
+             '--update is for one recording: run it for each, or --add them to the map'),
+            (is_several and (options.refine_mount or options.keyframe_images),
+             '--refine-mount and --keyframe-images are for one recording'),
             (options.level and is_update, '--level is for new maps, not for --update'),
             (options.object_size and (options.scale or options.known_distance or is_update),
              '--object-size is not for --scale, --known-distance or --update'),
@@ -232,6 +244,32 @@ def _write_report(path: Path | None, report: dict[str, Any]) -> None:
     if path is not None:
         write_text(path, json.dumps(report, indent=1))
         print(f'report: {path}', flush=True)
+
+
+def _first(options: argparse.Namespace, recordings: list[argparse.Namespace],
+           mapping: 'MappingOptions') -> tuple[Any, ...]:
+    """Take the first recording of a map, or the map of --add.
+
+    Return its detections, its recording, its images, and its keyframes if they exist.
+    """
+    from cliploc_ros.cli import sources
+    from cliploc_ros.cli.options import read_layer
+    from cliploc_ros.core.map.landmark_map import LandmarkMap
+    from cliploc_ros.offline.datasets.frames import move_frames
+    from cliploc_ros.offline.datasets.map_recording import load_recording
+
+    if options.add is None:
+        recorded, file, images = sources.read_source(own := recordings.pop(0))
+        detections, scale, rotation = _placed(recorded, own, mapping,
+                                              images is not None and images.of_tf)
+        if without := recorded.without_pose:
+            print(f'no pose: {without} of {recorded.images} images', flush=True)
+        return detections, sources.recording_of(own, file, scale, rotation), (
+            images and move_frames(images, scale, rotation)), None
+    if (recording := load_recording(options.add)) is None:
+        raise OptionsError(f'--add {options.add}: its recording is missing: build a map of all')
+    return recording.load(), recording, None, read_layer(
+        options.add, LandmarkMap.from_file(options.add), None)
 
 
 def _placed(detections: 'PosedDetections', options: argparse.Namespace,

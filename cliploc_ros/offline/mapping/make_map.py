@@ -140,7 +140,8 @@ def _has_embeddings(detections: PosedDetections) -> bool:
 
 def make_map(detections: PosedDetections, labeller: Labeller,
              options: MappingOptions | None = None, frames: Frames | None = None,
-             layer: LayerOptions | None = None, progress: Progress | None = None) -> MadeMap:
+             layer: LayerOptions | KeyframeLayer | None = None, progress: Progress | None = None
+             ) -> MadeMap:
     """Make a map from a recording.
 
     If no landmark is found, keyframes alone make a map. If the images give no keyframes,
@@ -155,8 +156,8 @@ def make_map(detections: PosedDetections, labeller: Labeller,
         See find_labeller.
     frames : Frames, optional
         The images, for the layer of keyframes.
-    layer : LayerOptions, optional
-        None: without keyframes.
+    layer : LayerOptions or KeyframeLayer, optional
+        Options, or keyframes that were built before. None: without keyframes.
     progress : callable, optional
         Called with the name of a stage and its progress, 0 to 1.
 
@@ -175,6 +176,10 @@ def make_map(detections: PosedDetections, labeller: Labeller,
         made = MadeMap(LandmarkMap.empty(options.frame_id), MappingReport(
             len(detections), 0, len(detections.classes), 0, 0.0, 0.0, 0.0, 0.0, 0.0,
             getattr(error, 'left_out', ()), (str(error),)))
+    if isinstance(layer, KeyframeLayer):
+        return replace(made, layer=replace(
+            layer, frame_id=options.frame_id, landmark_ids=made.landmark_map.landmark_ids,
+            landmark_centers=made.landmark_map.centers.astype(np.float32)))
     try:
         if frames is not None and layer is not None:
             return replace(made, layer=build_layer(frames, made.landmark_map, layer))

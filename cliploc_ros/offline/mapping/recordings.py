@@ -2,14 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several recordings of a place: where their coordinate frames lie, and one layer of keyframes.
 
-The keyframes of each recording are localized in the layer of the other one, by their own features.
-This gives the transform between the coordinate frames, and says which keyframes the layer needs:
-those that it does not localize yet (Churchill and Newman, "Experience-based navigation", 2013).
+The keyframes of a recording are localized in the layer of the others, by their own features. This
+gives the transform between the coordinate frames, and says which keyframes the layer needs:
+those that it does not localize yet (Churchill and Newman, "Experience-based navigation", 2013). Of
+a full cell, those stay that localize most others (Muehlfellner et al., "Summary maps", 2016).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
+from itertools import chain
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,144 +20,199 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.keyframes.features import Features
-from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer
+from cliploc_ros.core.keyframes.layer import PIXEL_SCALE, KeyframeLayer, Source
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
-from cliploc_ros.errors import MappingError, counted
+from cliploc_ros.errors import MappingError
+from cliploc_ros.offline.recording.layer_words import with_words
 
-# A keyframe with fewer agreeing points may be recognized by chance.
-_LEAST_POINTS = 15
-# Recordings are placed by at most this number of keyframes of each, with this number of points.
-_TRIED, _POINTS = 100, 60
-# A keyframe agrees with a placing if half of its points are projected within this angle. Poses of
+# A keyframe is recognized by this number of points: fewer may agree by chance. It is not added if
+# the layer localizes it with this number, and contradicts the map if it is localized elsewhere.
+_LEAST_POINTS, _ENOUGH, _DISPLACED = 15, 100, 40
+# Greatest number of points of a keyframe that place a recording.
+_POINTS = 60
+# A keyframe agrees with a placing that projects half of its points within this angle. Poses of
 # recordings have errors of centimetres: 15 px at f = 525 px are 6 cm at 2 m.
 _AGREE = 15.0 / 525.0
 # Least number of keyframes that agree, and of them for each one that agrees with another placing.
 _LEAST_AGREEING, _PER_RIVAL = 5, 3.0
 # Scale of the robust loss: 2 px at f = 525 px.
 _LOSS = 2.0 / 525.0
-
-
-class Sight(NamedTuple):
-    """A keyframe of one layer that another layer recognizes, with m points of that layer."""
-
-    keyframe: int
-    pose: NDArray[np.float64]  #: (4, 4): in the frame of its own layer
-    found: NDArray[np.float64]  #: (4, 4): in the frame of the other layer
-    points: NDArray[np.float64]  #: (m, 3): in the frame of the other layer
-    own: NDArray[np.float64]  #: (m, 3): the same points by the keyframe, in its camera
-    agreed: int  #: Number of agreeing features
-    keyframes: tuple[int, ...]  #: Keyframes of the other layer with agreeing points
-
-    def similarity(self, is_scaled: bool) -> NDArray[np.float64]:
-        """Return the transform (4, 4), with a scale, of its layer's frame into the other one."""
-        reach = np.linalg.norm(self.points - self.found[:3, 3], axis=1)
-        scale = np.median(reach / np.linalg.norm(self.own, axis=1)) if is_scaled else 1.0
-        return np.asarray(self.found @ np.diag([scale] * 3 + [1.0]) @ np.linalg.inv(self.pose))
-
-    def residuals(self, other_from_own: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the errors (m, 2) of the points' projections under a transform (4, 4)."""
-        own_from_other = np.linalg.inv(other_from_own @ self.pose)
-        inside = self.points @ own_from_other[:3, :3].T + own_from_other[:3, 3]
-        ahead = np.maximum(inside[:, 2:], 1e-3 * np.linalg.norm(inside, axis=1, keepdims=True))
-        return np.asarray(inside[:, :2] / ahead - self.own[:, :2] / self.own[:, 2:])
-
-
-def recognize(layer: KeyframeLayer, other: KeyframeLayer, keyframes: Sequence[int]) -> list[Sight]:
-    """Localize keyframes of a layer in another layer; return those that it recognizes."""
-    localizer, sights = KeyframeLocalizer(other), []
-    for keyframe in keyframes:
-        rows, camera = layer.rows(keyframe), layer.camera_of(keyframe)
-        pixels = layer.pixels[rows] / PIXEL_SCALE
-        features = Features(pixels, layer.descriptors[rows],
-                            np.ones(len(pixels), dtype=np.float32))
-        found = localizer.localize_features(features, camera)
-        if not found.places or found.places[0].inliers < _LEAST_POINTS:
-            found = localizer.localize_features(features, camera, fast=found)
-        for place in found.places[:1]:
-            if place.inliers >= _LEAST_POINTS:
-                own = np.asarray(layer.points[rows], dtype=np.float64)[
-                    cKDTree(pixels).query(place.pixels)[1]]
-                sights.append(Sight(keyframe, layer.map_from_camera[keyframe],
-                                    place.map_from_camera, place.points, own, place.inliers,
-                                    place.keyframes))
-    return sights
+# Size of a cell of positions [m], and of the components of directions.
+_CELL_M, _CELL_DIRECTION = 1.0, 0.5
 
 
 class Placing(NamedTuple):
     """Where the coordinate frame of a recording lies: scale it, rotate it, then shift it."""
 
-    scale: float
-    rotation: NDArray[np.float64]  #: (3, 3)
-    shift: NDArray[np.float64]  #: (3,)
-    agreeing: int  #: Number of keyframes that agree
-    tried: int  #: Number of keyframes that were recognized
+    scale: float = 1.0
+    rotation: NDArray[np.float64] = np.eye(3)  #: (3, 3)
+    shift: NDArray[np.float64] = np.zeros(3)  #: (3,) [m]
 
 
-def find_placing(layer: KeyframeLayer, other: KeyframeLayer, is_scaled: bool, name: str
-                 ) -> Placing:
-    """Place a layer in the coordinate frame of another one.
+class Sight(NamedTuple):
+    """A keyframe of a recording that the layer of a map recognizes, with m points of the layer."""
+
+    keyframe: int
+    pose: NDArray[np.float64]  #: (4, 4): in the frame of the recording
+    found: NDArray[np.float64]  #: (4, 4): in the map
+    points: NDArray[np.float64]  #: (m, 3): in the map
+    own: NDArray[np.float64]  #: (m, 3): the same points by the keyframe, in its camera
+    agreed: int  #: Number of agreeing features
+    keyframes: NDArray[np.int64]  #: Keyframes of the layer with agreeing points
+
+    def similarity(self, is_scaled: bool) -> NDArray[np.float64]:
+        """Return the transform (4, 4), with a scale, of the recording's frame into the map's."""
+        reach = np.linalg.norm(self.points - self.found[:3, 3], axis=1)
+        scale = np.median(reach / np.linalg.norm(self.own, axis=1)) if is_scaled else 1.0
+        return np.asarray(self.found @ np.diag([scale] * 3 + [1.0]) @ np.linalg.inv(self.pose))
+
+    def errors(self, map_from_recording: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the errors (m, 2) of the points' projections, on the plane z = 1."""
+        camera_from_map = np.linalg.inv(map_from_recording @ self.pose)
+        inside = self.points @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
+        ahead = np.maximum(inside[:, 2:], 1e-3 * np.linalg.norm(inside, axis=1, keepdims=True))
+        return np.asarray(inside[:, :2] / ahead - self.own[:, :2] / self.own[:, 2:])
+
+    def agrees(self, map_from_recording: NDArray[np.float64]) -> bool:
+        """Return whether the keyframe agrees with a placing (4, 4)."""
+        return bool(np.median(np.linalg.norm(self.errors(map_from_recording), axis=1)) < _AGREE)
+
+
+def recognize(new: KeyframeLayer, layer: KeyframeLayer) -> list[Sight]:
+    """Localize the keyframes of a recording in the layer of a map; return the recognized ones."""
+    localizer, sights = KeyframeLocalizer(layer), []
+    for keyframe, pose in enumerate(new.map_from_camera):
+        rows, camera = new.rows(keyframe), new.camera_of(keyframe)
+        pixels = new.pixels[rows] / PIXEL_SCALE
+        features = Features(pixels, new.descriptors_of(rows), np.ones(len(pixels), np.float32))
+        found = localizer.localize_features(features, camera)
+        if not found.places or found.places[0].inliers < _LEAST_POINTS:
+            found = localizer.localize_features(features, camera, fast=found)
+        for place in found.places[:1]:
+            kept = np.arange(0, len(place.pixels), 1 + len(place.pixels) // _POINTS)
+            if place.inliers >= _LEAST_POINTS:
+                own = new.points[rows][cKDTree(pixels).query(place.pixels[kept])[1]]
+                sights.append(Sight(keyframe, pose, place.map_from_camera, place.points[kept],
+                                    own.astype(np.float64), place.inliers, np.array(place.keyframes)))
+    return sights
+
+
+def find_placing(sights: Sequence[Sight], is_scaled: bool = False) -> tuple[Placing, int]:
+    """Place a recording in a map; return the number of keyframes that agree, too.
+
+    Each recognized keyframe proposes a placing. The one that most agree with is refined by robust
+    least squares over all their points. If the unit of the recording is unknown, `is_scaled`, its
+    scale is found, too.
+
+    MappingError: too few keyframes agree about the placing, or two placings fit.
+    """
+    guesses = [sight.similarity(is_scaled) for sight in sights]
+    agree = np.array([[sight.agrees(guess) for sight in sights] for guess in guesses],
+                     dtype=np.bool_).reshape(len(guesses), len(sights))
+    best = int(agree.sum(axis=1).argmax()) if guesses else 0
+    agreeing = int(agree[best:best + 1].sum())
+    rivals = int((agree & ~agree[best:best + 1]).sum(axis=1).max(initial=0))
+    if agreeing < max(_LEAST_AGREEING, _PER_RIVAL * rivals):
+        raise MappingError(f'its place in the map is unknown: {agreeing} of {len(sights)} '
+                           f'recognized keyframes agree about it, {rivals} about another place')
+
+    def moved(step: NDArray[np.float64]) -> NDArray[np.float64]:
+        turn = Rotation.from_rotvec(step[:3]).as_matrix() * np.exp(step[6:].sum())
+        return np.asarray(guesses[best] @ transforms.make_transform(turn, step[3:6]))
+    kept = [sights[row] for row in np.nonzero(agree[best])[0]]
+    placing = moved(least_squares(
+        lambda step: np.concatenate([sight.errors(moved(step)) for sight in kept]).ravel(),
+        np.zeros(6 + is_scaled), x_scale='jac', loss='cauchy', f_scale=_LOSS).x)
+    scale = float(np.cbrt(np.linalg.det(placing[:3, :3])))
+    return (Placing(scale, placing[:3, :3] / scale, placing[:3, 3]),
+            sum(sight.agrees(placing) for sight in sights))
+
+
+def join_layers(layers: Sequence[KeyframeLayer]) -> KeyframeLayer:
+    """Join layers in one coordinate frame, without small images.
+
+    MappingError: their features are of different kinds.
+    """
+    if len(names := {layer.kind.name for layer in layers}) > 1:
+        raise MappingError(f'keyframes of {" and ".join(sorted(names))} cannot be joined: give '
+                           'the `keyframe_features` of the map')
+    layers = [layer.plain() for layer in layers]
+
+    sources = [layer.sources or (Source(''),) for layer in layers]
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(layer, name) for layer in layers])
+        for name in ('map_from_camera', 'pixels', 'points', 'descriptors', 'words')}
+
+    def rows(name: str, counts: Iterable[int]) -> NDArray[np.int64]:
+        firsts, found = np.cumsum([0, *counts]), [getattr(layer, name) for layer in layers]
+        return np.concatenate([first + np.broadcast_to(0 if own is None else own, len(layer))
+                               for first, own, layer in zip(firsts, found, layers, strict=False)])
+    return with_words(replace(
+        layers[0], cameras=tuple(chain(*(layer.cameras for layer in layers))),
+        camera_rows=rows('camera_rows', (len(layer.cameras) for layer in layers)),
+        sources=tuple(chain(*sources)), source_rows=rows('source_rows', map(len, sources)),
+        deviation_per_metre=np.concatenate([layer.deviations() for layer in layers]),
+        offsets=np.cumsum([0, *chain(*(np.diff(layer.offsets) for layer in layers))]),
+        images=None, image_offsets=None, **joined))
+
+
+def add_layer(layer: KeyframeLayer, new: KeyframeLayer, is_scaled: bool, same_frame: bool,
+              per_cell: int) -> tuple[KeyframeLayer, Placing, str]:
+    """Add the keyframes of a recording to those of a map.
 
     Parameters
     ----------
     is_scaled : bool
-        Whether the unit of the layer is unknown.
-    name : str
-        The recording, for messages.
+        Whether the unit of the recording is unknown, see find_placing.
+    same_frame : bool
+        Keep the poses of the recording; a shift is only named.
+    per_cell : int
+        Greatest number of keyframes of a cell of place and direction.
+
+    Returns
+    -------
+    layer : KeyframeLayer
+    placing : Placing
+    note : str
+        The placing, and what was added.
 
     Raises
     ------
     MappingError
-        Too few keyframes agree about the placing, or two placings fit.
+        The layers cannot be joined, or the recording cannot be placed.
     """
-    there, back = (recognize(one, two, range(0, len(one), 1 + len(one) // _TRIED))
-                   for one, two in ((layer, other), (other, layer)))
-    sights = [sight._replace(points=sight.points[::step], own=sight.own[::step])
-              for sight in (*there, *back) for step in [1 + len(sight.points) // _POINTS]]
-
-    def errors(placing: NDArray[np.float64], rows: Sequence[int]) -> list[NDArray[np.float64]]:
-        reverse = np.linalg.inv(placing)
-        return [sights[row].residuals(placing if row < len(there) else reverse) for row in rows]
-
-    def agreeing(placing: NDArray[np.float64], rows: Sequence[int]) -> list[int]:
-        return [row for row, error in zip(rows, errors(placing, rows), strict=True)
-                if np.median(np.linalg.norm(error, axis=1)) < _AGREE]
-
-    def best(rows: Sequence[int]) -> tuple[list[int], NDArray[np.float64]]:
-        found = [sights[row].similarity(is_scaled) for row in rows]
-        found = [one if row < len(there) else np.linalg.inv(one)
-                 for row, one in zip(rows, found, strict=True)]
-        return max(((agreeing(one, rows), one) for one in found), key=lambda pair: len(pair[0]),
-                   default=([], np.eye(4)))
-
-    every = range(len(sights))
-    kept, placing = best(every)
-    rivals, _ = best([row for row in every if row not in kept])
-    if len(kept) < max(_LEAST_AGREEING, _PER_RIVAL * len(rivals)):
-        raise MappingError(
-            f'{name}: its place in the map is unknown: {counted(len(kept), "keyframe")} '
-            f'agree about it, expected {_LEAST_AGREEING}; {len(rivals)} about another place; '
-            'record more views of mapped places, or give `same_frame`')
-    for _ in range(2):
-        middle = make_transform(np.eye(3), np.concatenate(
-            [sights[row].points for row in kept if row < len(there)] or [np.zeros((1, 3))]
-        ).mean(axis=0))
-
-        def moved(step: NDArray[np.float64], start: NDArray[np.float64] = placing,
-                  middle: NDArray[np.float64] = middle) -> NDArray[np.float64]:
-            turn = make_transform(Rotation.from_rotvec(step[:3]).as_matrix() * np.exp(
-                step[6:].sum()), step[3:6])
-            return np.asarray(middle @ turn @ np.linalg.inv(middle) @ start)
-        rows = kept
-        fit = least_squares(lambda step: np.concatenate(errors(moved(step), rows)).ravel(),
-                            np.zeros(6 + is_scaled), loss='cauchy', f_scale=_LOSS)
-        placing = moved(fit.x)
-        kept = agreeing(placing, every)
-    scale = float(np.cbrt(np.linalg.det(placing[:3, :3])))
-    return Placing(scale, placing[:3, :3] / scale, placing[:3, 3], len(kept), len(sights))
-
-
-def move_layer(layer: KeyframeLayer, placing: Placing) -> KeyframeLayer:
-    """Move a layer into the coordinate frame of a placing."""
-    return layer
+    sights, placing = recognize(new, layer), Placing()
+    note = 'it is not compared with the map, which recognizes too few of its keyframes'
+    with suppress(*[MappingError] * same_frame):
+        found, agreed = find_placing(sights, is_scaled)
+        poses = transforms.move_poses(new.map_from_camera, *found)
+        shift_m = np.median(np.linalg.norm((poses - new.map_from_camera)[:, :3, 3], axis=1))
+        angle = transforms.rotation_angle_deg(found.rotation)
+        placing = placing if same_frame else found
+        note = (f'{agreed} keyframes place it {shift_m:.2f} m and {angle:.1f} degrees from where '
+                f'its poses are{", which stay" * same_frame}')
+    new = replace(new, map_from_camera=transforms.move_poses(new.map_from_camera, *placing),
+                  points=(placing.scale * new.points).astype(np.float32))
+    poses, first = np.concatenate([layer.map_from_camera, new.map_from_camera]), len(layer)
+    kept, votes, displaced = np.ones(len(poses), bool), np.zeros(len(poses), dtype=np.int64), 0
+    for sight in sights:
+        votes[sight.keyframes] += 1
+        pose = poses[first + sight.keyframe]
+        if sight.agreed >= _DISPLACED and not transforms.SAME_LOOK.agree(sight.found, pose):
+            kept[first + sight.keyframe], displaced = False, displaced + 1
+        elif sight.agreed >= _ENOUGH and transforms.SAME_BOXES.agree(sight.found, pose):
+            kept[first + sight.keyframe] = False
+    added = int(kept[first:].sum())
+    cells = np.floor(np.hstack([poses[:, :3, 3] / _CELL_M, poses[:, :3, 2] / _CELL_DIRECTION]))
+    cell = np.unique(cells[kept], axis=0, return_inverse=True)[1].ravel()
+    # of a cell, those with the most votes; new ones win ties
+    order = np.lexsort([-np.arange(len(cell)), -votes[kept], cell])
+    kept[np.nonzero(kept)[0][order]] = np.concatenate(
+        [*map(np.arange, np.bincount(cell))]) < per_cell
+    note += (f'; {added} of its {len(new)} keyframes added, {displaced} that contradict the map '
+             f'left out; full cells lost {first + added - kept.sum()}')
+    parts = [part.select(chosen) for part, chosen in ((layer, kept[:first]), (new, kept[first:]))
+             if chosen.any()]
+    return join_layers(parts) if added else layer, placing, note
