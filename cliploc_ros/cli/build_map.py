@@ -39,7 +39,6 @@ examples:
   build_map --colmap office --known-distance a.jpg b.jpg 1.5 --level --out office.yaml
   build_map --rgbd kitchen --level --out kitchen.yaml --no-keyframe-layer
   build_map --bag monday --bag tuesday --folder phone --out office.yaml
-  build_map --add office.yaml --bag wednesday --out office.yaml
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
 """
 
@@ -58,8 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
     add_source_options(parser)
     option(parser, '--out YAML', 'the map to write', required=True)
     option(parser, '--update YAML', 'bring this map up to date; --out may be the same file')
-    option(parser, '--add YAML', 'build this map again from its recordings and those given here; '
-           '--out may be the same file')
+    option(parser, '--add YAML', 'build this map again, with further recordings')
     option(parser, '--same-frame', 'the recordings have one coordinate frame: a shift between '
            'them is named, but stays (default: recordings are placed by their keyframes)')
     option(parser, '--report JSON', 'also write what was found and left out, and why')
@@ -103,25 +101,21 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.mapping import make_map
-    from cliploc_ros.offline.recording.keyframe_layer import build_layer
 
     begin = time.monotonic()
     recordings = sources.each_recording(options)
     update, name = options.update, ', '.join(sources.source_of(own).name for own in recordings)
     command.check_output(options.out)
     layer, note = layer_options(recordings[0])
-    is_several = len(recordings) > 1 or options.add is not None
-    _refuse_conflicts(options, is_several)
+    _refuse_conflicts(options, len(recordings) > 1 or options.add is not None)
+    if options.add is not None:
+        options.frame_id = LandmarkMap.from_file(options.add).frame_id
     if update is not None and not len(LandmarkMap.from_file(update)):
         raise OptionsError(f'--update {update}: is a map of keyframes alone, which cannot be '
                            'updated; build a new one')
     mapping = _mapping_options(options, f'build_map {name}')
-    detections, recording, frames, joined = _first(options, recordings, mapping)
-    if is_several:
-        if frames is not None and layer is not None:
-            joined = build_layer(frames, LandmarkMap.empty(mapping.frame_id), layer)
-        detections, recording, joined = sources.join_sources(
-            options, recordings, detections, recording, joined, layer)
+    detections, recording, frames, joined = sources.read_recordings(
+        options, recordings, partial(_placed, mapping=mapping), layer)
     _tell_misspelt(mapping.moving_classes, detections.class_names)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
@@ -192,17 +186,15 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
 
 def _refuse_conflicts(options: argparse.Namespace, is_several: bool) -> None:
     """Refuse conflicting options, before any work is done."""
-    is_update = options.update is not None
+    is_update, is_new = options.update is not None, options.add is options.update is None
     for is_wrong, text in (
-            (is_update and is_several,
-             '--update is for one recording: run it for each, or --add them to the map'),
-            (is_several and (options.refine_mount or options.keyframe_images),
-             '--refine-mount and --keyframe-images are for one recording'),
-            (options.level and is_update, '--level is for new maps, not for --update'),
-            (options.object_size and (options.scale or options.known_distance or is_update),
-             '--object-size is not for --scale, --known-distance or --update'),
-            (options.refine_mount and is_update,
-             '--refine-mount is for new maps, not for --update'),
+            (is_update and is_several, '--update is for one recording: run it for each in turn'),
+            (is_several and options.keyframe_images, '--keyframe-images is for one recording'),
+            (options.level and not is_new, '--level is for new maps, not for --update or --add'),
+            (options.object_size and (options.scale or options.known_distance or not is_new),
+             '--object-size is not for --scale, --known-distance, --update or --add'),
+            (options.refine_mount and (is_update or is_several),
+             '--refine-mount is for new maps of one recording, not for --update'),
             (options.refine_mount and len(options.cameras) > 1, '--refine-mount is for one '
              'camera: correct each with a map of --cameras NAME alone'),
             (options.joint is False and options.pose_noise,
@@ -246,35 +238,8 @@ def _write_report(path: Path | None, report: dict[str, Any]) -> None:
         print(f'report: {path}', flush=True)
 
 
-def _first(options: argparse.Namespace, recordings: list[argparse.Namespace],
-           mapping: 'MappingOptions') -> tuple[Any, ...]:
-    """Take the first recording of a map, or the map of --add.
-
-    Return its detections, its recording, its images, and its keyframes if they exist.
-    """
-    from cliploc_ros.cli import sources
-    from cliploc_ros.cli.options import read_layer
-    from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.offline.datasets.frames import move_frames
-    from cliploc_ros.offline.datasets.map_recording import load_recording
-
-    if options.add is None:
-        recorded, file, images = sources.read_source(own := recordings.pop(0))
-        detections, scale, rotation = _placed(recorded, own, mapping,
-                                              images is not None and images.of_tf)
-        if without := recorded.without_pose:
-            print(f'no pose: {without} of {recorded.images} images', flush=True)
-        return detections, sources.recording_of(own, file, scale, rotation), (
-            images and move_frames(images, scale, rotation)), None
-    if (recording := load_recording(options.add)) is None:
-        raise OptionsError(f'--add {options.add}: its recording is missing: build a map of all')
-    return recording.load(), recording, None, read_layer(
-        options.add, LandmarkMap.from_file(options.add), None)
-
-
-def _placed(detections: 'PosedDetections', options: argparse.Namespace,
-            mapping: 'MappingOptions', of_tf: bool
-            ) -> 'tuple[PosedDetections, float, NDArray[np.float64]]':
+def _placed(detections: 'PosedDetections', options: argparse.Namespace, of_tf: bool,
+            mapping: 'MappingOptions') -> 'tuple[PosedDetections, float, NDArray[np.float64]]':
     """Level and scale detections; return them with the scale and the rotation (3, 3)."""
     import numpy as np
 

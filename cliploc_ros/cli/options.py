@@ -50,13 +50,14 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
 
 def add_folders(group: Any, **more: Any) -> None:
     """Add the options that name a folder of images to a group of a parser."""
-    option(group, '--tum DIR', 'a TUM RGB-D folder, without its depth')
-    option(group, '--rgbd DIR', 'a folder with depth: TUM RGB-D or 7-Scenes')
+    option(group, '--tum DIR', 'a TUM RGB-D folder, without its depth', **more)
+    option(group, '--rgbd DIR', 'a folder with depth: TUM RGB-D or 7-Scenes', **more)
     option(group, '--folder DIR', 'a folder of any known layout, with its depth: TUM RGB-D, '
            '7-Scenes, Polycam, Record3D, Stray Scanner, ARKitScenes, HoloLens 2, transforms.json, '
            'COLMAP', **more)
-    option(group, '--colmap DIR', 'a COLMAP model, or a project with sparse/0 and images/')
-    option(group, '--nerf DIR', 'a transforms.json of nerfstudio or Instant-NGP, or its folder')
+    option(group, '--colmap DIR', 'a COLMAP model, or a project with sparse/0 and images/', **more)
+    option(group, '--nerf DIR', 'a transforms.json of nerfstudio or Instant-NGP, or its folder',
+           **more)
 
 
 def add_reading_options(parser: argparse.ArgumentParser) -> None:
@@ -165,9 +166,8 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--keyframe-features', 'kind of features of the keyframes, and later of the '
            'images to localize; xfeat is a network of 2.7 MB, which is downloaded once '
            '(%(default)s)', default=SIFT, choices=FEATURES)
-    option(group, '--keyframes-per-cell N', 'of several recordings: greatest number of keyframes '
-           'in a cell of 1 m and 30 degrees; those that localize most others stay (%(default)s)',
-           positive_int, 40)
+    option(group, '--keyframes-per-cell N', 'of several recordings, most keyframes in a cell of '
+           '1 m and 30 degrees: those that localize most others (%(default)s)', positive_int, 40)
     option(group, '--keyframe-images', 'also store small images of the keyframes, for the debug '
            'image: anyone who has the file can see the place')
 

@@ -3,7 +3,7 @@
 """Read the recording that the command line names, see cli.options."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.cli.options import FOLDERS, check_folder_options, folder_of
+from cliploc_ros.cli.options import FOLDERS, check_folder_options, folder_of, read_layer
 from cliploc_ros.command import positive
 from cliploc_ros.core.geometry.depth import DepthCamera
 from cliploc_ros.core.geometry.transforms import make_transform
@@ -178,11 +178,9 @@ def each_recording(options: argparse.Namespace) -> list[argparse.Namespace]:
 
     Options that level or scale poses count for the first one. OptionsError: there is none.
     """
-    found, kinds = list[argparse.Namespace](), ('bag', *FOLDERS, 'observations')
-    for name in kinds:
-        given = getattr(options, name)
-        for path in given if isinstance(given, list) else filter(None, [given]):
-            found.append(argparse.Namespace(**vars(options) | dict.fromkeys(kinds) | {name: path}))
+    kinds = ('bag', *FOLDERS, 'observations')
+    found = [argparse.Namespace(**vars(options) | dict.fromkeys(kinds) | {name: path})
+             for name in kinds for path in getattr(options, name) or ()]
     for own in found[options.add is None:]:  # placed in a map, so that any unit will do
         vars(own).update(level=False, known_distance=None, record_to=None, object_size=())
     if not found:
@@ -190,13 +188,34 @@ def each_recording(options: argparse.Namespace) -> list[argparse.Namespace]:
     return found
 
 
-def join_sources(options: argparse.Namespace, others: Sequence[argparse.Namespace],
-                 detections: PosedDetections, recording: MapRecording,
-                 layer: KeyframeLayer | None, wanted: LayerOptions | None
-                 ) -> tuple[PosedDetections, MapRecording, KeyframeLayer | None]:
-    """Join other recordings with that of a map, and with its keyframes; see add_layer."""
+def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.Namespace],
+                    place: Callable[..., Any], wanted: LayerOptions | None) -> tuple[
+                        PosedDetections, MapRecording, frames.Frames | None, KeyframeLayer | None]:
+    """Read the recordings of a map; with --add, after those of that map.
+
+    `place` levels and scales the first one. Return detections, what the map names as its
+    recording, and either the images of a single recording, or the keyframes of several, see
+    add_layer.
+    """
+    if options.add is not None:
+        if (recording := load_recording(options.add)) is None:
+            raise OptionsError(f'--add {options.add}: its recording is missing: give all again')
+        detections, layer = recording.load(), read_layer(
+            options.add, LandmarkMap.from_file(options.add), None)
+    else:
+        first, *recordings = recordings
+        detections, file, images = read_source(first)
+        if without := detections.without_pose:
+            print(f'no pose: {without} of {detections.images} images', flush=True)
+        detections, scale, rotation = place(detections, first, bool(images and images.of_tf))
+        recording, layer = recording_of(first, file, scale, rotation), None
+        images = images and frames.move_frames(images, scale, rotation)
+        if not recordings:
+            return detections, recording, images, None
+        if images is not None and wanted is not None:
+            layer = build_layer(images, LandmarkMap.empty(options.frame_id), wanted)
     parts = [detections]
-    for own in others:
+    for own in recordings:
         (seen, _, images), placing = read_source(own), Placing()
         with naming(source_of(own), MappingError):
             if layer is not None and images is not None and wanted is not None:
@@ -205,15 +224,15 @@ def join_sources(options: argparse.Namespace, others: Sequence[argparse.Namespac
                     not images.is_metric, options.same_frame, options.keyframes_per_cell)
                 print(f'{source_of(own)}: {note}', flush=True)
             elif not options.same_frame:
-                raise MappingError('without keyframes of all recordings, its place in the map is '
-                                   'unknown: give `same_frame` if its poses are those of the map')
+                raise MappingError('lacks keyframes that place it in the map: give `same_frame`')
         end_s = max(part.stamps_s[-1] for part in parts)
-        parts.append(seen.moved(*placing).later(max(0.0, end_s + _APART_S - seen.stamps_s[0])))
+        stamps_s = seen.stamps_s + max(0.0, end_s + _APART_S - seen.stamps_s[0])
+        parts.append(replace(seen.moved(*placing), stamps_s=stamps_s, stamps_ns=None))
     joined = join_detections(parts)
     file = options.out.with_suffix(f'.{len(joined)}.npz')
     # its poses are those of the first recording
     save_observations(file, joined.moved(1.0 / recording.scale, np.array(recording.rotation).T))
-    return joined, replace(recording, observations=file), layer
+    return joined, replace(recording, observations=file), None, layer
 
 
 def source_of(options: argparse.Namespace) -> Path:

@@ -15,7 +15,6 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import DatasetError
-from cliploc_ros.units import NS_PER_S
 
 # Intrinsics that differ by a smaller share belong to one camera that refocuses.
 _SAME_CAMERA = 0.02
@@ -131,11 +130,6 @@ class PosedDetections:
         """Return the same detections with moved poses, see move_poses."""
         return self.with_poses(move_poses(self.map_from_camera, scale, rotation, shift))
 
-    def later(self, delay_s: float) -> 'PosedDetections':
-        """Return the same detections with later stamps."""
-        return replace(self, stamps_s=self.stamps_s + delay_s, stamps_ns=None
-                       if self.stamps_ns is None else self.stamps_ns + round(delay_s * NS_PER_S))
-
 
 def join_detections(parts: Sequence[PosedDetections]) -> PosedDetections:
     """Join the detections of several recordings with poses in one coordinate frame.
@@ -148,8 +142,8 @@ def join_detections(parts: Sequence[PosedDetections]) -> PosedDetections:
                            'all with one CLIP, or with `no_clip`')
     classes = sorted({name for part in parts for name in part.class_names})
     own = [[*zip(part.camera_names, part.cameras, strict=True)] for part in parts]
-    names, cameras = zip(*dict.fromkeys(chain(*own)), strict=True)
-    known = [*zip(names, cameras, strict=True)]
+    known = [*dict.fromkeys(chain(*own))]
+    names, cameras = zip(*known, strict=True)
     parts = [replace(
         part, classes=np.array([*map(classes.index, part.class_names), 0])[part.classes],
         camera_rows=np.array([*map(known.index, pairs)])[part.frame_cameras])

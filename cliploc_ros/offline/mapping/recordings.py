@@ -11,7 +11,7 @@ a full cell, those stay that localize most others (Muehlfellner et al., "Summary
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,10 +28,8 @@ from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.recording.layer_words import with_words
 
 # A keyframe is recognized by this number of points: fewer may agree by chance. It is not added if
-# the layer localizes it with this number, and contradicts the map if it is localized elsewhere.
-_LEAST_POINTS, _ENOUGH, _DISPLACED = 15, 100, 40
-# Greatest number of points of a keyframe that place a recording.
-_POINTS = 60
+# the layer localizes it with this number: it is known, or contradicts the map.
+_LEAST_POINTS, _ENOUGH = 15, 80
 # A keyframe agrees with a placing that projects half of its points within this angle. Poses of
 # recordings have errors of centimetres: 15 px at f = 525 px are 6 cm at 2 m.
 _AGREE = 15.0 / 525.0
@@ -91,11 +89,10 @@ def recognize(new: KeyframeLayer, layer: KeyframeLayer) -> list[Sight]:
         if not found.places or found.places[0].inliers < _LEAST_POINTS:
             found = localizer.localize_features(features, camera, fast=found)
         for place in found.places[:1]:
-            kept = np.arange(0, len(place.pixels), 1 + len(place.pixels) // _POINTS)
             if place.inliers >= _LEAST_POINTS:
-                own = new.points[rows][cKDTree(pixels).query(place.pixels[kept])[1]]
-                sights.append(Sight(keyframe, pose, place.map_from_camera, place.points[kept],
-                                    own.astype(np.float64), place.inliers, np.array(place.keyframes)))
+                own = new.points[rows][cKDTree(pixels).query(place.pixels)[1]]
+                sights.append(Sight(keyframe, pose, place.map_from_camera, place.points,
+                                    own.astype(float), place.inliers, np.array(place.keyframes)))
     return sights
 
 
@@ -109,37 +106,35 @@ def find_placing(sights: Sequence[Sight], is_scaled: bool = False) -> tuple[Plac
     MappingError: too few keyframes agree about the placing, or two placings fit.
     """
     guesses = [sight.similarity(is_scaled) for sight in sights]
-    agree = np.array([[sight.agrees(guess) for sight in sights] for guess in guesses],
-                     dtype=np.bool_).reshape(len(guesses), len(sights))
-    best = int(agree.sum(axis=1).argmax()) if guesses else 0
-    agreeing = int(agree[best:best + 1].sum())
-    rivals = int((agree & ~agree[best:best + 1]).sum(axis=1).max(initial=0))
+    agree = np.array([[sight.agrees(guess) for sight in sights] for guess in guesses] or [[]],
+                     dtype=np.bool_)
+    row = int(agree.sum(axis=1).argmax())
+    kept, placing = agree[row], (guesses or [np.eye(4)])[row]
+    for _ in range(2 * bool(kept.sum() >= _LEAST_AGREEING)):
+        placing = _refined([*compress(sights, kept)], placing, is_scaled)
+        kept = np.array([sight.agrees(placing) for sight in sights])
+    agreeing, rivals = kept.sum(), (agree & ~kept).sum(axis=1).max()
     if agreeing < max(_LEAST_AGREEING, _PER_RIVAL * rivals):
         raise MappingError(f'its place in the map is unknown: {agreeing} of {len(sights)} '
                            f'recognized keyframes agree about it, {rivals} about another place')
+    scale = float(np.cbrt(np.linalg.det(placing[:3, :3])))
+    return Placing(scale, placing[:3, :3] / scale, placing[:3, 3]), int(agreeing)
 
+
+def _refined(sights: Sequence[Sight], start: NDArray[np.float64], is_scaled: bool
+             ) -> NDArray[np.float64]:
+    """Refine a placing (4, 4) by robust least squares."""
     def moved(step: NDArray[np.float64]) -> NDArray[np.float64]:
         turn = Rotation.from_rotvec(step[:3]).as_matrix() * np.exp(step[6:].sum())
-        return np.asarray(guesses[best] @ transforms.make_transform(turn, step[3:6]))
-    kept = [sights[row] for row in np.nonzero(agree[best])[0]]
-    placing = moved(least_squares(
-        lambda step: np.concatenate([sight.errors(moved(step)) for sight in kept]).ravel(),
+        return np.asarray(start @ transforms.make_transform(turn, step[3:6]))
+    return moved(least_squares(
+        lambda step: np.concatenate([sight.errors(moved(step)) for sight in sights]).ravel(),
         np.zeros(6 + is_scaled), x_scale='jac', loss='cauchy', f_scale=_LOSS).x)
-    scale = float(np.cbrt(np.linalg.det(placing[:3, :3])))
-    return (Placing(scale, placing[:3, :3] / scale, placing[:3, 3]),
-            sum(sight.agrees(placing) for sight in sights))
 
 
 def join_layers(layers: Sequence[KeyframeLayer]) -> KeyframeLayer:
-    """Join layers in one coordinate frame, without small images.
-
-    MappingError: their features are of different kinds.
-    """
-    if len(names := {layer.kind.name for layer in layers}) > 1:
-        raise MappingError(f'keyframes of {" and ".join(sorted(names))} cannot be joined: give '
-                           'the `keyframe_features` of the map')
+    """Join layers of one kind of features in one coordinate frame, without small images."""
     layers = [layer.plain() for layer in layers]
-
     sources = [layer.sources or (Source(''),) for layer in layers]
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(layer, name) for layer in layers])
@@ -180,8 +175,8 @@ def add_layer(layer: KeyframeLayer, new: KeyframeLayer, is_scaled: bool, same_fr
 
     Raises
     ------
-    MappingError
-        The layers cannot be joined, or the recording cannot be placed.
+    MapError, MappingError
+        The features are of different kinds, or the recording cannot be placed.
     """
     sights, placing = recognize(new, layer), Placing()
     note = 'it is not compared with the map, which recognizes too few of its keyframes'
@@ -189,21 +184,20 @@ def add_layer(layer: KeyframeLayer, new: KeyframeLayer, is_scaled: bool, same_fr
         found, agreed = find_placing(sights, is_scaled)
         poses = transforms.move_poses(new.map_from_camera, *found)
         shift_m = np.median(np.linalg.norm((poses - new.map_from_camera)[:, :3, 3], axis=1))
-        angle = transforms.rotation_angle_deg(found.rotation)
         placing = placing if same_frame else found
-        note = (f'{agreed} keyframes place it {shift_m:.2f} m and {angle:.1f} degrees from where '
-                f'its poses are{", which stay" * same_frame}')
+        note = (f'{agreed} keyframes place it {shift_m:.2f} m and '
+                f'{transforms.rotation_angle_deg(found.rotation):.1f} degrees from where its '
+                f'poses are{", which stay" * same_frame}')
     new = replace(new, map_from_camera=transforms.move_poses(new.map_from_camera, *placing),
                   points=(placing.scale * new.points).astype(np.float32))
     poses, first = np.concatenate([layer.map_from_camera, new.map_from_camera]), len(layer)
     kept, votes, displaced = np.ones(len(poses), bool), np.zeros(len(poses), dtype=np.int64), 0
     for sight in sights:
         votes[sight.keyframes] += 1
-        pose = poses[first + sight.keyframe]
-        if sight.agreed >= _DISPLACED and not transforms.SAME_LOOK.agree(sight.found, pose):
-            kept[first + sight.keyframe], displaced = False, displaced + 1
-        elif sight.agreed >= _ENOUGH and transforms.SAME_BOXES.agree(sight.found, pose):
-            kept[first + sight.keyframe] = False
+        if sight.agreed >= _ENOUGH:
+            row = first + sight.keyframe
+            kept[row], displaced = False, displaced + (
+                not transforms.SAME_LOOK.agree(sight.found, poses[row]))
     added = int(kept[first:].sum())
     cells = np.floor(np.hstack([poses[:, :3, 3] / _CELL_M, poses[:, :3, 2] / _CELL_DIRECTION]))
     cell = np.unique(cells[kept], axis=0, return_inverse=True)[1].ravel()
@@ -211,8 +205,8 @@ def add_layer(layer: KeyframeLayer, new: KeyframeLayer, is_scaled: bool, same_fr
     order = np.lexsort([-np.arange(len(cell)), -votes[kept], cell])
     kept[np.nonzero(kept)[0][order]] = np.concatenate(
         [*map(np.arange, np.bincount(cell))]) < per_cell
-    note += (f'; {added} of its {len(new)} keyframes added, {displaced} that contradict the map '
-             f'left out; full cells lost {first + added - kept.sum()}')
+    note += (f'; {added} of its {len(new)} keyframes are new, {displaced} contradict the map; '
+             f'full cells lose {first + added - kept.sum()}')
     parts = [part.select(chosen) for part, chosen in ((layer, kept[:first]), (new, kept[first:]))
              if chosen.any()]
     return join_layers(parts) if added else layer, placing, note
