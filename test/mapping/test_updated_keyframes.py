@@ -10,8 +10,8 @@ from scene import CAMERA, ROOM, make_layer, rigid
 
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import Landmarks
+from cliploc_ros.offline.mapping.recordings import join_layers
 from cliploc_ros.offline.mapping.update.keyframes import check_belongs, update_layer
-from cliploc_ros.offline.recording.layer_words import join_layers
 
 WALL = 600
 #: Points of a wall 3 m in front of the cameras, and their looks.
@@ -43,11 +43,11 @@ def fates(updated, name):
 
 
 def test_a_room_without_change_keeps_all_and_gets_what_it_lacks():
-    updated = update_layer(OLD, layer_of([-1.7, 0.1, 1.2]), NOTHING, ROOM)
+    updated = update_layer(OLD, layer_of([-1.7, 0.1, 1.2]), NOTHING)
     assert updated.removed is None
     assert fates(updated, 'confirmed') == [*range(len(OLD))]
     half = OLD.select(np.arange(len(OLD)) < 4)
-    updated = update_layer(half, layer_of([-1.7, 1.2]), NOTHING, ROOM)
+    updated = update_layer(half, layer_of([-1.7, 1.2]), NOTHING)
     assert fates(updated, 'added') == [4]
     assert updated.layer.map_from_camera[:, 0, 3] == pytest.approx([-2.0, -1.5, -1.0, -0.5, 1.2])
     assert 'added' in updated.line() and '0 points removed' in updated.line()
@@ -56,7 +56,7 @@ def test_a_room_without_change_keeps_all_and_gets_what_it_lacks():
 def test_points_that_moved_go_and_their_keyframes_with_them():
     moved = POINTS + np.where(POINTS[:, :1] < 0.0, (0.0, 0.0, 1.0), 0.0)
     stale = layer_of(np.arange(-3.0, 3.1, 0.5), moved)
-    updated = update_layer(stale, layer_of(np.arange(-3.0, 3.1, 0.25)), NOTHING, ROOM)
+    updated = update_layer(stale, layer_of(np.arange(-3.0, 3.1, 0.25)), NOTHING)
     assert {0, 1, 2} <= set(fates(updated, 'retired')) <= set(range(6))
     assert {8, 9, 10, 11, 12} <= set(fates(updated, 'confirmed'))
     every = np.concatenate([updated.layer.points_in_map(row) for row in range(len(updated.layer))])
@@ -69,7 +69,7 @@ def test_points_that_moved_go_and_their_keyframes_with_them():
 
 def test_points_on_objects_that_are_gone_go_without_images():
     gone = Landmarks(np.array([[0.0, 0.0, 3.0]]), 0.6 * np.eye(3)[None], np.array([0]))
-    updated = update_layer(OLD, None, gone, ROOM)
+    updated = update_layer(OLD, None, gone)
     every = np.concatenate([updated.layer.points_in_map(row) for row in range(len(OLD))])
     assert np.linalg.norm(every - (0.0, 0.0, 3.0), axis=1).min() > 0.59
     assert fates(updated, 'retired') == [] and updated.removed is not None
@@ -79,7 +79,7 @@ def test_points_on_objects_that_are_gone_go_without_images():
 def test_another_room_does_not_belong():
     other = layer_of(np.arange(-2.0, 2.1, 0.5), looks=LOOKS[::-1])
     with pytest.raises(MappingError, match='does not belong'):
-        check_belongs(update_layer(OLD, other, NOTHING, ROOM))
-    check_belongs(update_layer(OLD, layer_of([0.0]), NOTHING, ROOM))
+        check_belongs(update_layer(OLD, other, NOTHING))
+    check_belongs(update_layer(OLD, layer_of([0.0]), NOTHING))
 
 

@@ -34,12 +34,12 @@ from cliploc_ros.offline.mapping.labelling import embed_landmarks, embed_phrases
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.recordings import join_layers
 from cliploc_ros.offline.mapping.systematic import MountCorrection
 from cliploc_ros.offline.mapping.update.keyframes import UpdatedLayer, check_belongs, update_layer
 from cliploc_ros.offline.mapping.update.updating import UpdatedMap, UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
-from cliploc_ros.offline.recording.layer_words import join_layers
 from cliploc_ros.offline.vocabulary.vocabulary import load_vocabulary, shipped_phrases
 
 # A scale by objects of known size: greatest number of trial maps, and the relative change of the
@@ -153,7 +153,8 @@ def _has_embeddings(detections: PosedDetections) -> bool:
 
 def make_map(detections: PosedDetections, labeller: Labeller,
              options: MappingOptions | None = None, frames: Frames | None = None,
-             layer: LayerOptions | None = None, progress: Progress | None = None) -> MadeMap:
+             layer: LayerOptions | KeyframeLayer | None = None, progress: Progress | None = None
+             ) -> MadeMap:
     """Make a map from a recording.
 
     If no landmark is found, keyframes alone make a map. If the images give no keyframes,
@@ -168,8 +169,8 @@ def make_map(detections: PosedDetections, labeller: Labeller,
         See find_labeller.
     frames : Frames, optional
         The images, for the layer of keyframes.
-    layer : LayerOptions, optional
-        None: without keyframes.
+    layer : LayerOptions or KeyframeLayer, optional
+        Options, or keyframes that were built before. None: without keyframes.
     progress : callable, optional
         Called with the name of a stage and its progress, 0 to 1.
 
@@ -194,14 +195,17 @@ def make_map(detections: PosedDetections, labeller: Labeller,
     return made
 
 
-def _with_layer(made: MadeMap, frames: Frames | None, layer: LayerOptions | None) -> MadeMap:
-    """Return a map with the keyframes of a recording, or with a note why there are none."""
-    if frames is None or layer is None:
-        return made
+def _with_layer(made: MadeMap, frames: Frames | None, layer: LayerOptions | KeyframeLayer | None
+                ) -> MadeMap:
+    """Return a map with a layer, or with a note why the frames give none."""
     try:
-        return replace(made, layer=build_layer(frames, made.landmark_map, layer))
+        if isinstance(layer, LayerOptions):
+            layer = None if frames is None else build_layer(frames, made.landmark_map, layer)
     except MappingError as error:
         return replace(made, note=f'no keyframes: {error}')
+    return made if layer is None else replace(made, layer=replace(
+        layer, frame_id=made.landmark_map.frame_id, landmark_ids=made.landmark_map.landmark_ids,
+        landmark_centers=made.landmark_map.centers.astype(np.float32)))
 
 
 def scale_of_objects(detections: PosedDetections, options: MappingOptions, class_name: str,
@@ -266,13 +270,13 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
     made = replace(made, updated=old.map_set)
     if old_layer is None:
         return made
-    keyframes = update_layer(old_layer, made.layer, gone, made.landmark_map)
+    keyframes = update_layer(old_layer, made.layer, gone)
     if not len(old):
         check_belongs(keyframes)
     removed = [] if keyframes.removed is None else [keyframes.removed]
     with suppress(MapError):  # there is none, or it is of another map
         removed.append(load_layer_of_map(layer_path(removed_path(path)), old, kinds))
-    return replace(made, layer=keyframes.layer, keyframes=keyframes._replace(
+    return replace(_with_layer(made, None, keyframes.layer), keyframes=keyframes._replace(
         removed=join_layers(removed) if removed else None))
 
 

@@ -138,6 +138,8 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         keyframe.posed.bearings[rows] * (keyframe.camera.fx, keyframe.camera.fy)
         + (keyframe.camera.cx, keyframe.camera.cy) for keyframe, _, rows in chosen])
     different = tuple(dict.fromkeys(cameras))
+    # stamps of images without time begin at 0
+    date = str(np.datetime64(seen[0].stamp_ns, 'ns'))[:10] * (seen[0].stamp_ns > 10**17)
     built = with_words(layer.KeyframeLayer(
         landmark_map.frame_id, landmark_map.landmark_ids,
         landmark_map.centers.astype(np.float32), different,
@@ -149,7 +151,8 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         layer.FROM_DEPTH if any(np.isfinite(keyframe.depths).any() for keyframe in seen)
         else layer.TRIANGULATED,
         camera_rows=None if len(different) == 1 else np.array(
-            [different.index(own) for own in cameras]), kind=kind))
+            [different.index(own) for own in cameras]), kind=kind,
+        sources=(layer.Source(frames.source.name, date),)))
     if not options.images:
         return built
     jpegs = [keyframe.jpeg for keyframe, _, _ in chosen]

@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Visual words of a layer of keyframes, and the compression of a large layer."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import vq
 
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
-from cliploc_ros.core.keyframes.layer import WORDS, KeyframeLayer, Source, nearest_words
+from cliploc_ros.core.keyframes.layer import WORDS, KeyframeLayer, nearest_words
 
 # Descriptors that the words are learned from, for each group of WORDS words; steps of k-means.
 _MOST_LEARNED, _STEPS = 50_000, 8
@@ -24,27 +21,6 @@ _POINTS_PER_WORD, _MOST_IN_GROUP = 200_000, 16
 _LARGE, _CODES = 1_000_000, 16
 # Rows at once, and rows that the codes are learned from.
 _ROWS = 1 << 16
-
-
-def join_layers(layers: Sequence[KeyframeLayer]) -> KeyframeLayer:
-    """Join layers of the same kind and coordinate frame, without images, and learn new words."""
-    layers = [layer.plain() for layer in layers if len(layer)]
-    names = [layer.sources or (Source(''),) for layer in layers]
-    cameras = tuple(dict.fromkeys(chain.from_iterable(layer.cameras for layer in layers)))
-    sources = tuple(dict.fromkeys(chain.from_iterable(names)))
-    rows = [np.zeros(len(layer), np.int64) if layer.source_rows is None else layer.source_rows
-            for layer in layers]
-    columns: dict[str, Any] = {
-        name: np.concatenate([getattr(layer, name) for layer in layers])
-        for name in ('map_from_camera', 'pixels', 'points', 'descriptors')}
-    return with_words(replace(
-        layers[0], **columns, cameras=cameras, sources=sources, images=None, image_offsets=None,
-        offsets=np.cumsum([0, *chain.from_iterable(np.diff(layer.offsets) for layer in layers)]),
-        camera_rows=np.array([cameras.index(layer.camera_of(row))
-                              for layer in layers for row in range(len(layer))], np.int64),
-        source_rows=np.array([sources.index(own[row]) for own, theirs in zip(
-            names, rows, strict=True) for row in theirs], np.int64),
-        deviation_per_metre=np.concatenate([layer.deviations() for layer in layers])))
 
 
 def with_words(layer: KeyframeLayer) -> KeyframeLayer:

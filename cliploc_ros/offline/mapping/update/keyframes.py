@@ -7,7 +7,6 @@ point is found if a feature at its projection matches. The points of a keyframe,
 cube of the room in all keyframes, are gone if hardly any look finds them, while others are found.
 """
 
-from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
@@ -19,12 +18,11 @@ from cliploc_ros.core.geometry.ellipsoid import normalized_lengths
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.localization import ENOUGH_INLIERS, keyframes_near
-from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.presence import probability_there
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import Landmarks
+from cliploc_ros.offline.mapping.recordings import join_layers
 from cliploc_ros.offline.recording.keyframe_layer import LEAST_POINTS
-from cliploc_ros.offline.recording.layer_words import join_layers
 
 # A keyframe is looked for in this number of nearest views, up to this distance of views: 1.2 m or
 # 24 degrees. A feature is at the projection of a point up to this angle: 8 px at f = 525 px.
@@ -114,8 +112,7 @@ def check_belongs(updated: UpdatedLayer) -> None:
             'or build a new map')
 
 
-def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks,
-                 landmark_map: LandmarkMap) -> UpdatedLayer:
+def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks) -> UpdatedLayer:
     """Update the keyframes of a map.
 
     Parameters
@@ -124,8 +121,6 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks,
         Of the recording, with poses in the map. None: the recording has no images.
     gone : Landmarks
         Objects that are no longer in these places.
-    landmark_map : LandmarkMap
-        The updated map.
     """
     old, count = old.plain(), len(old)
     new = old.select(np.zeros(count, dtype=np.bool_)) if new is None else new
@@ -159,10 +154,8 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks,
             removed, expected, found)), strict=True)]
     fates += [KeyframeFate('added', pose[:3, 3].round(3).tolist(), size) for pose, size in zip(
         added.map_from_camera, np.diff(added.offsets).tolist(), strict=True)]
-    layer = replace(join_layers([kept, added]), landmark_ids=landmark_map.landmark_ids,
-                    landmark_centers=landmark_map.centers.astype(np.float32))
-    return UpdatedLayer(layer, old.select(removed > 0, is_gone) if is_gone.any() else None,
-                        tuple(fates))
+    return UpdatedLayer(join_layers([part for part in (kept, added) if len(part)]), old.select(
+        removed > 0, is_gone) if is_gone.any() else None, tuple(fates))
 
 
 def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Looks:
