@@ -10,6 +10,7 @@ from scene import CAMERA, ROOM, embeddings_of
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.offline.datasets.map_recording import MapRecording
 from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
+from cliploc_ros.offline.mapping.update.keyframes import UpdatedLayer
 
 
 def made_map(number):
@@ -21,7 +22,8 @@ def made_map(number):
         np.tile(np.eye(4), (1, 1, 1)), np.array([0, 5]), np.zeros((5, 2), np.uint16),
         np.full((5, 3), number, dtype=np.float32), np.zeros((5, 128), np.uint8),
         np.zeros(5, np.uint16), np.ones((1, 128), np.uint8))
-    return MadeMap(landmark_map, None, embeddings_of(ROOM.landmark_ids, means), layer)
+    return MadeMap(landmark_map, None, embeddings_of(ROOM.landmark_ids, means), layer,
+                   keyframes=UpdatedLayer(layer, layer, ()))
 
 
 def write_set(path, number):

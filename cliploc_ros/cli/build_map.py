@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,6 +38,7 @@ examples:
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
   build_map --colmap office --known-distance a.jpg b.jpg 1.5 --level --out office.yaml
   build_map --rgbd kitchen --level --out kitchen.yaml --no-keyframe-layer
+  build_map --bag monday --bag tuesday --folder phone --out office.yaml
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
 """
 
@@ -56,6 +57,9 @@ def make_parser() -> argparse.ArgumentParser:
     add_source_options(parser)
     option(parser, '--out YAML', 'the map to write', required=True)
     option(parser, '--update YAML', 'bring this map up to date; --out may be the same file')
+    option(parser, '--add YAML', 'build this map again, with further recordings')
+    option(parser, '--same-frame', 'the recordings have one coordinate frame: a shift between '
+           'them is named, but stays (default: recordings are placed by their keyframes)')
     option(parser, '--report JSON', 'also write what was found and left out, and why')
     option(parser, '--frame-id', 'coordinate frame of the map (%(default)s)', default='map')
     option(parser, '--every N', 'use only every N-th frame (%(default)s)', command.positive_int, 1)
@@ -94,26 +98,21 @@ def build(options: argparse.Namespace) -> int:
     """Build or update the map that the command line names; return the exit code."""
     # Imported late, so that --help is fast.
     from cliploc_ros.cli import sources
-    from cliploc_ros.core.keyframes.layer import layer_path
     from cliploc_ros.core.map.landmark_map import LandmarkMap
-    from cliploc_ros.offline.datasets.frames import move_frames
     from cliploc_ros.offline.mapping import make_map
 
     begin = time.monotonic()
-    update, name = options.update, sources.source_of(options).name
+    recordings = sources.each_recording(options)
+    update, name = options.update, ', '.join(sources.source_of(own).name for own in recordings)
     command.check_output(options.out)
-    layer, note = layer_options(options)
-    _refuse_conflicts(options)
-    if update is not None and not len(LandmarkMap.from_file(update)):
-        raise OptionsError(f'--update {update}: is a map of keyframes alone, which cannot be '
-                           'updated; build a new one')
+    layer, note = layer_options(recordings[0])
+    _refuse_conflicts(options, len(recordings) > 1 or options.add is not None)
+    if options.add is not None:
+        options.frame_id = LandmarkMap.from_file(options.add).frame_id
     mapping = _mapping_options(options, f'build_map {name}')
-    recorded, file, images = sources.read_source(options)
-    _tell_misspelt(mapping.moving_classes, recorded.class_names)
-    detections, scale, rotation = _placed(recorded, options, mapping,
-                                          images is not None and images.of_tf)
-    if without := recorded.without_pose:
-        print(f'no pose: {without} of {recorded.images} images', flush=True)
+    detections, recording, frames, joined = sources.read_recordings(
+        options, recordings, partial(_placed, mapping=mapping), layer)
+    _tell_misspelt(mapping.moving_classes, detections.class_names)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
     labeller = make_map.find_labeller(
@@ -121,13 +120,14 @@ def build(options: argparse.Namespace) -> int:
         options.vocabulary)
     try:
         if update is not None:
-            made = make_map.update_map(update, detections, labeller, mapping)
-            note = ('the new map has no keyframes, which need all images: it localizes by objects '
-                    'alone; build a new map to have both') if layer_path(update).exists() else ''
+            made = make_map.update_map(update, detections, labeller, mapping, frames, layer)
+            note = made.note or note
+            if options.keyframe_layer is False:
+                made = replace(made, layer=None, keyframes=None)
         else:
-            frames = images and move_frames(images, scale, rotation)
             with command.StageBar() as bar:
-                made = make_map.make_map(detections, labeller, mapping, frames, layer, bar.show)
+                made = make_map.make_map(detections, labeller, mapping, frames, joined or layer,
+                                         bar.show)
             note = note or made.note
             if options.keyframe_layer and note:
                 raise MappingError(note)
@@ -136,8 +136,8 @@ def build(options: argparse.Namespace) -> int:
         _write_report(options.report, {'failure': str(error),
                                        'left_out': [asdict(landmark) for landmark in left_out]})
         raise
-    _write_report(options.report, asdict(made.report))
-    recording = sources.recording_of(options, file, scale, rotation)
+    _write_report(options.report, asdict(made.report) | ({} if made.keyframes is None else {
+        'keyframes': [fate._asdict() for fate in made.keyframes.fates]}))
     path, is_poor = _write(options, made, name, recording, [labeller.note, note], begin)
     try:
         if options.check:
@@ -163,6 +163,8 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
     from cliploc_ros.offline.mapping.make_map import write_made_map
 
     lines = made.report.lines()
+    if made.keyframes is not None:
+        lines.insert(1, made.keyframes.line())
     head = [f'built by build_map from {name}', *lines[:2]] if options.update is None else [
         f'{options.update.name}, updated by build_map from {name}', lines[0]]
     if made.mount is not None:
@@ -182,15 +184,17 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
     return path, is_poor
 
 
-def _refuse_conflicts(options: argparse.Namespace) -> None:
+def _refuse_conflicts(options: argparse.Namespace, is_several: bool) -> None:
     """Refuse conflicting options, before any work is done."""
-    is_update = options.update is not None
+    is_update, is_new = options.update is not None, options.add is options.update is None
     for is_wrong, text in (
-            (options.level and is_update, '--level is for new maps, not for --update'),
-            (options.object_size and (options.scale or options.known_distance or is_update),
-             '--object-size is not for --scale, --known-distance or --update'),
-            (options.refine_mount and is_update,
-             '--refine-mount is for new maps, not for --update'),
+            (is_update and is_several, '--update is for one recording: run it for each in turn'),
+            (is_several and options.keyframe_images, '--keyframe-images is for one recording'),
+            (options.level and not is_new, '--level is for new maps, not for --update or --add'),
+            (options.object_size and (options.scale or options.known_distance or not is_new),
+             '--object-size is not for --scale, --known-distance, --update or --add'),
+            (options.refine_mount and (is_update or is_several),
+             '--refine-mount is for new maps of one recording, not for --update'),
             (options.refine_mount and len(options.cameras) > 1, '--refine-mount is for one '
              'camera: correct each with a map of --cameras NAME alone'),
             (options.joint is False and options.pose_noise,
@@ -234,9 +238,8 @@ def _write_report(path: Path | None, report: dict[str, Any]) -> None:
         print(f'report: {path}', flush=True)
 
 
-def _placed(detections: 'PosedDetections', options: argparse.Namespace,
-            mapping: 'MappingOptions', of_tf: bool
-            ) -> 'tuple[PosedDetections, float, NDArray[np.float64]]':
+def _placed(detections: 'PosedDetections', options: argparse.Namespace, of_tf: bool,
+            mapping: 'MappingOptions') -> 'tuple[PosedDetections, float, NDArray[np.float64]]':
     """Level and scale detections; return them with the scale and the rotation (3, 3)."""
     import numpy as np
 

@@ -19,15 +19,18 @@ if TYPE_CHECKING:
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
+#: Options that name a folder, and the key of its layout; '' to detect it.
+FOLDERS = {'tum': 'tum', 'rgbd': 'rgbd', 'folder': '', 'colmap': 'colmap', 'nerf': 'nerf'}
 SIFT, XFEAT = FEATURES = 'sift', 'xfeat'
 
 
 def add_source_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of all sources to a parser."""
-    sources = parser.add_mutually_exclusive_group(required=True)
-    option(sources, '--bag', 'a rosbag2 recording with images and poses', Path)
-    add_folders(sources)
-    option(sources, '--observations NPZ', 'boxes and poses that were recorded before')
+    sources = parser.add_argument_group('recordings: one, or several of any kind')
+    option(sources, '--bag', 'a rosbag2 recording with images and poses', Path, action='append')
+    add_folders(sources, action='append')
+    option(sources, '--observations NPZ', 'boxes and poses that were recorded before',
+           action='append')
     add_reading_options(parser)
     group = parser.add_argument_group('odometry of --bag')
     odometry = group.add_mutually_exclusive_group()
@@ -45,15 +48,16 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--workers N', 'local processes (%(default)s)', positive_int, 1)
 
 
-def add_folders(group: Any) -> None:
+def add_folders(group: Any, **more: Any) -> None:
     """Add the options that name a folder of images to a group of a parser."""
-    option(group, '--tum DIR', 'a TUM RGB-D folder, without its depth')
-    option(group, '--rgbd DIR', 'a folder with depth: TUM RGB-D or 7-Scenes')
+    option(group, '--tum DIR', 'a TUM RGB-D folder, without its depth', **more)
+    option(group, '--rgbd DIR', 'a folder with depth: TUM RGB-D or 7-Scenes', **more)
     option(group, '--folder DIR', 'a folder of any known layout, with its depth: TUM RGB-D, '
            '7-Scenes, Polycam, Record3D, Stray Scanner, ARKitScenes, HoloLens 2, transforms.json, '
-           'COLMAP')
-    option(group, '--colmap DIR', 'a COLMAP model, or a project with sparse/0 and images/')
-    option(group, '--nerf DIR', 'a transforms.json of nerfstudio or Instant-NGP, or its folder')
+           'COLMAP', **more)
+    option(group, '--colmap DIR', 'a COLMAP model, or a project with sparse/0 and images/', **more)
+    option(group, '--nerf DIR', 'a transforms.json of nerfstudio or Instant-NGP, or its folder',
+           **more)
 
 
 def add_reading_options(parser: argparse.ArgumentParser) -> None:
@@ -133,8 +137,7 @@ def add_weights_options(group: Any) -> None:
 
 def folder_of(options: argparse.Namespace) -> tuple[Path, str] | None:
     """Return the folder that the command line names and the key of its layout; '' to detect it."""
-    named = {'tum': 'tum', 'rgbd': 'rgbd', 'folder': '', 'colmap': 'colmap', 'nerf': 'nerf'}
-    return next(((getattr(options, name), key) for name, key in named.items()
+    return next(((getattr(options, name), key) for name, key in FOLDERS.items()
                  if getattr(options, name) is not None), None)
 
 
@@ -163,6 +166,8 @@ def add_layer_options(parser: argparse.ArgumentParser) -> None:
     option(group, '--keyframe-features', 'kind of features of the keyframes, and later of the '
            'images to localize; xfeat is a network of 2.7 MB, which is downloaded once '
            '(%(default)s)', default=SIFT, choices=FEATURES)
+    option(group, '--keyframes-per-cell N', 'of several recordings, most keyframes in a cell of '
+           '1 m and 30 degrees: those that localize most others (%(default)s)', positive_int, 40)
     option(group, '--keyframe-images', 'also store small images of the keyframes, for the debug '
            'image: anyone who has the file can see the place')
 
@@ -177,10 +182,9 @@ def layer_options(options: argparse.Namespace) -> 'tuple[LayerOptions | None, st
     from cliploc_ros.models.xfeat import load_xfeat
     from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 
-    problem = next((
-        f'--{name}: keyframes need the images of the recording that the map is built from; give '
-        '--bag or a folder' for name in ('observations', 'update')
-        if getattr(options, name) is not None),
+    problem = (
+        '--observations: keyframes need the images of the recording; give --bag or a folder'
+        if options.observations is not None else
         '--every: choose frames with --keyframes METRES DEGREES' if options.every > 1 else
         '--refine-mount: build again with the corrected --mount' if options.refine_mount else '')
     if options.keyframe_layer and problem:
@@ -190,7 +194,8 @@ def layer_options(options: argparse.Namespace) -> 'tuple[LayerOptions | None, st
                                (options.keyframe_features == XFEAT, '--keyframe-features')):
             if is_given:
                 raise OptionsError(f'{name} is for --keyframe-layer')
-        return None, '' if options.keyframe_layer is False else f'no keyframes with {problem}'
+        return None, '' if options.keyframe_layer is False else (
+            f'{"keyframes are not compared" if options.update else "no keyframes"} with {problem}')
     distance_m, angle_deg = options.keyframes
     return LayerOptions(
         distance_m, angle_deg, options.keyframe_points, options.keyframe_images,

@@ -3,7 +3,7 @@
 """Read the recording that the command line names, see cli.options."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,23 +11,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.cli.options import check_folder_options, folder_of
+from cliploc_ros.cli.options import FOLDERS, check_folder_options, folder_of, read_layer
 from cliploc_ros.command import positive
 from cliploc_ros.core.geometry.depth import DepthCamera
 from cliploc_ros.core.geometry.transforms import make_transform
+from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import DatasetError, OptionsError
+from cliploc_ros.errors import DatasetError, MappingError, OptionsError
 from cliploc_ros.models import protocols
 from cliploc_ros.models.files import digest_file
 from cliploc_ros.offline.datasets import bag_frames, bag_poses, frames
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.images import Images, open_images
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
-from cliploc_ros.offline.datasets.observations import load_observations
+from cliploc_ros.offline.datasets.observations import load_observations, save_observations
+from cliploc_ros.offline.datasets.parsing import naming
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
-from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections, join_detections
+from cliploc_ros.offline.mapping.recordings import Placing, add_layer
 from cliploc_ros.offline.recording import recorder
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.units import NS_PER_S
 
 # Options that change how the frames of a recording are read.
@@ -36,6 +40,9 @@ _READING = ('pose_topic', 'map_frame', 'camera_frame', 'tf', 'trajectory', 'moun
             'depth_intrinsics', 'depth_baseline', 'intrinsics', 'cameras')
 # Options that define the poses of a folder.
 _PLACING = ('axes', 'scale', 'known_distance', 'level')
+
+# Recordings of one map count as this far apart in time, or more [s].
+_APART_S = 3600.0
 
 
 def detector_options(options: argparse.Namespace, **more: Any) -> protocols.DetectorOptions:
@@ -164,6 +171,68 @@ def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str
         return images
     return {name: frames.move_frames(own, built_from.scale, np.array(built_from.rotation))
             for name, own in images.items()}
+
+
+def each_recording(options: argparse.Namespace) -> list[argparse.Namespace]:
+    """Return the options of each recording that the command line names: bags, then folders.
+
+    Options that level or scale poses count for the first one. OptionsError: there is none.
+    """
+    kinds = ('bag', *FOLDERS, 'observations')
+    found = [argparse.Namespace(**vars(options) | dict.fromkeys(kinds) | {name: path})
+             for name in kinds for path in getattr(options, name) or ()]
+    for own in found[options.add is None:]:  # placed in a map, so that any unit will do
+        vars(own).update(level=False, known_distance=None, record_to=None, object_size=())
+    if not found:
+        raise OptionsError('give a recording: --bag, --folder, --observations or another')
+    return found
+
+
+def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.Namespace],
+                    place: Callable[..., Any], wanted: LayerOptions | None) -> tuple[
+                        PosedDetections, MapRecording, frames.Frames | None, KeyframeLayer | None]:
+    """Read the recordings of a map; with --add, after those of that map.
+
+    `place` levels and scales the first one. Return detections, what the map names as its
+    recording, and either the images of a single recording, or the keyframes of several, see
+    add_layer.
+    """
+    if options.add is not None:
+        if (recording := load_recording(options.add)) is None:
+            raise OptionsError(f'--add {options.add}: its recording is missing: give all again')
+        detections, layer = recording.load(), read_layer(
+            options.add, LandmarkMap.from_file(options.add), None)
+    else:
+        first, *recordings = recordings
+        detections, file, images = read_source(first)
+        if without := detections.without_pose:
+            print(f'no pose: {without} of {detections.images} images', flush=True)
+        detections, scale, rotation = place(detections, first, bool(images and images.of_tf))
+        recording, layer = recording_of(first, file, scale, rotation), None
+        images = images and frames.move_frames(images, scale, rotation)
+        if not recordings:
+            return detections, recording, images, None
+        if images is not None and wanted is not None:
+            layer = build_layer(images, LandmarkMap.empty(options.frame_id), wanted)
+    parts = [detections]
+    for own in recordings:
+        (seen, _, images), placing = read_source(own), Placing()
+        with naming(source_of(own), MappingError):
+            if layer is not None and images is not None and wanted is not None:
+                layer, placing, note = add_layer(
+                    layer, build_layer(images, LandmarkMap.empty(layer.frame_id), wanted),
+                    not images.is_metric, options.same_frame, options.keyframes_per_cell)
+                print(f'{source_of(own)}: {note}', flush=True)
+            elif not options.same_frame:
+                raise MappingError('lacks keyframes that place it in the map: give `same_frame`')
+        end_s = max(part.stamps_s[-1] for part in parts)
+        stamps_s = seen.stamps_s + max(0.0, end_s + _APART_S - seen.stamps_s[0])
+        parts.append(replace(seen.moved(*placing), stamps_s=stamps_s, stamps_ns=None))
+    joined = join_detections(parts)
+    file = options.out.with_suffix(f'.{len(joined)}.npz')
+    # its poses are those of the first recording
+    save_observations(file, joined.moved(1.0 / recording.scale, np.array(recording.rotation).T))
+    return joined, replace(recording, observations=file), None, layer
 
 
 def source_of(options: argparse.Namespace) -> Path:

@@ -194,6 +194,11 @@ def test_a_map_of_keyframes_alone(shared_data, tmp_path, capsys):
         assert pose_error(found.map_from_camera, frame.map_from_camera)[0] < 0.05
     assert check_map.main([str(out), '--frames', '4', *map(str, FAST)]) == 1
     assert 'verdict: keyframes only: ' in capsys.readouterr().out
+    report = tmp_path / 'today.json'
+    assert build_map.main([*given, '--update', str(out), '--report', str(report)]) == 0
+    assert {fate['fate'] for fate in json.loads(report.read_text())['keyframes']} == {'confirmed'}
+    assert f'keyframes: {len(layer)} confirmed, 0 retired, 0 added' in capsys.readouterr().out
+    assert len(load_layer_of_map(layer_path(out), LandmarkMap.from_file(out))) == len(layer)
     assert build_map.main([*given, '--no-keyframe-layer']) == 1
 
 

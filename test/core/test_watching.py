@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform
-from cliploc_ros.core.map.visibility import Expected, Missing, expect
+from cliploc_ros.core.map.presence import Missing
+from cliploc_ros.core.map.visibility import Expected, expect
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.watch.camera import ImageFaults

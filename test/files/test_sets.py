@@ -18,7 +18,7 @@ from whole_sets import ROOM, made_map, write_set
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
 from cliploc_ros.core.map.landmark_embeddings import embeddings_path, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.map.map_file import set_digest, write_map
+from cliploc_ros.core.map.map_file import removed_path, set_digest, write_map
 from cliploc_ros.errors import DatasetError, MapError
 from cliploc_ros.files.storage import replace_file
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording, recording_path
@@ -34,7 +34,8 @@ def read(path):
     embeddings = load_embeddings_of_map(path, landmark_map.landmark_ids, landmark_map.map_set)
     number = round(float((landmark_map.centers - ROOM.centers)[0, 0]) / 0.01)
     return number, {number % 8 == int(np.argmax(embeddings.means[0])),
-                    number == load_layer_of_map(layer_path(path), landmark_map).points[0, 0],
+                    *(number == load_layer_of_map(layer_path(place), landmark_map).points[0, 0]
+                      for place in (path, removed_path(path))),
                     number == load_recording(path).scale - 1.0}
 
 
@@ -110,14 +111,19 @@ def test_the_studio_finishes_what_a_killed_writer_left(path):
     assert others.exists() and document.file.encoder_key == 'key'
 
 
-def test_an_update_keeps_the_keyframes_and_no_embeddings(path):
-    before = LandmarkMap.from_file(path)
-    updated = replace(made_map(1), layer=None, embeddings=None)
-    assert write_made_map(path, updated, [], MapRecording(path.with_name('seen.npz')), path) == []
+def test_an_update_writes_a_new_set_unless_another_update_was_faster(path):
+    recording, before = MapRecording(path.with_name('seen.npz')), LandmarkMap.from_file(path)
+    first, second = (replace(made_map(number), embeddings=None, updated=before.map_set)
+                     for number in (1, 2))
+    write_made_map(path, first, [], recording, path)
     after = LandmarkMap.from_file(path)
-    assert after.map_set.family == before.map_set.family != after.map_set.digest
-    assert load_layer_of_map(layer_path(path), after).points[0, 0] == 0
+    assert after.map_set.family == after.map_set.digest != before.map_set.digest
+    assert load_layer_of_map(layer_path(path), after).points[0, 0] == 1
     assert not embeddings_path(path).exists()
+    with pytest.raises(MapError, match='another program changed it'):
+        write_made_map(path, second, [], recording, path)
+    assert LandmarkMap.from_file(path).map_set == after.map_set
+    write_made_map(path.with_name('b.yaml'), second, [], recording, path)
 
 
 def test_a_map_by_hand_takes_any_files(path):

@@ -17,7 +17,7 @@ from scene import ROOM
 
 from cliploc_ros.cli.build_map import make_parser
 from cliploc_ros.cli.options import layer_options, read_layer
-from cliploc_ros.cli.sources import read_cameras
+from cliploc_ros.cli.sources import each_recording, read_cameras
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.core.keyframes.features import SIFT
 from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, save_layer
@@ -183,6 +183,6 @@ def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch)
     options = make_parser().parse_args([
         '--tum', str(ASSETS / 'mapping'), '--keyframe-features', 'xfeat', '--keyframe-layer',
         '--out', str(tmp_path / 'map.yaml')])
-    save_layer(layer_path(options.out), build_layer(read_cameras(options)[''], landmark_map,
-                                                    layer_options(options)[0]))
+    save_layer(layer_path(options.out), build_layer(
+        read_cameras(each_recording(options)[0])[''], landmark_map, layer_options(options)[0]))
     assert read_layer(options.out, landmark_map, wanted=True).kind.dimensions == 64

@@ -149,6 +149,8 @@ class Evidence:
     @property
     def genuine(self) -> float:
         """Return the probability that the place is real, not a picture, and unchanged."""
+        if self.recognized and self.recognized.parted >= CALIBRATION.genuine.least_parted:
+            return 0.5
         return 1.0 if self.signs is None else chance_genuine(self.signs, self.motion)
 
     @property

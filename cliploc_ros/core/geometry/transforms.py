@@ -54,12 +54,13 @@ def quaternion_from_transform(a_from_b: NDArray[np.float64]) -> NDArray[np.float
     return quat_xyzw if quat_xyzw[3] >= 0.0 else -quat_xyzw
 
 
-def move_poses(poses: NDArray[np.float64], scale: float, rotation: NDArray[np.float64]
-               ) -> NDArray[np.float64]:
-    """Scale the positions of poses (n, 4, 4), then rotate the poses by a rotation (3, 3)."""
+def move_poses(poses: NDArray[np.float64], scale: float, rotation: NDArray[np.float64],
+               shift: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
+    """Scale the positions of poses (n, 4, 4), rotate the poses (3, 3), then shift them (3,)."""
     moved = poses.copy()
     moved[:, :3, 3] *= scale
     moved[:, :3] = rotation @ moved[:, :3]
+    moved[:, :3, 3] += shift
     return moved
 
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, TAKEN, invert_transform
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
@@ -29,9 +29,9 @@ from cliploc_ros.errors import MapError
 # Number of keyframes to match: the most similar, the most similar at other places (so that places
 # that look alike are found), and keyframes near each pose that objects propose.
 _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
-# With fewer agreeing points, more keyframes are matched: this many near the pose, and as many of
+#: With fewer agreeing points, more keyframes are matched: this many near the pose, and as many of
 # the next similar keyframes.
-_ENOUGH_INLIERS, _MORE = 100, 5
+ENOUGH_INLIERS, _MORE = 100, 5
 # An image's words may resemble those of the wrong keyframes. If none of the above shows the place,
 # the strongest 600 features are matched with the next 25 keyframes. A chance pose has up to 8
 # inliers among these matches, so 20 are required.
@@ -155,6 +155,8 @@ class _Place(NamedTuple):
     inliers: _Matched
     agreed: int
     cells: NDArray[np.int64]
+    #: Number of other features that agree on a pose nearby, see RecognizedPlace.parted
+    parted: int = 0
 
 
 class KeyframeLocalizer:
@@ -231,7 +233,7 @@ class KeyframeLocalizer:
                        if keyframe not in chosen]
         matched = self._match(descriptors, chosen, deadline)
         first = _place(matched, look)
-        if first is None or first.agreed < _ENOUGH_INLIERS:
+        if first is None or first.agreed < ENOUGH_INLIERS:
             # also match keyframes near the pose, and the next similar keyframes
             near = keyframes_near(poses, first.map_from_camera)[:_MORE].tolist() if first else []
             more = [rank for rank in dict.fromkeys([*near, *ranks[:_SIMILAR + _MORE]])
@@ -348,7 +350,8 @@ class KeyframeLocalizer:
             aspect, of_aspect, look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
             tuple(shares.tolist()), look.features.pixels[place.inliers.features],
             place.inliers.rows, place.inliers.points, is_thorough,
-            float(_distances(self.layer.map_from_camera[used], pose).min()))
+            float(_distances(self.layer.map_from_camera[used], pose).min()),
+            place.parted / (place.agreed + place.parted))
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:
@@ -396,8 +399,12 @@ def _places(first: _Place | None, matched: _Matched, look: _Look
     while place is not None and (not places or place.agreed >= LEAST_INLIERS):
         if look.constraint.allows(place.map_from_camera):
             found += 1
-            if not any(SAME_ANSWER.agree(place.map_from_camera, other.map_from_camera)
-                       for other in places):
+            pose = place.map_from_camera
+            places = [other._replace(parted=max(place.agreed, other.parted))
+                      if SAME_SIGHT.agree(pose, other.map_from_camera)
+                      and not TAKEN.agree(pose, other.map_from_camera) else other
+                      for other in places]
+            if not any(SAME_ANSWER.agree(pose, other.map_from_camera) for other in places):
                 places.append(place)
         elif outside_m is None and place.agreed >= LEAST_INLIERS:
             outside_m = look.constraint.outside_m(place.map_from_camera)
@@ -430,11 +437,12 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
     return max(places, key=lambda place: place.agreed, default=None)
 
 
-def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.int64]:
+def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64], most: float = 1.0
+                   ) -> NDArray[np.int64]:
     """Return the keyframes whose views overlap the view of a pose, the closest first."""
     costs = _distances(poses, guess)
     order = np.argsort(costs, kind='stable')
-    return np.asarray(order[costs[order] < 1.0])
+    return np.asarray(order[costs[order] < most])
 
 
 def _distances(poses: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,5 +14,7 @@ map_file, parameter_file
 similarities, pairs, culling
     Find landmarks by similarity of their labels, by pairs, and by position.
 visibility
-    Find the landmarks that an image should show, and landmarks that are gone.
+    Find the landmarks that an image should show.
+presence
+    Whether objects are still in their places: for the watch and for updates.
 """

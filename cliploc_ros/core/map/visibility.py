@@ -1,25 +1,17 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Find the landmarks that an image should show at a pose, and landmarks that are gone.
+"""Find the landmarks that an image should show at a pose.
 
 An image should show the landmarks that are near, large, entirely in view and not occluded. Maps
 contain no walls, so a wall may hide an expected landmark. If the image shows a landmark beside it,
 it is not hidden. cliploc_ros.offline.mapping.evidence and simulated detectors use these criteria
 with other limits, for whole recordings and for single detections.
-
-A detector finds some landmarks in each image and others rarely. The share of looks that find a
-landmark has a beta distribution, updated by each look. If the landmark is present, the probability
-of k consecutive misses is B(a, b + k) / B(a, b).
 """
 
-from collections import deque
-from collections.abc import Iterable
-from math import log
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaln, expit
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import (
@@ -31,7 +23,6 @@ from cliploc_ros.core.geometry.ellipsoid import (
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 
-Values = float | NDArray[Any]
 #: A detector finds a landmark only if the image shows this share of its box.
 SHOWN_SHARE = 0.6
 #: A landmark is out of view if nearer landmarks hide more than this share of it. Chosen.
@@ -44,21 +35,6 @@ _REACH_M, _LEAST_SIDE_PX, _SURE_SHARE = 6.0, 20.0, 0.75
 _BESIDE_COSINE, _BESIDE_SHARE = np.cos(np.radians(20.0)), 0.8
 #: Number of sides of a landmark, sectors of equal angle about the vertical.
 SIDES = 8
-# Prior of the share of looks that find a present landmark: mean over all landmarks, weight of this
-# mean in looks, and weight of the overall share (or of the map's seen_ratio) in looks where a
-# single landmark is judged. Chosen.
-_FOUND, _OF_FOUND, _OF_SHARE = 0.75, 10.0, 3.0
-# Limits of this share.
-_SHARES = (0.1, 0.95)
-# Prior probability that a landmark is gone, and share of looks in which a detection matches a
-# landmark that is gone by chance. Chosen.
-_GONE, _BY_CHANCE = 0.05, 0.05
-# A landmark is reported at this probability. The number of counted sightings is limited, so that a
-# landmark that is removed after a day is soon reported.
-_NAMED, _MOST_SEEN = 0.8, 15.0
-# The map is out of date at a place if, of the landmarks that this number of last looks expected,
-# this number and this share are gone, counted by their probabilities.
-_HERE, _LEAST_GONE, _LEAST_SHARE = 10, 2.0, 0.25
 
 
 def is_in_image(box: NDArray[np.float64], bounds: NDArray[np.float64], least_share: float
@@ -155,100 +131,3 @@ def expect(landmark_map: LandmarkMap, camera: Camera, map_from_camera: NDArray[n
     x, y, _ = (landmark_map.centers[near[rows]] - map_from_camera[:3, 3]).T
     sides = np.floor(SIDES * (np.arctan2(y, x) / (2.0 * np.pi) + 0.5)).astype(np.int64) % SIDES
     return Expected(near[rows], was_seen[rows], in_sight[rows], sides)
-
-
-def log_evidence(found: Values, missed: Values, seen: Values, misses: Values) -> Values:
-    """Return the logarithm of the beta-binomial probability of looks at an object in its place.
-
-    `found` and `missed` are the parameters of the prior of the share of looks that find it, `seen`
-    and `misses` the numbers of looks. The binomial coefficient is omitted.
-    """
-    return betaln(found + seen, missed + misses) - betaln(found, missed)
-
-
-def log_odds_there(stays: float, there: Values, away: Values) -> Values:
-    """Return the log odds that an object is in its place: the watch and map updates ask this.
-
-    `stays` is its prior probability; `there` and `away` are the log evidence of the looks if the
-    object is in its place, and if it is gone.
-    """
-    return log(stays / (1.0 - stays)) + there - away
-
-
-class _Record(NamedTuple):
-    """Weighted numbers of looks that found and that missed a landmark."""
-
-    found: float = 0.0
-    missed: float = 0.0  #: Misses before the last sighting
-    misses: float = 0.0  #: Misses since the last sighting
-    seen_from: int = 0  #: Sides from which it was seen, as bits
-
-    def gone(self, share: float) -> float:
-        """Return the probability that it is gone, given the prior share of looks that find it.
-
-        Misses are counted up to the number with the strongest evidence. Further misses would be
-        evidence that it is present but rarely found, because a landmark that is gone is sometimes
-        matched by chance. A removed landmark would then no longer be reported after some hundred
-        looks.
-        """
-        found = _OF_SHARE * share + self.found
-        missed = _OF_SHARE * (1.0 - share) + self.missed
-        misses = min(self.misses, max(0.0, found / _BY_CHANCE - found - missed))
-        there = log_evidence(found, missed, 0.0, misses)
-        return float(expit(-log_odds_there(1.0 - _GONE, there, misses * log(1.0 - _BY_CHANCE))))
-
-
-class Missing:
-    """Finds landmarks that are gone, from the looks that should have shown them."""
-
-    def __init__(self, landmark_map: LandmarkMap) -> None:
-        self._details = landmark_map.details
-        self._records: dict[int, _Record] = {}
-        self._expected: deque[list[int]] = deque(maxlen=_HERE)
-
-    def add(self, expected: Expected, weight: float) -> None:
-        """Count a look at a right pose; its weight is 1 if it is independent of earlier looks."""
-        for landmark, was_seen, in_sight, side in zip(*(column.tolist() for column in expected),
-                                                      strict=True):
-            record = self._records.get(landmark, _Record())
-            if was_seen:
-                keep = min(1.0, _MOST_SEEN / (record.found + weight))
-                self._records[landmark] = _Record(
-                    keep * (record.found + weight), keep * (record.missed + record.misses),
-                    seen_from=record.seen_from | 1 << side)
-            # count misses only from sides where it was seen: a detector may not recognize a
-            # television from behind. A landmark that was never seen is missed from all sides.
-            elif in_sight and (not record.seen_from or any(
-                    record.seen_from >> (side + step) % SIDES & 1 for step in (-1, 0, 1))):
-                self._records[landmark] = record._replace(misses=record.misses + weight)
-        if len(expected.landmarks):
-            self._expected.append(expected.landmarks.tolist())
-
-    def named(self) -> list[int]:
-        """Return the missing landmarks in decreasing order of probability."""
-        gone = self._gone(self._records)
-        return sorted((landmark for landmark in gone if gone[landmark] >= _NAMED),
-                      key=lambda landmark: -gone[landmark])
-
-    @property
-    def is_outdated(self) -> bool:
-        """Check whether the map is out of date at the place of the last looks."""
-        here = {landmark for look in self._expected for landmark in look}
-        gone = sum(self._gone(here).values())
-        return bool(gone >= _LEAST_GONE and gone >= _LEAST_SHARE * len(here))
-
-    def _gone(self, landmarks: Iterable[int]) -> dict[int, float]:
-        """Return the probability that each landmark is gone."""
-        # overall share of the landmarks that were seen; the first sighting is not counted, because
-        # it selects them
-        seen = [record for record in self._records.values() if record.found > 0.0]
-        found = sum(max(0.0, record.found - 1.0) for record in seen)
-        missed = sum(record.missed for record in seen)
-        overall = (_OF_FOUND * _FOUND + found) / (_OF_FOUND + found + missed)
-        result = {}
-        for landmark in landmarks:
-            ratio = self._details[landmark].seen_ratio if self._details else None
-            share = overall if ratio is None else min(overall, ratio)
-            result[landmark] = self._records.get(landmark, _Record()).gone(
-                min(max(share, _SHARES[0]), _SHARES[1]))
-        return result

@@ -11,5 +11,6 @@ watch
     The entry point: the probability that the pose is right, filtered over correlated looks, and
     the state with its reason.
 
-core.map.visibility finds the landmarks that an image should show, and landmarks that are gone.
+core.map.visibility finds the landmarks that an image should show, core.map.presence those that are
+gone.
 """

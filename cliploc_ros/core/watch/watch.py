@@ -21,7 +21,7 @@ from cliploc_ros.core.acceptance.verdict import too_tilted
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, is_rigid, pose_error
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
-from cliploc_ros.core.map.visibility import Missing
+from cliploc_ros.core.map.presence import Missing
 from cliploc_ros.core.observation import Observation, tilt_deg
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.core.search.frame_search import vertical_of

@@ -179,7 +179,8 @@ def _placed(folder: Path, layout: Layout, capture: frames.Capture, options: fram
         [(file.color.name, file.stamp_ns, file.camera, _end_of(file.color)) for file, _ in posed],
         [(np.round(pose, 6).tolist(), file.depth and _end_of(file.depth))
          for file, pose in posed]))
-    return replace(found, digest=digest, notes=(*filter(None, notes), *found.notes))
+    return replace(found, digest=digest, notes=(*filter(None, notes), *found.notes),
+                   is_metric=capture.is_metric or scale is not None)
 
 
 def _end_of(file: Path) -> tuple[int, bytes]:

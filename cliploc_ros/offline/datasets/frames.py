@@ -93,6 +93,7 @@ class Frames:
     #: The frames of each camera; empty if there is only one
     of_cameras: tuple['Frames', ...] = ()
     of_tf: bool = False  #: Whether tf has the poses, or the mount of the camera
+    is_metric: bool = True  #: Whether the unit of the poses is known
     varies: bool = False  #: Whether the camera differs between images
     #: Digests of images with cameras, and of poses, which may change without the images
     digest: str = ''

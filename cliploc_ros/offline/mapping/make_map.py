@@ -3,6 +3,7 @@
 """Mapping as a library: make a map with labels, embeddings and keyframes from a recording."""
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,23 +11,33 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, removed_layer, save_layer
+from cliploc_ros.core.keyframes.layer import (
+    KeyframeLayer,
+    layer_path,
+    load_layer_of_map,
+    removed_layer,
+    save_layer,
+)
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import load_removed, removed_path, write_landmarks, write_map
-from cliploc_ros.errors import MappingError, ModelError, counted
+from cliploc_ros.core.map.parameter_file import MapSet
+from cliploc_ros.errors import MapError, MappingError, ModelError, counted
 from cliploc_ros.files.storage import WriteOfSet
 from cliploc_ros.models.onnx_clip import ClipWeights, names_onnx, resolve_clip_weights
 from cliploc_ros.models.protocols import ClipOptions
+from cliploc_ros.models.xfeat import feature_kinds
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.map_recording import MapRecording, recording_path, save_recording
 from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map
 from cliploc_ros.offline.mapping.labelling import embed_landmarks, embed_phrases, label_landmarks
-from cliploc_ros.offline.mapping.landmarks import classes_of
+from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.offline.mapping.recordings import join_layers
 from cliploc_ros.offline.mapping.systematic import MountCorrection
-from cliploc_ros.offline.mapping.update.updating import UpdateReport
+from cliploc_ros.offline.mapping.update.keyframes import UpdatedLayer, check_belongs, update_layer
+from cliploc_ros.offline.mapping.update.updating import UpdatedMap, UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.offline.vocabulary.vocabulary import load_vocabulary, shipped_phrases
@@ -47,6 +58,8 @@ class MadeMap:
     mount: MountCorrection | None = None  #: Correction of the mount, if requested
     note: str = ''  #: The reason why the requested layer is missing
     removed: LandmarkMap | None = None  #: Landmarks that updates removed from the map
+    keyframes: UpdatedLayer | None = None  #: What an update made of the keyframes
+    updated: MapSet | None = None  #: The map that was updated
 
 
 @dataclass(frozen=True)
@@ -140,7 +153,8 @@ def _has_embeddings(detections: PosedDetections) -> bool:
 
 def make_map(detections: PosedDetections, labeller: Labeller,
              options: MappingOptions | None = None, frames: Frames | None = None,
-             layer: LayerOptions | None = None, progress: Progress | None = None) -> MadeMap:
+             layer: LayerOptions | KeyframeLayer | None = None, progress: Progress | None = None
+             ) -> MadeMap:
     """Make a map from a recording.
 
     If no landmark is found, keyframes alone make a map. If the images give no keyframes,
@@ -155,8 +169,8 @@ def make_map(detections: PosedDetections, labeller: Labeller,
         See find_labeller.
     frames : Frames, optional
         The images, for the layer of keyframes.
-    layer : LayerOptions, optional
-        None: without keyframes.
+    layer : LayerOptions or KeyframeLayer, optional
+        Options, or keyframes that were built before. None: without keyframes.
     progress : callable, optional
         Called with the name of a stage and its progress, 0 to 1.
 
@@ -175,14 +189,23 @@ def make_map(detections: PosedDetections, labeller: Labeller,
         made = MadeMap(LandmarkMap.empty(options.frame_id), MappingReport(
             len(detections), 0, len(detections.classes), 0, 0.0, 0.0, 0.0, 0.0, 0.0,
             getattr(error, 'left_out', ()), (str(error),)))
-    try:
-        if frames is not None and layer is not None:
-            return replace(made, layer=build_layer(frames, made.landmark_map, layer))
-    except MappingError as error:
-        made = replace(made, note=f'no keyframes: {error}')
-    if failure is not None:
+    made = _with_layer(made, frames, layer)
+    if failure is not None and made.layer is None:
         raise failure
     return made
+
+
+def _with_layer(made: MadeMap, frames: Frames | None, layer: LayerOptions | KeyframeLayer | None
+                ) -> MadeMap:
+    """Return a map with a layer, or with a note why the frames give none."""
+    try:
+        if isinstance(layer, LayerOptions):
+            layer = None if frames is None else build_layer(frames, made.landmark_map, layer)
+    except MappingError as error:
+        return replace(made, note=f'no keyframes: {error}')
+    return made if layer is None else replace(made, layer=replace(
+        layer, frame_id=made.landmark_map.frame_id, landmark_ids=made.landmark_map.landmark_ids,
+        landmark_centers=made.landmark_map.centers.astype(np.float32)))
 
 
 def scale_of_objects(detections: PosedDetections, options: MappingOptions, class_name: str,
@@ -216,11 +239,13 @@ def scale_of_objects(detections: PosedDetections, options: MappingOptions, class
 
 
 def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
-               options: MappingOptions) -> MadeMap:
+               options: MappingOptions, frames: Frames | None = None,
+               layer: LayerOptions | None = None) -> MadeMap:
     """Update the map in a file with a recording; the file is not written.
 
     Poses are refined against the map by the errors in ``pose_errors``; without these, if the boxes
-    show that the poses are inaccurate.
+    show that the poses are inaccurate. Keyframes are compared with those of the images; without
+    images, they only lose the points on objects that are gone.
 
     Raises
     ------
@@ -228,46 +253,72 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
         The map is invalid, the recording does not belong to it, or the text tower cannot be
         loaded.
     """
-    old = LandmarkMap.from_file(path)
-    old_embeddings = load_embeddings_of_map(path, old.landmark_ids, old.map_set)
-    updated = update_landmarks(old, detections, options, old_embeddings,
-                               load_removed(path, old.map_set.family))
-    landmark_map, first = updated.landmark_map, updated.first_new
-    if first == len(landmark_map):
-        return MadeMap(landmark_map, updated.report, updated.embeddings, removed=updated.removed)
-    # only new landmarks are labelled; the others keep their labels
-    new, _ = labeller.describe(landmark_map.select(range(first, len(landmark_map))), detections,
-                               np.where(updated.shown >= first, updated.shown - first, -1))
-    texts = dict(zip(new.landmark_ids, new.labels, strict=True))
-    return MadeMap(
-        replace(landmark_map, labels=landmark_map.labels[:first] + new.labels,
-                details=landmark_map.details[:first] + new.details),
-        replace(updated.report, new=tuple(
-            replace(landmark, label=texts[landmark.landmark_id])
-            for landmark in updated.report.new)),
-        updated.embeddings, removed=updated.removed)
+    old, place, kinds = LandmarkMap.from_file(path), layer_path(path), feature_kinds()
+    old_layer = load_layer_of_map(place, old, kinds) if place.exists() else None
+    if layer is not None and old_layer is not None:
+        layer = replace(layer, kind=old_layer.kind)
+    if len(old):
+        found = update_landmarks(old, detections, options, load_embeddings_of_map(
+            path, old.landmark_ids, old.map_set), load_removed(path, old.map_set.family))
+        gone = found.gone
+        made = _with_layer(_label_new(found, detections, labeller), frames, layer)
+        if made.layer is not None:
+            made = replace(made, layer=replace(made.layer, map_from_camera=(
+                found.map_from_given @ made.layer.map_from_camera)))
+    else:
+        made, gone = make_map(detections, labeller, options, frames, layer), Landmarks.none()
+    made = replace(made, updated=old.map_set)
+    if old_layer is None:
+        return made
+    keyframes = update_layer(old_layer, made.layer, gone)
+    if not len(old):
+        check_belongs(keyframes)
+    removed = [] if keyframes.removed is None else [keyframes.removed]
+    with suppress(MapError):  # there is none, or it is of another map
+        removed.append(load_layer_of_map(layer_path(removed_path(path)), old, kinds))
+    return replace(_with_layer(made, None, keyframes.layer), keyframes=keyframes._replace(
+        removed=join_layers(removed) if removed else None))
+
+
+def _label_new(updated: UpdatedMap, detections: PosedDetections, labeller: Labeller) -> MadeMap:
+    """Label the new landmarks of an updated map; the others keep their labels."""
+    landmark_map, first, report = updated.landmark_map, updated.first_new, updated.report
+    if first < len(landmark_map):
+        new, _ = labeller.describe(
+            landmark_map.select(range(first, len(landmark_map))), detections,
+            np.where(updated.shown >= first, updated.shown - first, -1))
+        texts = dict(zip(new.landmark_ids, new.labels, strict=True))
+        landmark_map = replace(landmark_map, labels=landmark_map.labels[:first] + new.labels,
+                               details=landmark_map.details[:first] + new.details)
+        report = replace(report, new=tuple(replace(landmark, label=texts[landmark.landmark_id])
+                                           for landmark in report.new))
+    return MadeMap(landmark_map, report, updated.embeddings, removed=updated.removed)
 
 
 def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording: MapRecording,
                    updated: Path | None = None) -> list[str]:
     """Write a map and the files next to it as one set; return lines about its keyframes.
 
-    If a map is updated in place, its keyframes stay. The keyframes of any other map that is
-    replaced are removed.
+    The keyframes of a map that is replaced are removed if the new one has none.
 
-    CliplocError: a file cannot be written; nothing was changed.
+    CliplocError: a file cannot be written, or another program changed the map while it was
+    updated; nothing was changed.
     """
     layer, landmark_map, lines = made.layer, made.landmark_map, []
+    if made.updated is not None and updated is not None and path.resolve() == updated.resolve() \
+            and LandmarkMap.from_file(path).map_set != made.updated:
+        raise MapError(f'{path}: another program changed it during this update; update again')
     besides: dict[Path, WriteOfSet | None] = {
         recording_path(path): partial(save_recording, path, recording)}
     if layer is not None:
         besides[layer_path(path)] = lambda place, digest: save_layer(
             place, replace(layer, set_digest=digest))
-    elif updated is not None and path.resolve() == updated.resolve():
-        landmark_map = replace(landmark_map, map_set=LandmarkMap.from_file(updated).map_set)
     else:
         lines += [removed_layer(path)] * layer_path(path).exists()
         besides[layer_path(path)] = None
+    went = made.keyframes and made.keyframes.removed
+    besides[layer_path(removed_path(path))] = None if went is None else (
+        lambda place, digest: save_layer(place, replace(went, set_digest=digest)))
     besides[removed_path(path)] = partial(write_landmarks, landmark_map=replace(
         made.removed, map_set=landmark_map.map_set)) if made.removed else None
     write_map(path, landmark_map, comments, made.embeddings, besides)

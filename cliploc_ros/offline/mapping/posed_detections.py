@@ -5,6 +5,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.core.observation import Detections
+from cliploc_ros.errors import DatasetError
 
 # Intrinsics that differ by a smaller share belong to one camera that refocuses.
 _SAME_CAMERA = 0.02
@@ -123,9 +125,44 @@ class PosedDetections:
         """Return the same detections with other poses (F, 4, 4)."""
         return replace(self, map_from_camera=map_from_camera)
 
-    def moved(self, scale: float, rotation: NDArray[np.float64]) -> 'PosedDetections':
-        """Return the same detections with scaled and rotated poses, see move_poses."""
-        return self.with_poses(move_poses(self.map_from_camera, scale, rotation))
+    def moved(self, scale: float, rotation: NDArray[np.float64],
+              shift: NDArray[np.float64] | float = 0.0) -> 'PosedDetections':
+        """Return the same detections with moved poses, see move_poses."""
+        return self.with_poses(move_poses(self.map_from_camera, scale, rotation, shift))
+
+
+def join_detections(parts: Sequence[PosedDetections]) -> PosedDetections:
+    """Join the detections of several recordings with poses in one coordinate frame.
+
+    Classes are matched by name, and cameras by name and intrinsics. Numbers that a recording lacks
+    are NaN. DatasetError: the embeddings are of several encoders.
+    """
+    if len({part.encoder_key for part in parts}) > 1:
+        raise DatasetError('recordings with embeddings of different encoders, or without: record '
+                           'all with one CLIP, or with `no_clip`')
+    classes = sorted({name for part in parts for name in part.class_names})
+    own = [[*zip(part.camera_names, part.cameras, strict=True)] for part in parts]
+    known = [*dict.fromkeys(chain(*own))]
+    names, cameras = zip(*known, strict=True)
+    parts = [replace(
+        part, classes=np.array([*map(classes.index, part.class_names), 0])[part.classes],
+        camera_rows=np.array([*map(known.index, pairs)])[part.frame_cameras])
+        for part, pairs in zip(parts, own, strict=True)]
+
+    def joined(name: str) -> Any:
+        found = [getattr(part, name) for part in parts]
+        example = next((array for array in found if array is not None), np.empty(0, np.bool_))
+        if example.dtype.kind != 'f' and any(array is None for array in found):
+            return None
+        return np.concatenate([np.full((len(part.classes if name in _PER_BOX else part),
+                                        *example.shape[1:]), np.nan) if array is None else array
+                               for part, array in zip(parts, found, strict=True)])
+    together = replace(
+        parts[0], cameras=cameras, class_names=tuple(classes), camera_names=tuple(
+            f'{name}#{row}' if name in names[:row] else name for row, name in enumerate(names)),
+        frame_offsets=np.cumsum([0, *chain(*(np.diff(part.frame_offsets) for part in parts))]),
+        **{name: joined(name) for name in (*_PER_BOX, *_PER_FRAME)})
+    return together.select_frames(np.argsort(together.stamps_s, kind='stable'))
 
 
 def group_cameras(cameras: Sequence[Camera]

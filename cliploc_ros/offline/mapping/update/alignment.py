@@ -16,7 +16,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.ellipsoid import normalized_lengths
-from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.mapping import joint
 from cliploc_ros.offline.mapping.association import ASSOCIATION_IOU, associate
@@ -65,10 +64,9 @@ class OldMap(NamedTuple):
 
 def known_landmarks(old: LandmarkMap, class_names: tuple[str, ...]) -> OldMap:
     """Return the landmarks of a map, with the classes of a recording."""
-    details = old.details or (LandmarkDetails(),) * len(old)
     sigmas = np.array([_UNKNOWN_SIGMA_M if detail.position_sigma is None
-                       else detail.position_sigma for detail in details])
-    return OldMap(replace(old, details=details), landmarks_of_map(old, class_names),
+                       else detail.position_sigma for detail in old.every_detail])
+    return OldMap(replace(old, details=old.every_detail), landmarks_of_map(old, class_names),
                   np.maximum(sigmas, _LEAST_SIGMA_M))
 
 
@@ -115,6 +113,7 @@ class Aligned(NamedTuple):
     """The recording in the coordinate frame of the map."""
 
     views: Views
+    map_from_given: NDArray[np.float64]  #: (4, 4): the offset that was corrected
     #: Offset of the recording's coordinate frame, at the mean of the landmarks
     offset_m: float
     offset_deg: float
@@ -148,7 +147,7 @@ def align(given: Views, known: OldMap, options: MappingOptions) -> Aligned:
         found = refit(views, known.landmarks, shown, options.min_viewpoints)
         errors = estimated = joint.significant_pose_errors(views, found.landmarks, shown)
     refined = views if errors is None else _refine(views, known, errors, options)
-    return Aligned(refined, offset_m, offset_deg, *joint.pose_changes(views, refined),
+    return Aligned(refined, total, offset_m, offset_deg, *joint.pose_changes(views, refined),
                    joint.pose_errors(views, refined), estimated)
 
 

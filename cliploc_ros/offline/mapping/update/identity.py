@@ -19,9 +19,10 @@ from scipy.sparse.csgraph import connected_components
 
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, concatenated
 from cliploc_ros.offline.mapping.labelling import embed_landmarks
+from cliploc_ros.offline.mapping.landmarks import Landmarks
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update.alignment import OldMap, has_moved
-from cliploc_ros.offline.mapping.update.judging import Judgement, Shown
+from cliploc_ros.offline.mapping.update.judging import Judgement
 
 # Gains, in nats. Chosen: one dissimilar appearance does not outweigh an object in its place, but
 # two exchanged ones do; appearance decides whether a new object is a missing one.
@@ -52,29 +53,27 @@ class Fates(NamedTuple):
     moved: NDArray[np.int64]
     missing: NDArray[np.int64]
     not_observed: NDArray[np.int64]
+    kept: NDArray[np.int64]  #: All that are in the new map
     new: NDArray[np.int64]  #: Objects that are not an old landmark
     objects: NDArray[np.int64]  #: (L,): the object that each old landmark is, -1 for none
     rivals: dict[int, tuple[int, ...]]  #: Other old landmarks that an object could be
 
 
-def decide_fates(known: OldMap, judged: Judgement, objects: Shown, looks: 'Likeness | None'
-                 ) -> Fates:
-    """Return the fate of each old landmark."""
-    numbers, rivals = _identify(known, objects, judged, looks)
-    found = numbers >= 0
-    elsewhere = found.copy()
-    rows = np.nonzero(found)[0]
-    elsewhere[rows] = objects.owners[numbers[rows]] != rows
+def decide_fates(known: OldMap, judged: Judgement, looks: 'Likeness | None', here: int) -> Fates:
+    """Return the fate of each old landmark; only the first ones are still in the map."""
+    numbers, rivals = _identify(known, judged, looks)
+    found, rows = numbers >= 0, np.arange(len(numbers))
+    elsewhere = found & (numbers != rows)
     # an object slightly off its place did not move: it was mapped inaccurately
-    rows = np.nonzero(elsewhere)[0]
-    elsewhere[rows] = has_moved(known.landmarks.select(rows), known.sigmas[rows],
-                                objects.refits.select(numbers[rows]))
-    missing = ~found & ((judged.is_gone & ~judged.is_doubtful) | judged.is_there)
-    return Fates(
-        np.nonzero(found & ~elsewhere)[0], np.nonzero(elsewhere)[0], np.nonzero(missing)[0],
-        np.nonzero(~found & ~missing)[0],
-        np.setdiff1d([number for number, weak in enumerate(objects.weak) if not weak],
-                     numbers[found]), numbers, rivals)
+    away = np.nonzero(elsewhere)[0]
+    elsewhere[away] = has_moved(known.landmarks.select(away), known.sigmas[away],
+                                judged.refits.select(numbers[away]))
+    is_lost = ~found & (rows < here)
+    missing = is_lost & ((judged.is_gone & ~judged.is_doubtful) | judged.is_there)
+    new = len(rows) + np.nonzero([not find.weak for find in judged.finds.each])[0]
+    return Fates(rows[found & ~elsewhere], rows[elsewhere], rows[missing],
+                 rows[is_lost & ~missing], rows[found | (is_lost & ~missing)],
+                 np.setdiff1d(new, numbers[found]), numbers, rivals)
 
 
 class Likeness(NamedTuple):
@@ -107,10 +106,10 @@ def why_not_comparable(old: LandmarkEmbeddings | None, detections: PosedDetectio
 
 
 def compare_looks(old: LandmarkEmbeddings, landmark_ids: Sequence[str],
-                  detections: PosedDetections, objects: Shown) -> Likeness:
+                  detections: PosedDetections, judged: Judgement) -> Likeness:
     """Return the embeddings of the old landmarks, by their ids, and of the recording's objects."""
-    of_objects = embed_landmarks([str(number) for number in range(len(objects.owners))],
-                                 detections, objects.shown)
+    of_objects = embed_landmarks([str(number) for number in range(len(judged.sight.seen))],
+                                 detections, judged.shown)
     return Likeness(old.in_order(landmark_ids).means.astype(np.float32),
                     of_objects.means.astype(np.float32))
 
@@ -150,38 +149,36 @@ class _LookModel(NamedTuple):
         return np.nan_to_num(np.clip(gains, -_MAX_LOOK_GAIN, _MAX_LOOK_GAIN), nan=0.0)
 
 
-def _identify(known: OldMap, objects: Shown, judged: Judgement, looks: Likeness | None
+def _identify(known: OldMap, judged: Judgement, looks: Likeness | None
               ) -> tuple[NDArray[np.int64], dict[int, tuple[int, ...]]]:
     """Return the object (L,) that each old landmark is, -1 for none, and the rivals of objects.
 
     A landmark that is gone may be any new object, and a doubtful one may be a nearby object. Any
     other landmark can only be the object in its place or near it.
     """
-    held = np.nonzero(objects.owners >= 0)[0]
-    owners = objects.owners[held]
-    result = np.full(len(known.sigmas), -1, dtype=np.int64)
-    result[owners] = held
-    groups = _class_groups(known, objects)
-    model = None if looks is None else _learn_looks(objects, looks, groups)
+    held = np.nonzero(judged.is_there)[0]
+    result = np.where(judged.is_there, np.arange(len(known.sigmas)), -1)
+    groups = _class_groups(known, judged.landmarks)
+    model = None if looks is None else _learn_looks(judged, looks, groups)
     doubtful = np.zeros(len(held), dtype=np.bool_)
     if looks is not None and model is not None:
-        cosines = looks.similarities(owners, held).diagonal()  # NaN is not doubtful
+        cosines = looks.similarities(held, held).diagonal()  # NaN is not doubtful
         doubtful = cosines < model.own - _DOUBT * model.sigma
     own = judged.sight.select(slice(len(known.sigmas)))
     searched = (judged.is_gone | judged.is_doubtful) & (
         own.seen <= _MOST_SEEN_IF_MOVED * own.expected)
-    searched[[row for rows in objects.near for row in rows]] = True
-    searched[owners] = doubtful
-    offered = objects.owners < 0
+    searched[[row for _, row in judged.near]] = True
+    searched[held] = doubtful
+    offered = np.arange(len(judged.sight.seen)) >= len(known.sigmas)
     offered[held] = doubtful
     rivals: dict[int, tuple[int, ...]] = {}
     of_landmarks = np.where(known.landmarks.classes >= 0, groups[known.landmarks.classes], -1)
-    of_objects = groups[objects.landmarks.classes]
+    of_objects = np.where(judged.landmarks.classes >= 0, groups[judged.landmarks.classes], -1)
     for group in np.unique(of_objects[offered]):
         rows = np.nonzero(searched & (of_landmarks == group))[0]
         columns = np.nonzero(offered & (of_objects == group))[0]
         if len(rows) and len(columns):
-            gains = _gains(known, objects, judged, rows, columns)
+            gains = _gains(known, judged, rows, columns)
             if looks is not None and model is not None:
                 gains += model.gains(looks.similarities(rows, columns))
             result[rows], close = _assign(gains, rows, columns)
@@ -189,24 +186,24 @@ def _identify(known: OldMap, objects: Shown, judged: Judgement, looks: Likeness 
     return result, rivals
 
 
-def _class_groups(known: OldMap, objects: Shown) -> NDArray[np.int64]:
+def _class_groups(known: OldMap, objects: Landmarks) -> NDArray[np.int64]:
     """Return a group for each class; all classes of a landmark are in one group."""
-    count = 1 + max(int(landmarks.names[:, 1].max(initial=0))
-                    for landmarks in (objects.landmarks, known.landmarks))
+    count = 1 + int(objects.names[:, 1].max(initial=0))
     rows, classes = known.landmarks.names.T
     main = known.landmarks.classes[rows]
     links = coo_matrix((np.ones(len(main)), (main, classes)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
 
 
-def _learn_looks(objects: Shown, looks: Likeness, groups: NDArray[np.int64]) -> _LookModel | None:
+def _learn_looks(judged: Judgement, looks: Likeness, groups: NDArray[np.int64]
+                 ) -> _LookModel | None:
     """Learn the cosines of embeddings from the landmarks in their place; None if too few."""
-    held = np.nonzero(objects.owners >= 0)[0]
+    held = np.nonzero(judged.is_there)[0]
     own, other = [np.empty(0)], [np.empty(0)]
-    classes = groups[objects.landmarks.classes[held]]
+    classes = groups[judged.landmarks.classes[held]]
     for group in np.unique(classes):
         columns = held[classes == group]
-        cosines = looks.similarities(objects.owners[columns], columns)
+        cosines = looks.similarities(columns, columns)
         is_own = np.eye(len(columns), dtype=np.bool_)
         own.append(cosines[is_own])
         other.append(cosines[~is_own])
@@ -221,28 +218,28 @@ def _learn_looks(objects: Shown, looks: Likeness, groups: NDArray[np.int64]) -> 
     return _LookModel(middle, elsewhere, max(*spreads, 1e-3))
 
 
-def _gains(known: OldMap, objects: Shown, judged: Judgement, rows: NDArray[np.int64],
-           columns: NDArray[np.int64]) -> NDArray[np.float64]:
+def _gains(known: OldMap, judged: Judgement, rows: NDArray[np.int64], columns: NDArray[np.int64]
+           ) -> NDArray[np.float64]:
     """Return the gains (k, j) by place, class, size and distance; -inf for impossible pairs."""
     sizes = [np.log(np.sort(np.linalg.norm(landmarks.bases, axis=1), axis=1)[:, 1:]).mean(axis=1)
-             for landmarks in (known.landmarks.select(rows), objects.landmarks.select(columns))]
+             for landmarks in (known.landmarks.select(rows), judged.landmarks.select(columns))]
     change = np.abs(sizes[0][:, None] - sizes[1][None])
     ways_m = np.linalg.norm(known.landmarks.centers[rows][:, None]
-                            - objects.landmarks.centers[columns][None], axis=2)
+                            - judged.landmarks.centers[columns][None], axis=2)
     gains = (_ELSEWHERE_GAIN - 0.5 * np.square(change / _SIZE_SIGMA)
              - _WAY_GAIN * np.log1p(ways_m / _WAY_M))
     names = known.names
     for place, row in enumerate(rows):
         for column, number in enumerate(columns):
-            if objects.owners[number] == row:
+            if number == row:
                 gains[place, column] = _IN_PLACE_GAIN
-            elif int(row) in objects.near[number]:
+            elif (int(number), int(row)) in judged.near:
                 gains[place, column] += _NEAR_GAIN - _ELSEWHERE_GAIN
             elif (change[place, column] > _MAX_SIZE_CHANGE
-                  or not (judged.is_gone[row] or row in objects.owners
+                  or not (judged.is_gone[row] or judged.is_there[row]
                           or (judged.is_doubtful[row]
                               and ways_m[place, column] < _MAX_DOUBTED_MOVE_M))
-                  or (int(row), int(objects.landmarks.classes[number])) not in names):
+                  or (int(row), int(judged.landmarks.classes[number])) not in names):
                 gains[place, column] = -np.inf
     return gains
 

@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.visibility import log_evidence, log_odds_there
+from cliploc_ros.core.map.presence import STAYS, probability_there, worth_of
 from cliploc_ros.offline.mapping.association import associate, find_overlaps
 from cliploc_ros.offline.mapping.building import LeftOut, NothingFoundError, build_map, rounded
 from cliploc_ros.offline.mapping.doubles import Relation, close_pairs, relation
@@ -30,20 +29,11 @@ from cliploc_ros.offline.mapping.views import Views
 # less often than before.
 _FACTOR_RANGE = (0.3, 2.0)
 _RATIO_RANGE = (0.02, 0.95)
-# Least number of landmarks, and of viewpoints of each, to estimate the scatter of the ratios;
-# least weight of a usual ratio [views]. Chosen.
-_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
-_FEW_LANDMARKS, _FEW_VIEWS, _LEAST_WORTH = 5, 3, 0.5
-# Share of the objects that are usually still in their place; share of the views in which an object
-# is detected, if neither map nor recording give it; share of the views with a false detection in
-# an empty place. Chosen, like all values below.
-_STAYS, _SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.9, 0.03
-# The seen ratio counts as this number of views at most: an object may be hard to see from one
-# side.
-_PRIOR_VIEWS = 4.0
-# An object is gone if its probability of being there is below the first number, or the second one
-# if another object was found in its place. It is there if the probability is above the third one.
-_GONE_BELOW, _GONE_BELOW_IF_TAKEN, _THERE_ABOVE = 0.05, 0.5, 0.95
+# Share of the views in which an object is detected, if neither map nor recording give it; share of
+# the views with a false detection in an empty place. Chosen, like all values below.
+_SEEN_RATIO, _CHANCE_RATIO = 0.9, 0.03
+# An object is gone, or there, if its probability of being there is below or above these numbers.
+_GONE_BELOW, _THERE_ABOVE = 0.05, 0.95
 # An object is also gone if it was never seen, and usually would have been seen from this number of
 # viewpoints: how often an object is seen differs more between recordings than the map's seen_ratio
 # predicts. Measured with studies.updates.
@@ -59,15 +49,20 @@ _MIN_NEW_SHARE, _MIN_SHARE_IN_PLACE = 0.4, 0.15
 _MIN_MOVED_BASELINE_DEG = 10.0
 
 
+class Find(NamedTuple):
+    """An object that no old landmark explains in its place."""
+
+    class_id: str
+    details: LandmarkDetails
+    weak: str = ''  #: Why it may be a moved landmark, but not a new one; '' if it may be a new one
+
+
 class Finds(NamedTuple):
-    """The m finds: objects that no old landmark explains in its place."""
+    """The m finds."""
 
     landmarks: Landmarks
-    class_ids: tuple[str, ...]
-    details: tuple[LandmarkDetails, ...]
-    left_out: tuple[LeftOut, ...]  #: Objects not good enough for a map, or old landmarks
-    #: Why each find may be a moved landmark, but not a new one; '' if it may be a new one
-    weak: tuple[str, ...] = ()
+    each: tuple[Find, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()  #: Objects not good enough for a map, or old landmarks
 
     def without(self, reasons: Sequence[str | None], sight: Sight) -> 'Finds':
         """Return the finds without those that have a reason (m,), which are left out.
@@ -78,90 +73,91 @@ class Finds(NamedTuple):
         own = sight.select(slice(len(sight.seen) - len(reasons), None))
         return Finds(
             self.landmarks.select(np.array(kept, dtype=np.int64)),
-            tuple(self.class_ids[row] for row in kept), tuple(self.details[row] for row in kept),
-            weak=tuple(self.weak[row] for row in kept), left_out=self.left_out + tuple(
-                LeftOut(self.class_ids[row], rounded(self.landmarks.centers[row]),
+            tuple(self.each[row] for row in kept), self.left_out + tuple(
+                LeftOut(self.each[row].class_id, rounded(self.landmarks.centers[row]),
                         int(own.seen_frames[row]), int(own.seen[row]), reason)
                 for row, reason in enumerate(reasons) if reason is not None))
 
 
 class Judgement(NamedTuple):
-    """The evidence from a recording with n boxes for L old landmarks and m finds."""
+    """The evidence from a recording with n boxes for L old landmarks and m finds.
 
-    #: (n,): the old landmark that each box shows in its place, L + the find, or -1 for none
+    They are the objects of the recording, in this order.
+    """
+
+    #: (n,): the object that each box shows in its place, -1 for none
     shown: NDArray[np.int64]
+    refits: alignment.Refits  #: Of the objects
+    sight: Sight  #: Of the objects
     finds: Finds
-    sight: Sight  #: Of the old places, then of the finds
     is_gone: NDArray[np.bool_]  #: (L,)
     is_there: NDArray[np.bool_]  #: (L,): if neither, the recording is inconclusive
     #: (L,): not proven to be gone, although boxes place it elsewhere, or hardly any show it
     is_doubtful: NDArray[np.bool_]
+    #: Pairs of a find and an old landmark that it may be although it is slightly off its place
+    near: frozenset[tuple[int, int]]
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """Return the objects as landmarks."""
+        return self.refits.landmarks
 
 
-def judge(detections: PosedDetections, views: Views, known: alignment.OldMap,
+def judge(detections: PosedDetections, aligned: alignment.Aligned, known: alignment.OldMap,
           options: MappingOptions) -> Judgement:
-    """Judge each place of the map by the recording, and find the other objects that it shows.
-
-    The views have poses in the coordinate frame of the map.
-    """
-    count = len(known.landmarks.centers)
+    """Judge each place of the map by the recording, and find the other objects that it shows."""
+    count, views = len(known.landmarks.centers), aligned.views
     finds = _find_new(detections, views, _free(views, known), options)
     # weak finds beside an old landmark would take its boxes
     _, sight = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
     beside = {new for new, _, _ in _pairs_between(finds.landmarks, known.landmarks)}
-    finds = finds.without([weak if weak and new in beside else None
-                           for new, weak in enumerate(finds.weak)], sight)
+    finds = finds.without([find.weak if find.weak and new in beside else None
+                           for new, find in enumerate(finds.each)], sight)
     # old landmarks and finds compete for the boxes: an old one may have boxes of a neighbour
     shown, _ = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
     refits = alignment.refit(views, known.landmarks, np.where(shown < count, shown, -1),
                              options.min_viewpoints)
     displaced = alignment.has_moved(known.landmarks, known.sigmas, refits)
-    finds = _with_displaced(finds, refits, displaced, known.map.class_ids)
-    shown, sight = _look(views, known, finds, displaced)
+    _, sight = _look(views, known, finds, displaced)
+    # objects that are gone hide nothing; new objects hide old places
     is_gone = displaced | _is_absent(known, sight.select(slice(count)), _GONE_BELOW)
-    # a new object may be in the place of an old landmark that still has a false detection
-    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 1.0)
-    _, sight = _look(views, known, finds, is_gone)
-    # finds should be seen about as often as the old landmarks, which come first in `sight`
-    ratios = sight.seen_ratio[:count][sight.seen[:count] > 0]
-    usual = float(np.median(ratios)) if len(ratios) else 1.0
-    least = _MIN_NEW_SHARE * usual
-    finds = finds._replace(weak=tuple(
-        weak if weak or ratio >= least else f'seen in {100 * ratio:.1f} % of the frames that show '
-        f'its place, less than {100 * least:.1f} %, {_MIN_NEW_SHARE:g} of the usual rate'
-        for weak, ratio in zip(finds.weak, sight.seen_ratio[count:], strict=True)))
-    # new objects hide old places
     shown, sight = _look(views, known, finds, is_gone)
-    # an old landmark is probably gone if a find with more boxes is in its place
-    boxes = np.bincount(shown[shown >= 0], minlength=count + len(finds.details))
-    limits = np.full(count, _GONE_BELOW)
-    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
-        if boxes[count + new] > boxes[row]:
-            limits[row] = _GONE_BELOW_IF_TAKEN
-    is_gone = displaced | _is_absent(known, sight.select(slice(count)), limits)
-    shown, sight = _look(views, known, finds, is_gone)
-    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight, 0.0)
-    # objects that are gone hide nothing
+    finds = _without_copies(views, finds, refits.landmarks, known, shown, sight)
     shown, sight = _look(views, known, finds, is_gone)
     own = sight.select(slice(count))
-    is_gone |= _is_absent(known, own, limits)
+    is_gone |= _is_absent(known, own, _GONE_BELOW)
     shown[np.isin(shown, np.nonzero(is_gone)[0])] = -1
-    of_landmarks = np.where(shown < count, shown, -1)
-    refits = alignment.refit(views, known.landmarks, of_landmarks, options.min_viewpoints)
-    fits = gather_evidence(views, refits.landmarks, of_landmarks).median_iou
+    # finds should be seen about as often as the old landmarks
+    ratios = own.seen_ratio[own.seen > 0]
+    usual = float(np.median(ratios)) if len(ratios) else 1.0
+    least = _MIN_NEW_SHARE * usual
+    finds = finds._replace(each=tuple(
+        find if find.weak or ratio >= least else find._replace(
+            weak=f'seen in {100 * ratio:.1f} % of the frames that show its place, less than '
+            f'{100 * least:.1f} %, {_MIN_NEW_SHARE:g} of the usual rate')
+        for find, ratio in zip(finds.each, sight.seen_ratio[count:], strict=True)))
+    landmarks = Landmarks.joined(known.landmarks, finds.landmarks)
+    refits = alignment.refit(views, landmarks, shown, options.min_viewpoints)
+    left_m = left_by_poses(views, np.square(aligned.changes), shown, len(landmarks.centers))
+    refits = refits._replace(
+        covariances=refits.covariances + np.square(left_m)[:, None, None] * np.eye(3))
+    fits = gather_evidence(views, refits.landmarks, shown).median_iou[:count]
     is_rare = ((own.seen_ratio < _MIN_SHARE_IN_PLACE * usual) & (own.expected >= LEAST_VIEWS))
-    is_there = (~is_gone & ~is_rare & (fits >= MIN_MEDIAN_IOU)
-                & (refits.is_known | (_probability_there(known, own) > _THERE_ABOVE)))
+    is_there = (~is_gone & ~is_rare & (fits >= MIN_MEDIAN_IOU) & (
+        refits.is_known[:count] | (_probability_there(known, own) > _THERE_ABOVE)))
     # boxes place it elsewhere, but may not suffice for a find there: then it may not be gone
-    is_doubtful = (is_gone & ~_is_absent(known, own, limits)) | (
-        ~is_there & ~is_gone & (is_rare | _is_absent(known, own, _STAYS))
+    is_doubtful = (is_gone & ~_is_absent(known, own, _GONE_BELOW)) | (
+        ~is_there & ~is_gone & (is_rare | _is_absent(known, own, STAYS))
         & (known.landmarks.classes >= 0))
-    return Judgement(shown, finds, sight, is_gone, is_there, is_doubtful)
+    shown[np.isin(shown, np.nonzero(~is_there)[0])] = -1
+    near = frozenset(
+        (count + new, row) for new, row, _ in _pairs_between(finds.landmarks, known.landmarks)
+        if not is_there[row] and (row, int(finds.landmarks.classes[new])) in known.names)
+    return Judgement(shown, refits, sight, finds, is_gone, is_there, is_doubtful, near)
 
 
-def _is_absent(known: alignment.OldMap, sight: Sight, limits: NDArray[np.float64] | float
-               ) -> NDArray[np.bool_]:
-    """Return a mask of the objects (L,) whose probability of being in place is below the limits.
+def _is_absent(known: alignment.OldMap, sight: Sight, limit: float) -> NDArray[np.bool_]:
+    """Return a mask of the objects (L,) whose probability of being in place is below a limit.
 
     Classes without a box are excluded: the detector may not know them, or not at these sizes.
     """
@@ -169,7 +165,7 @@ def _is_absent(known: alignment.OldMap, sight: Sight, limits: NDArray[np.float64
     seen = sight.seen > 0
     usual = np.median(sight.seen[seen] / sight.expected[seen]) if seen.any() else 0.0
     is_never_seen = ~seen & (usual * sight.expected >= _USUALLY_SEEN)
-    return np.asarray(is_told & (is_never_seen | (_probability_there(known, sight) < limits)))
+    return np.asarray(is_told & (is_never_seen | (_probability_there(known, sight) < limit)))
 
 
 def _probability_there(known: alignment.OldMap, sight: Sight) -> NDArray[np.float64]:
@@ -190,26 +186,15 @@ def _probability_there(known: alignment.OldMap, sight: Sight) -> NDArray[np.floa
         factor = np.clip(sight.seen[told].sum() / max(expected, 1e-9), *_FACTOR_RANGE)
         ratios = np.where(np.isnan(given), ratios, factor * ratios)
     ratios = np.clip(ratios, *_RATIO_RANGE)
-    # the usual ratios count as few views if this recording scatters about them: a beta variable
-    # of mean r and n views has the variance r (1 - r) / (n + 1)
-    certainty, rows = _PRIOR_VIEWS, seen & (sight.expected >= _FEW_VIEWS)
-    if np.count_nonzero(rows) >= _FEW_LANDMARKS:
-        shares, usual = sight.seen[rows] / sight.expected[rows], ratios[rows]
-        # the median excludes objects that are gone, which are not scatter
-        scatter = np.median(np.square(shares - usual) / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
-        certainty = float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH,
-                                  _PRIOR_VIEWS))
-    there, away = (log_evidence(views * share, views * (1.0 - share), sight.seen,
-                                sight.expected - sight.seen)
-                   for views, share in ((certainty, ratios), (_PRIOR_VIEWS, _CHANCE_RATIO)))
-    return np.asarray(expit(log_odds_there(_STAYS, there, away)))
+    return probability_there(sight.seen, sight.expected, ratios, worth_of(
+        sight.seen, sight.expected, ratios), _CHANCE_RATIO)
 
 
 def _look(views: Views, known: alignment.OldMap, finds: Finds, is_gone: NDArray[np.bool_]
           ) -> tuple[NDArray[np.int64], Sight]:
     """Return the old landmark or new find that each box shows, and the sight of all places."""
     places = Landmarks.joined(known.landmarks, finds.landmarks)
-    is_solid = np.concatenate([~is_gone, np.ones(len(finds.details), dtype=np.bool_)])
+    is_solid = np.concatenate([~is_gone, np.ones(len(finds.each), dtype=np.bool_)])
     shown = associate(views, places, among=is_solid)
     return shown, look_for(views, places, shown, is_solid)
 
@@ -236,53 +221,39 @@ def _free(views: Views, known: alignment.OldMap) -> NDArray[np.bool_]:
 def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool_],
               options: MappingOptions) -> Finds:
     """Return the landmarks that the free boxes show, with the poses of the views."""
-    no_finds = Finds(Landmarks.none(), (), (), ())
     if not is_free.any():
-        return no_finds
+        return Finds(Landmarks.none())
     posed = detections.with_poses(views.poses).select_boxes(is_free)
+    least = options.min_baseline_deg
     try:
-        built = build_map(posed, replace(options, pose_errors=None, estimate_pose_errors=False,
-                                         refine_mount=False, min_baseline_deg=min(
-                                             options.min_baseline_deg, _MIN_MOVED_BASELINE_DEG)))
+        built = build_map(posed, replace(
+            options, pose_errors=None, estimate_pose_errors=False, refine_mount=False,
+            min_baseline_deg=min(least, _MIN_MOVED_BASELINE_DEG)))
     except NothingFoundError as error:
-        return no_finds._replace(left_out=error.left_out)
-    return Finds(landmarks_of_map(built.landmark_map, detections.class_names),
-                 built.landmark_map.class_ids, built.landmark_map.details, built.report.left_out,
-                 tuple('' if (detail.baseline_deg or 0.0) >= options.min_baseline_deg else
-                       f'seen from one side only: {detail.baseline_deg:.1f} degrees, less than '
-                       f'{options.min_baseline_deg:g}' for detail in built.landmark_map.details))
-
-
-def _with_displaced(finds: Finds, refits: alignment.Refits, displaced: NDArray[np.bool_],
-                    class_ids: Sequence[str]) -> Finds:
-    """Add old landmarks that are slightly displaced to the finds, unless they are among them."""
-    rows = np.nonzero(displaced)[0]
-    again = {moved for moved, _, _ in _pairs_between(refits.landmarks.select(rows),
-                                                     finds.landmarks)}
-    rows = rows[[moved not in again for moved in range(len(rows))]]
-    return finds._replace(
-        landmarks=Landmarks.joined(finds.landmarks, refits.landmarks.select(rows)),
-        class_ids=finds.class_ids + tuple(class_ids[row] for row in rows.tolist()),
-        details=finds.details + (LandmarkDetails(),) * len(rows),
-        weak=finds.weak + ('',) * len(rows))
+        return Finds(Landmarks.none(), left_out=error.left_out)
+    found = built.landmark_map
+    return Finds(landmarks_of_map(found, detections.class_names), tuple(
+        Find(class_id, detail, '' if (detail.baseline_deg or 0.0) >= least else
+             f'seen from one side only: {detail.baseline_deg:.1f} degrees, less than {least:g}')
+        for class_id, detail in zip(found.class_ids, found.details, strict=True)),
+        built.report.left_out)
 
 
 def _without_copies(views: Views, finds: Finds, old: Landmarks, known: alignment.OldMap,
-                    shown: NDArray[np.int64], sight: Sight, majority: float) -> Finds:
+                    shown: NDArray[np.int64], sight: Sight) -> Finds:
     """Return the finds without those that are an old landmark in its place.
 
-    An old landmark is in its place if it has a box, and at least `majority` boxes for each box of
-    the find. A find of its class that lies in it shows the same object. So does any other
-    overlapping find, as a part or under another name, unless frames show two objects at once.
+    An old landmark is in its place if it has a box. A find of its class that lies in it shows the
+    same object. So does any other overlapping find, as a part or under another name, unless frames
+    show two objects at once.
     """
     count = len(old.centers)
-    boxes = group_boxes(shown, count + len(finds.details))
-    reasons: list[str | None] = [None] * len(finds.details)
+    boxes = group_boxes(shown, count + len(finds.each))
+    reasons: list[str | None] = [None] * len(finds.each)
     every = Landmarks.joined(old, finds.landmarks)
     for new, row, distance in _pairs_between(finds.landmarks, old):
         is_one_class = old.classes[row] == finds.landmarks.classes[new]
-        if len(boxes[row]) >= max(1.0, majority * len(boxes[count + new])) and (
-                (is_one_class and distance < alignment.LEAST_MOVE_SHAPES)
+        if len(boxes[row]) and ((is_one_class and distance < alignment.LEAST_MOVE_SHAPES)
                 or relation(views, every, boxes, (row, count + new)) is not Relation.TWO):
             reasons[new] = f'it is {known.map.landmark_ids[row]} in its place'
     return finds.without(reasons, sight)
@@ -293,54 +264,3 @@ def _pairs_between(new: Landmarks, old: Landmarks) -> list[tuple[int, int, float
     count = len(new.centers)
     return [(first, second - count, distance) for first, second, distance
             in close_pairs(Landmarks.joined(new, old)) if first < count <= second]
-
-
-class Shown(NamedTuple):
-    """The m objects that the recording shows: old landmarks in their places, and finds."""
-
-    refits: alignment.Refits  #: Where they are
-    owners: NDArray[np.int64]  #: (m,): the old landmark in whose place it was seen, -1 for none
-    #: For each object, the old landmarks that it may be although it is slightly off their place
-    near: tuple[frozenset[int], ...]
-    shown: NDArray[np.int64]  #: (n,): the object that each box shows, -1 for none
-    sight: Sight
-    given: tuple[LandmarkDetails, ...]  #: Classes and source of the finds
-    weak: tuple[str, ...]  #: See Finds
-    class_ids: tuple[str, ...]  #: Of the finds; '' of old landmarks
-
-    @property
-    def landmarks(self) -> Landmarks:
-        """Return the objects as landmarks."""
-        return self.refits.landmarks
-
-    def left_out(self, chosen: NDArray[np.int64]) -> tuple[LeftOut, ...]:
-        """Return the weak finds that are not among the chosen objects."""
-        return tuple(LeftOut(self.class_ids[row], rounded(self.landmarks.centers[row]),
-                             int(self.sight.seen_frames[row]), int(self.sight.seen[row]), weak)
-                     for row, weak in enumerate(self.weak) if weak and row not in chosen)
-
-
-def gather_objects(aligned: alignment.Aligned, known: alignment.OldMap, judged: Judgement,
-                   options: MappingOptions) -> Shown:
-    """Return the objects that the recording shows."""
-    views, count, finds = aligned.views, len(known.sigmas), judged.finds
-    in_place = np.nonzero(judged.is_there)[0]
-    places = np.concatenate([in_place, count + np.arange(len(finds.details))])
-    numbers = np.full(count + len(finds.details) + 1, -1, dtype=np.int64)
-    numbers[places] = np.arange(len(places))
-    shown = numbers[judged.shown]
-    landmarks = Landmarks.joined(known.landmarks.select(in_place), finds.landmarks)
-    refits = alignment.refit(views, landmarks, shown, options.min_viewpoints)
-    left_m = left_by_poses(views, np.square(aligned.changes), shown, len(places))
-    refits = refits._replace(
-        covariances=refits.covariances + np.square(left_m)[:, None, None] * np.eye(3))
-    near: list[set[int]] = [set() for _ in places]
-    names = known.names
-    for new, row, _ in _pairs_between(finds.landmarks, known.landmarks):
-        if not judged.is_there[row] and (row, int(finds.landmarks.classes[new])) in names:
-            near[len(in_place) + new].add(row)
-    return Shown(
-        refits, np.concatenate([in_place, np.full(len(finds.details), -1, dtype=np.int64)]),
-        tuple(map(frozenset, near)), shown, judged.sight.select(places),
-        (LandmarkDetails(),) * len(in_place) + finds.details, ('',) * len(in_place) + finds.weak,
-        ('',) * len(in_place) + finds.class_ids)

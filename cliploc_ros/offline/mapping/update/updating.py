@@ -24,7 +24,7 @@ from cliploc_ros.offline.mapping.building import LeftOut, left_out_lines, rounde
 from cliploc_ros.offline.mapping.doubles import find_doubles
 from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, Evidence, Sight, gather_evidence
 from cliploc_ros.offline.mapping.joint import estimated_note
-from cliploc_ros.offline.mapping.landmarks import landmarks_of_map, unused_ids
+from cliploc_ros.offline.mapping.landmarks import Landmarks, landmarks_of_map, unused_ids
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.update import alignment, identity, judging
@@ -111,6 +111,8 @@ class UpdatedMap:
     first_new: int  #: Row of the first new landmark
     #: (F, 4, 4): the poses in the coordinate frame of the map
     map_from_camera: NDArray[np.float64]
+    gone: Landmarks  #: Landmarks that moved or are missing, in their old places
+    map_from_given: NDArray[np.float64]  #: (4, 4): the offset of the recording's coordinate frame
     embeddings: LandmarkEmbeddings | None  #: Image embeddings of the new map
     #: Landmarks that are missing now, or were before; a returning object gets its old id
     removed: LandmarkMap
@@ -148,35 +150,29 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
                                             if name not in old.landmark_ids]))
     known = alignment.known_landmarks(old, detections.class_names)
     aligned = alignment.align(given, known, options)
-    judged = judging.judge(detections, aligned.views, known, options)
+    judged = judging.judge(detections, aligned, known, options)
     loose, well = (int((associate(aligned.views, known.landmarks, min_iou) >= 0).sum())
                    for min_iou in (ASSOCIATION_IOU, MIN_MEDIAN_IOU))
     _check_belongs(judged, count, well / max(1, loose))
-    objects = judging.gather_objects(aligned, known, judged, options)
     unlike = identity.why_not_comparable(embeddings, detections)
     looks = None
     if unlike:
         notes.append(f'image embeddings are not compared: {unlike}')
     elif embeddings is not None:
-        looks = identity.compare_looks(embeddings, old.landmark_ids, detections, objects)
-    fates = identity.decide_fates(known, judged, objects, looks)
-    away = fates.objects < 0
-    away[:count] = False
-    was_here = np.arange(len(old)) < count
-    fates = fates._replace(not_observed=fates.not_observed[was_here[fates.not_observed]],
-                           missing=fates.missing[was_here[fates.missing]])
-    kept = np.setdiff1d(np.nonzero(~away)[0], fates.missing)
-    updated = _renew(known, aligned.views, objects, fates, judged, detections.class_names, kept)
-    rows_of = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
-    has_object = fates.objects[kept] >= 0
-    rows_of[fates.objects[kept][has_object]] = np.nonzero(has_object)[0]
-    rows_of[fates.new] = len(kept) + np.arange(len(fates.new))
+        looks = identity.compare_looks(embeddings, old.landmark_ids, detections, judged)
+    fates = identity.decide_fates(known, judged, looks, count)
+    updated = _renew(known, aligned.views, judged, fates, detections.class_names)
+    # the row in the new map of each object, and of none
+    numbers = np.concatenate([fates.objects[fates.kept], fates.new])
+    rows_of = np.full(len(judged.sight.seen) + 1, -1, dtype=np.int64)
+    rows_of[numbers] = np.arange(len(numbers))
+    rows_of[-1] = -1
     without_doubles, shown, first_new, joined = _one_of_each(
-        updated, aligned.views, rows_of[objects.shown], len(kept), detections.class_names)
+        updated, aligned.views, rows_of[judged.shown], len(fates.kept), detections.class_names)
     notes += _notes(known, aligned, detections) + joined + [
         f'{old.landmark_ids[row]} is back: an earlier update had removed it'
-        for row in kept[kept >= count]]
-    lists = _describe(known.map, updated, objects, fates, judged)
+        for row in fates.kept[fates.kept >= count]]
+    lists = _describe(known.map, updated, judged, fates)
     lists['new'] = tuple(landmark for landmark in lists['new']
                          if landmark.landmark_id in without_doubles.landmark_ids)
     report = UpdateReport(
@@ -184,13 +180,17 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
         offset_m=aligned.offset_m, offset_deg=aligned.offset_deg,
         pose_change_m=aligned.change_m, pose_change_deg=aligned.change_deg,
         **lists,
-        left_out=tuple(sorted(judged.finds.left_out + objects.left_out(fates.objects),
-                              key=lambda landmark: -landmark.support)),
+        left_out=tuple(sorted(judged.finds.without([
+            find.weak if find.weak and number not in fates.objects else None
+            for number, find in enumerate(judged.finds.each, len(old))], judged.sight).left_out,
+            key=lambda landmark: -landmark.support)),
         notes=tuple(notes))
     return UpdatedMap(without_doubles, report, shown, first_new, aligned.views.poses,
+                      known.landmarks.select(np.concatenate([fates.moved, fates.missing])),
+                      aligned.map_from_given,
                       identity.renew_embeddings(embeddings, without_doubles.landmark_ids,
                                                 detections, shown),
-                      old.select(np.setdiff1d(np.arange(len(old)), kept).tolist()))
+                      old.select(np.setdiff1d(np.arange(len(old)), fates.kept).tolist()))
 
 
 def _check_belongs(judged: judging.Judgement, count: int, well_share: float) -> None:
@@ -227,50 +227,44 @@ def _notes(known: alignment.OldMap, aligned: alignment.Aligned, detections: Pose
     return notes
 
 
-def _renew(known: alignment.OldMap, views: Views, objects: judging.Shown, fates: identity.Fates,
-           judged: judging.Judgement, class_names: tuple[str, ...], kept: NDArray[np.int64]
-           ) -> LandmarkMap:
+def _renew(known: alignment.OldMap, views: Views, judged: judging.Judgement,
+           fates: identity.Fates, class_names: tuple[str, ...]) -> LandmarkMap:
     """Return the new map: the old landmarks that are kept, in their order, then new ones.
 
     The class names are those of the recording; the views have its poses in the map.
     """
-    evidence, old = gather_evidence(views, objects.landmarks, objects.shown), known.map
+    evidence, old = gather_evidence(views, judged.landmarks, judged.shown), known.map
     centers, details = old.centers.copy(), list(old.details)
     semi_axes, quats = old.semi_axes.copy(), old.quats_xyzw.copy()
-    new_axes, new_quats = objects.landmarks.axes_and_quats()
+    new_axes, new_quats = judged.landmarks.axes_and_quats()
     for row in fates.confirmed:
         number = fates.objects[row]
-        updated = _looked_for(details[row], objects.sight, number)
+        updated = _looked_for(details[row], judged.sight, number)
         details[row] = replace(
             updated, baseline_deg=max(updated.baseline_deg or 0.0,
                                       float(evidence.baseline_deg[number])),
             last_seen=max(updated.last_seen or 0.0, float(evidence.last_seen[number])))
     for row in fates.moved:
-        details[row] = _in_new_place(details[row], objects.sight, evidence, fates.objects[row])
+        details[row] = _in_new_place(details[row], judged.sight, evidence, fates.objects[row])
     for row in fates.not_observed[judged.is_doubtful[fates.not_observed]].tolist():
         details[row] = _looked_for(details[row], judged.sight, row)
-    placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, views, objects, fates)
+    placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, views, judged, fates)
     for row, weight in placed.items():
         number = fates.objects[row]
-        centers[row] += weight * (objects.landmarks.centers[number] - centers[row])
+        centers[row] += weight * (judged.landmarks.centers[number] - centers[row])
         semi_axes[row], quats[row] = new_axes[number], new_quats[number]
         if row not in fates.moved:
-            sigma = objects.refits.sigmas[number]
+            sigma = judged.refits.sigmas[number]
             details[row] = replace(details[row], position_sigma=float(
                 sigma if weight == 1.0 else np.sqrt(weight) * sigma))
-    names = tuple(class_names[number] for number in objects.landmarks.classes[fates.new])
-    every = [details[row] for row in kept] + [
-        _in_new_place(objects.given[number], objects.sight, evidence, number)
-        for number in fates.new]
-    return LandmarkMap(
-        old.frame_id,
-        tuple(old.landmark_ids[row] for row in kept) + unused_ids(names, old.landmark_ids),
-        tuple(old.labels[row] for row in kept) + names,
-        tuple(old.class_ids[row] for row in kept) + names,
-        np.concatenate([centers[kept], objects.landmarks.centers[fates.new]]),
-        np.concatenate([semi_axes[kept], new_axes[fates.new]]),
-        np.concatenate([quats[kept], new_quats[fates.new]]),
-        tuple(every) if any(detail != LandmarkDetails() for detail in every) else ())
+    names = tuple(class_names[number] for number in judged.landmarks.classes[fates.new])
+    added = LandmarkMap(
+        old.frame_id, unused_ids(names, old.landmark_ids), names, names,
+        judged.landmarks.centers[fates.new], new_axes[fates.new], new_quats[fates.new],
+        tuple(_in_new_place(judged.finds.each[number - len(old)].details, judged.sight, evidence,
+                            number) for number in fates.new))
+    return replace(old, centers=centers, semi_axes=semi_axes, quats_xyzw=quats, details=tuple(
+        details)).select(fates.kept.tolist()).with_more(added)
 
 
 def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], first_new: int,
@@ -309,19 +303,19 @@ def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], f
     ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes
 
 
-def _refitted(known: alignment.OldMap, views: Views, objects: judging.Shown,
+def _refitted(known: alignment.OldMap, views: Views, judged: judging.Judgement,
               fates: identity.Fates) -> dict[int, float]:
     """Return the weight of the new centre for each confirmed landmark that is refitted."""
     rows = np.array([row for row in fates.confirmed
                      if known.map.details[row].position_sigma is not None
-                     and objects.refits.is_known[fates.objects[row]]], dtype=np.int64)
+                     and judged.refits.is_known[fates.objects[row]]], dtype=np.int64)
     numbers = fates.objects[rows]
-    renumbered = np.full(len(objects.owners) + 1, -1, dtype=np.int64)
+    renumbered = np.full(len(judged.sight.seen) + 1, -1, dtype=np.int64)
     renumbered[numbers] = np.arange(len(rows))
-    before = gather_evidence(views, known.landmarks.select(rows), renumbered[objects.shown])
+    before = gather_evidence(views, known.landmarks.select(rows), renumbered[judged.shown])
     # a fit to other sides of the object also differs, but then the old ellipsoid fits the boxes
     nudged = before.median_iou < MIN_MEDIAN_IOU
-    old_sigmas, new_sigmas = known.sigmas[rows], objects.refits.sigmas[numbers]
+    old_sigmas, new_sigmas = known.sigmas[rows], judged.refits.sigmas[numbers]
     weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + new_sigmas ** 2))
     better = nudged | (new_sigmas < old_sigmas)
     return dict(zip(rows[better].tolist(), weights[better].tolist(), strict=True))
@@ -344,12 +338,11 @@ def _in_new_place(details: LandmarkDetails, sight: Sight, evidence: Evidence, nu
                    last_seen=max(0.0, float(evidence.last_seen[number])))
 
 
-def _describe(old: LandmarkMap, updated: LandmarkMap, objects: judging.Shown,
-              fates: identity.Fates, judged: judging.Judgement
-              ) -> dict[str, tuple[UpdatedLandmark, ...]]:
+def _describe(old: LandmarkMap, updated: LandmarkMap, judged: judging.Judgement,
+              fates: identity.Fates) -> dict[str, tuple[UpdatedLandmark, ...]]:
     """Return the lists of an UpdateReport."""
     places = dict(zip(updated.landmark_ids, updated.centers, strict=True))
-    in_place, in_old_place = objects.sight.words, judged.sight.words
+    seen = judged.sight.words
 
     def listed(rows: NDArray[np.int64], words: Callable[[int], str]
                ) -> tuple[UpdatedLandmark, ...]:
@@ -366,22 +359,22 @@ def _describe(old: LandmarkMap, updated: LandmarkMap, objects: judging.Shown,
 
     def moved(row: int) -> str:
         number = fates.objects[row]
-        way = float(np.linalg.norm(objects.landmarks.centers[number] - old.centers[row]))
+        way = float(np.linalg.norm(judged.landmarks.centers[number] - old.centers[row]))
         left = ('an object that looks different is in its old place' if judged.is_there[row]
-                else f'old place {in_old_place(row)}')
+                else f'old place {seen(row)}')
         return (f'moved by {way:.2f} m: {left}; new place seen in '
-                f'{objects.sight.seen_frames[number]} of {objects.sight.expected_frames[number]}')
+                f'{judged.sight.seen_frames[number]} of {judged.sight.expected_frames[number]}')
 
     return {
-        'confirmed': listed(fates.confirmed, lambda row: in_place(fates.objects[row])),
+        'confirmed': listed(fates.confirmed, lambda row: seen(fates.objects[row])),
         'moved': listed(fates.moved, moved),
-        'missing': listed(fates.missing, in_old_place),
-        'not_observed': listed(fates.not_observed, in_old_place),
+        'missing': listed(fates.missing, seen),
+        'not_observed': listed(fates.not_observed, seen),
         'doubtful': listed(
             fates.not_observed[judged.is_doubtful[fates.not_observed]],
-            lambda row: f'{in_old_place(row)}: it is kept; delete it if it is gone'),
+            lambda row: f'{seen(row)}: it is kept; delete it if it is gone'),
         'new': tuple(UpdatedLandmark(
             updated.landmark_ids[place], updated.labels[place], updated.class_ids[place],
-            rounded(updated.centers[place]), 0.0, in_place(number),
+            rounded(updated.centers[place]), 0.0, seen(number),
             updated.details[place].last_seen)
             for place, number in enumerate(fates.new, len(updated) - len(fates.new)))}
