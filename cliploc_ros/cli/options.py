@@ -194,7 +194,8 @@ def layer_options(options: argparse.Namespace) -> 'tuple[LayerOptions | None, st
     distance_m, angle_deg = options.keyframes
     return LayerOptions(
         distance_m, angle_deg, options.keyframe_points, options.keyframe_images,
-        load_xfeat() if options.keyframe_features == XFEAT else features.SIFT), ''
+        load_xfeat() if options.keyframe_features == XFEAT else features.SIFT,
+        options.workers or 1, options.scheduler), ''
 
 
 def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:

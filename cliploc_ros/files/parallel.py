@@ -12,7 +12,7 @@ import signal
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -80,6 +80,23 @@ def run_tasks(make_work: MakeWork, tasks: Iterable[Any], *, workers: int = 1, sc
                 return
             for future in wait_for_some([*in_flight]):
                 yield in_flight.pop(future), future.result()
+
+
+def map_tasks(work: Callable[..., Any], tasks: Iterable[tuple[Any, ...]], **running: Any
+              ) -> Generator[Any]:
+    """Yield work(*task) of all tasks in their order; `running`: see run_tasks."""
+    waiting, following = dict[int, Any](), 0
+    with closing(run_tasks(partial(partial, _do_numbered, work), enumerate(tasks), **running)
+                 ) as finished:
+        for (number, _), result in finished:
+            waiting[number] = result
+            while following in waiting:
+                yield waiting.pop(following)
+                following += 1
+
+
+def _do_numbered(work: Callable[..., Any], task: tuple[int, tuple[Any, ...]]) -> Any:
+    return work(*task[1])
 
 
 class _Work:
