@@ -12,7 +12,7 @@ import signal
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -83,16 +83,11 @@ def run_tasks(make_work: MakeWork, tasks: Iterable[Any], *, workers: int = 1, sc
 
 
 def map_tasks(work: Callable[..., Any], tasks: Iterable[tuple[Any, ...]], **running: Any
-              ) -> Generator[Any]:
-    """Yield work(*task) of all tasks in their order; `running`: see run_tasks."""
-    waiting, following = dict[int, Any](), 0
-    with closing(run_tasks(partial(partial, _do_numbered, work), enumerate(tasks), **running)
-                 ) as finished:
-        for (number, _), result in finished:
-            waiting[number] = result
-            while following in waiting:
-                yield waiting.pop(following)
-                following += 1
+              ) -> list[Any]:
+    """Return work(*task) of all tasks in their order; `running`: see run_tasks."""
+    found = {number: result for (number, _), result in run_tasks(
+        partial(partial, _do_numbered, work), enumerate(tasks), **running)}
+    return [found[number] for number in range(len(found))]
 
 
 def _do_numbered(work: Callable[..., Any], task: tuple[int, tuple[Any, ...]]) -> Any:

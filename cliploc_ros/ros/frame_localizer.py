@@ -20,9 +20,9 @@ from rclpy.node import Node
 
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
-from cliploc_ros.core.geometry.transforms import invert_transform
+from cliploc_ros.core.geometry.transforms import invert_transform, shifted
 from cliploc_ros.core.kernels.compiled import KernelCache
-from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layer_of_map
+from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layers
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
 from cliploc_ros.core.map.joined_map import join_maps, parts_of
@@ -48,7 +48,7 @@ from cliploc_ros.models.protocols import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.parameters import RelocalizerParameters, map_files, path_of
+from cliploc_ros.ros.parameters import RelocalizerParameters, map_files
 from cliploc_ros.ros.visualization import SeenImage
 
 if TYPE_CHECKING:  # loaded where crops are compared
@@ -65,7 +65,7 @@ _LEAST_Z, _MOST_Y = 0.7, 0.3
 
 
 class Keyframes(NamedTuple):
-    """The keyframes of a map, and their file and its hash for the diagnostics."""
+    """The keyframes of the maps, and their files and hashes for the diagnostics."""
 
     localizer: KeyframeLocalizer
     file: str = ''
@@ -112,6 +112,9 @@ class FrameLocalizer:
         self.landmark_map = landmark_map
         self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
         self.observer = observer
+        #: The layer to draw; None with several maps
+        self.shown = None if keyframes is None or len(self.frame_ids) > 1 else \
+            keyframes.localizer.layer
         self.instants = Instants(landmark_map, options.matching != 'clip')
         self._options, self.watch = options, Watch(relocalizer)
         self.localizer = Localizer(relocalizer, None if keyframes is None else keyframes.localizer)
@@ -153,9 +156,8 @@ class FrameLocalizer:
             seen = replace(seen, similarities=np.asarray(seen.similarities)[
                 :, own.first:own.first + len(own.landmark_map)])
         names = [camera_frame.camera_name for camera_frame in query.frames]
-        layer = None if self.keyframes is None else self.keyframes.localizer.layer
         return Localized(
-            found, own.landmark_map, SeenImage(query.images[-1], seen, layer), for_filter,
+            found, own.landmark_map, SeenImage(query.images[-1], seen, self.shown), for_filter,
             (*frame.left_out, *(beside.camera for beside, _ in known.beside
                                             if beside.camera not in names)), query)
 
@@ -195,9 +197,8 @@ class FrameLocalizer:
         query = self.instants.query(frame, parameters, KnownBefore(state))
         observation = localizer.with_free_crops(query, 0, self.observer) \
             if can_do_without_crops(options) else by_classes(query.newest, len(self.landmark_map))
-        pose = map_from_camera.copy()
-        pose[:3, 3] += shift
-        return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
+        return self.watch.look(observation, shifted(map_from_camera, shift), query.images[-1],
+                               localizer.recognizer(query))
 
     def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
         """Return the localizer. If the options changed, it uses them, and the watch is new."""
@@ -363,29 +364,30 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
     return FrameLocalizer(landmark_map, observer, relocalizer, options, map_hash, keyframes)
 
 
-def keyframes_path(parameters: RelocalizerParameters) -> Path | None:
-    """Return the path of the layer in keyframes_file, or next to the map; None without a layer."""
-    named, map_file = parameters.keyframes_file, parameters.map_file
+def keyframes_paths(parameters: RelocalizerParameters) -> list[Path]:
+    """Return the paths of keyframes_file, or next to the maps; none if there is no layer."""
+    named = parameters.keyframes_file
     if named != NEXT_TO_MAP:
-        return Path(named) if named else None
-    path = layer_path(path_of(map_file)) if map_file else None
-    return path if path is not None and path.exists() else None
+        return [Path(named)] if named else []
+    paths = [*map(layer_path, map_files(parameters))]
+    return paths if any(path.exists() for path in paths) else []
 
 
 def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
                    ) -> Keyframes | None:
-    """Load the layer of keyframes_path; None if there is no layer or it is invalid.
+    """Load the layers of keyframes_paths; None if there is no layer or one is invalid.
 
-    If the layer is invalid or its features cannot be computed here, the error is logged, and the
+    If a layer is invalid or its features cannot be computed here, the error is logged, and the
     relocalizer uses the landmarks only.
     """
-    path = keyframes_path(parameters)
-    if path is None:
+    paths = keyframes_paths(parameters)
+    if not paths:
         return None
     from cliploc_ros.models.xfeat import feature_kinds
     try:
-        layer = load_layer_of_map(path, landmark_map, feature_kinds(parameters.cache_dir))
-        return Keyframes(KeyframeLocalizer(layer), str(path), layer_hash(path))
+        layer = load_layers(paths, landmark_map, feature_kinds(parameters.cache_dir))
+        return Keyframes(KeyframeLocalizer(layer), *(', '.join(map(str, texts)) for texts in (
+            paths, map(layer_hash, paths))))
     except (MapError, ModelError) as error:
         logger.error('localizing without keyframes: %s', error)
         return None

@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,8 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import are_rigid
+from cliploc_ros.core.geometry.transforms import are_rigid, shifted
 from cliploc_ros.core.keyframes.features import ONLY_SIFT, SIFT, FeatureKind, FeatureKinds
+from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.parameter_file import check_set
 from cliploc_ros.errors import CameraError, MapError
@@ -77,6 +79,9 @@ class KeyframeLayer:
     camera_rows: NDArray[np.int64] | None = None
     kind: FeatureKind = SIFT  #: Kind of the descriptors
     set_digest: str = ''  #: Digest of the map that the layer was written with; '' if unknown
+    #: Joined layers of several maps, each with its shift (3,), see MapPart. Poses, cameras and
+    #: deviation are then those of all keyframes, and everything else is only in the parts.
+    parts: tuple[tuple['KeyframeLayer', NDArray[np.float64]], ...] = ()
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -95,7 +100,7 @@ class KeyframeLayer:
 
     def prepare(self) -> None:
         """Compute the indices in advance, so that the first request does not wait for them."""
-        _ = self._profiles, self._unit_vocabulary
+        _ = self.parts or (self._profiles, self._unit_vocabulary)
 
     def camera_of(self, keyframe: int) -> Camera:
         """Return the camera that took a keyframe."""
@@ -242,6 +247,28 @@ def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds
     return layer
 
 
+def load_layers(paths: Sequence[Path], landmark_map: LandmarkMap, kinds: FeatureKinds = ONLY_SIFT
+                ) -> KeyframeLayer:
+    """Read the layer of each part of a map, and join them; see load_layer_of_map.
+
+    MapError: a layer is missing or invalid. With the keyframes of some maps only, a place that
+    looks the same in another map, such as a staircase, would seem unique.
+    """
+    parts = parts_of(landmark_map)
+    layers = [load_layer_of_map(path, part.landmark_map, kinds)
+              for path, part in zip(paths, parts, strict=False)]
+    if len(layers) < len(parts) or len({layer.kind.name for layer in layers}) > 1:
+        raise MapError(f'{", ".join(map(str, paths))}: {len(parts)} maps need a layer each, of '
+                       'the same --keyframe-features, next to the maps')
+    shifts = [part.shift for part in parts]
+    return layers[0] if len(layers) == 1 else replace(
+        layers[0], cameras=sum((layer.cameras for layer in layers), ()),
+        map_from_camera=np.concatenate([*map(shifted, (
+            layer.map_from_camera for layer in layers), shifts)]),
+        deviation_per_metre=max(layer.deviation_per_metre for layer in layers),
+        parts=tuple(zip(layers, shifts, strict=True)))
+
+
 def layer_hash(path: Path) -> str:
     """Return a digest of a layer file, from the names, sizes and checksums of its arrays.
 
@@ -281,7 +308,7 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
                          f'{kind.dimensions} for kind {name}')
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
-                         arrays.pop('landmark_centers'), cameras, **arrays,
+                         arrays.pop('landmark_centers'), cameras, **arrays, parts=(),
                          deviation_per_metre=deviation, kind=kind,
                          set_digest=str(header.get('set', '')))
 

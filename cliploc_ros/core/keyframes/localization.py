@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform, shifted
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
@@ -158,10 +158,17 @@ class _Place(NamedTuple):
 
 
 class KeyframeLocalizer:
-    """Localizes images in a layer of keyframes."""
+    """Localizes images in a layer of keyframes, or in the joined layers of several maps.
+
+    Each joined layer is searched in the coordinate frame of its map, since single precision is too
+    coarse for the joined map. The time grows with their number.
+    """
 
     def __init__(self, layer: KeyframeLayer) -> None:
         self.layer = layer
+        firsts = np.cumsum([0, *(len(part) for part, _ in layer.parts)]).tolist()
+        self._parts = [(KeyframeLocalizer(part), shift, first)
+                       for (part, shift), first in zip(layer.parts, firsts, strict=False)]
         layer.prepare()
 
     def localize_features(self, features: Features, camera: Camera,
@@ -190,6 +197,11 @@ class KeyframeLocalizer:
         MapError
             The features are not of the kind of the layer.
         """
+        if self._parts:
+            return _joined([part.localize_features(
+                features, camera, [shifted(guess, -shift) for guess in guesses], deadline,
+                constraint, fast and fast.shifted(-shift)).shifted(shift, first)
+                for part, shift, first in self._parts])
         kind, is_thorough = self.layer.kind, fast is not None
         if features.descriptors.shape[1] != kind.dimensions:
             raise MapError(f'features have {features.descriptors.shape[1]} dimensions, but the '
@@ -323,6 +335,9 @@ class KeyframeLocalizer:
         It is the share of cells of the image in which keyframes near the pose predict points. If
         it is 0, no keyframe is near: failed recognition is then no evidence against this place.
         """
+        if self._parts:  # the keyframes of other maps are far away
+            return max(part.coverage(shifted(map_from_camera, -shift), camera)
+                       for part, shift, _ in self._parts)
         near = keyframes_near(self.layer.map_from_camera, map_from_camera)
         return float(self._expects(near, map_from_camera, camera).mean())
 
@@ -382,6 +397,17 @@ class KeyframeLocalizer:
         position = _KEYFRAME_M**2 + (self.layer.deviation_per_metre * distance) ** 2
         rotation = _KEYFRAME_RAD**2 + (PER_RADIAN * angle) ** 2
         return np.diag(np.repeat([position, rotation], 3))
+
+
+def _joined(found: list[Recognition]) -> Recognition:
+    """Return the places in all maps, those of the map with the most inliers first.
+
+    If one search is incomplete, rivals may be missing, and there are no places.
+    """
+    found.sort(key=lambda seen: (seen.is_complete, -max((
+        place.inliers for place in seen.places), default=0), seen.outside_m is None))
+    return found[0]._replace(places=tuple(
+        place for seen in found for place in seen.places if found[0].is_complete))
 
 
 def _places(first: _Place | None, matched: _Matched, look: _Look

@@ -97,14 +97,9 @@ class _Keyframe(NamedTuple):
     camera: Camera  #: Camera of the undistorted image
     stamp_ns: int
 
-    @property
-    def has_depth(self) -> bool:
-        """Return whether depth gives the points."""
-        return bool(np.isfinite(self.depths).any())
-
 
 # map_tasks with the workers of the user.
-_Run = Callable[..., Iterator[Any]]
+_Run = Callable[..., list[Any]]
 
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
@@ -160,7 +155,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         np.concatenate([points for _, points, _ in chosen]).astype(np.float32),
         descriptors, layer.nearest_words(kind.units(descriptors), kind.units(vocabulary)
                                          ).astype(np.uint16), vocabulary,
-        layer.FROM_DEPTH if any(keyframe.has_depth for keyframe in seen)
+        layer.FROM_DEPTH if any(np.isfinite(keyframe.depths).any() for keyframe in seen)
         else layer.TRIANGULATED,
         camera_rows=None if len(different) == 1 else np.array(
             [different.index(own) for own in cameras]), kind=kind)
@@ -175,13 +170,13 @@ def _points_of(seen: Sequence[_Keyframe], kind: FeatureKind, run: _Run
                ) -> list[NDArray[np.float64]]:
     """Return the points (n, 3) of each keyframe in its camera's coordinate frame; NaN: unknown."""
     images = [keyframe.posed for keyframe in seen]
-    triangulated = run(partial(triangulate, kind=kind), (
-        (keyframe.posed, [images[row] for row in near])
-        for keyframe, near in zip(seen, neighbours_of(images), strict=True)
-        if not keyframe.has_depth))
-    return [np.column_stack([keyframe.posed.bearings, np.ones(len(keyframe.depths))])
-            * keyframe.depths[:, None] if keyframe.has_depth else next(triangulated)
-            for keyframe in seen]
+    found = [np.column_stack([keyframe.posed.bearings, np.ones(len(keyframe.depths))])
+             * keyframe.depths[:, None] for keyframe in seen]
+    without = [row for row, points in enumerate(found) if not np.isfinite(points).any()]
+    neighbours = neighbours_of(images)
+    triangulated = dict(zip(without, run(partial(triangulate, kind=kind), (
+        (images[row], neighbours[row]) for row in without)), strict=True))
+    return [triangulated.get(row, points) for row, points in enumerate(found)]
 
 
 def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
@@ -192,8 +187,8 @@ def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
     images, ratios = [keyframe.posed for keyframe in seen], list[float]()
     neighbours = neighbours_of(images)
     for number in range(0, len(seen), 1 + len(seen) // _COMPARED):
-        if seen[number].has_depth:
-            found = triangulate(images[number], [images[row] for row in neighbours[number]], kind
+        if np.isfinite(seen[number].depths).any():
+            found = triangulate(images[number], neighbours[number], kind
                                 )[:, 2] / seen[number].depths
             ratios += found[np.isfinite(found)].tolist()
     if len(ratios) >= _LEAST_POINTS:
@@ -314,8 +309,8 @@ def _small_jpeg(frame: PosedImage) -> bytes:
     return bytes(content)
 
 
-def neighbours_of(images: Sequence[PosedFeatures]) -> list[NDArray[np.int64]]:
-    """Return the rows of the images to match each image with.
+def neighbours_of(images: Sequence[PosedFeatures]) -> list[list[PosedFeatures]]:
+    """Return the images to match each image with.
 
     These are the nearest images with a similar direction, the nearest first.
     """
@@ -327,7 +322,7 @@ def neighbours_of(images: Sequence[PosedFeatures]) -> list[NDArray[np.int64]]:
         cosines = 0.5 * (np.einsum('kij,ij->k', poses[near, :3, :3], pose[:3, :3]) - 1.0)
         fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
         order = np.argsort(distances, kind='stable')
-        found.append(near[order[fit[order]][:_NEIGHBOURS]])
+        found.append([images[row] for row in near[order[fit[order]][:_NEIGHBOURS]]])
     return found
 
 
