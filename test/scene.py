@@ -19,14 +19,14 @@ from cliploc_ros.core.geometry.transforms import (
     make_transform,
     transform_from_pose,
 )
-from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT
-from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, nearest_words, save_layer
+from cliploc_ros.core.keyframes.features import DIMENSIONS
+from cliploc_ros.core.keyframes.layer import KeyframeLayer, layer_path, save_layer
 from cliploc_ros.core.map import map_file
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.offline.recording.keyframe_layer import learn_words
+from cliploc_ros.offline.recording.layer_words import with_words
 
 CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
 #: Looks along the map's z axis, not level: rotate room and pose first if a vertical matters.
@@ -144,14 +144,12 @@ def make_layer(room: LandmarkMap, keyframes=6, points=40) -> KeyframeLayer:
     """Return keyframes with random points that no image shows."""
     rng, total = np.random.default_rng(0), keyframes * points
     descriptors = rng.integers(0, 120, (total, DIMENSIONS)).astype(np.uint8)
-    vocabulary = learn_words(descriptors)
-    return KeyframeLayer(
+    return with_words(KeyframeLayer(
         room.frame_id, room.landmark_ids, room.centers.astype(np.float32), (CAMERA,),
         np.tile(np.eye(4), (keyframes, 1, 1)), np.arange(0, total + 1, points),
         rng.integers(0, 10_000, (total, 2)).astype(np.uint16),
         rng.normal(size=(total, 3)).astype(np.float32), descriptors,
-        nearest_words(SIFT.units(descriptors), SIFT.units(vocabulary)).astype(np.uint16),
-        vocabulary)
+        np.zeros(total, np.uint16), descriptors[:1]))
 
 
 def write_map(room: LandmarkMap, path) -> None:

@@ -213,7 +213,7 @@ def test_the_layer_of_another_map_is_named(file, other, message):
 
 
 @pytest.mark.parametrize(('changes', 'message'), [
-    ({'header': {'version': 2}}, 'version 2'),
+    ({'header': {'version': 3}}, 'version 3'),
     ({'header': {'descriptors': []}}, r"kind '\[\]', expected rootsift"),
     ({'header': {'camera': 7}}, 'camera'), ({'points': None}, 'points'),
     ({'points': np.zeros((3, 3), np.float32)}, r'points has shape'),

@@ -210,7 +210,7 @@ class Says:
     def __init__(self, place):
         self._place = place
         self.layer = SimpleNamespace(map_from_camera=np.empty((0, 4, 4)), kind=SIFT,
-                                     deviation_per_metre=0.01)
+                                     deviations=lambda rows: np.full(len(rows), 0.01))
 
     def localize_features(self, *_):
         return Recognition((self._place,))

@@ -251,8 +251,8 @@ class Comparison:
         if (self.place is None or self._recognizer is None or passed is None
                 or passed[0].recognized is None):
             return None
-        return compare_motion(self._recognizer.deviation_per_metre, passed[0].recognized,
-                              self.place, passed[1])
+        return compare_motion(self._recognizer.deviation_per_metre(self.place),
+                              passed[0].recognized, self.place, passed[1])
 
     def _not_mirrored(self, by_points: float) -> float:
         """Return the probability that the image is not mirrored.
@@ -290,7 +290,7 @@ class Comparison:
         Only confident recognitions count here. The comparison itself includes the evidence of a
         dozen points.
         """
-        chance = max((1.0 / (1.0 + math.exp(-points_utility(contender.recognized)))
+        chance = max((1.0 / (1.0 + math.exp(-max(points_utility(contender.recognized), -50.0)))
                       for contender in self.contenders if contender.recognized is not None),
                      default=0.0)
         return 1.0 if self.place or chance < self._joined.options.min_confidence else 1.0 - chance

@@ -4,9 +4,12 @@
 
 Images are compared by the visual words of their features (Sivic and Zisserman, "Video Google",
 2003): the descriptors of a layer are clustered, each cluster is a word, and the similarity of two
-images is that of their word histograms. Words that occur in many keyframes have less weight.
+images is that of their word histograms. Words that occur in many keyframes have less weight. The
+words of a large layer have two levels (Nister and Stewenius, "Scalable recognition with a
+vocabulary tree", 2006), and its descriptors are compressed: to the word and a product-quantized
+residual (Jegou et al., "Product quantization for nearest neighbor search", 2011).
 
-The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Its arrays are read completely.
+The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Large arrays of points stay in it.
 """
 
 import hashlib
@@ -17,11 +20,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_array, csr_array
 
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import are_rigid, shifted
@@ -41,18 +45,34 @@ _SAME_FOCAL = 0.02
 FROM_DEPTH, TRIANGULATED = 0.1, 0.02
 #: Pixel coordinates of the layer are stored in sixteenths.
 PIXEL_SCALE = 16.0
-VERSION = 1
+#: Words of a small layer; the words of a larger one are a multiple, in as many groups. 1,024 words
+#: find the keyframes of the kitchen as well as comparing all descriptors.
+WORDS = 1024
+#: Version 1 has one deviation_per_metre, in its header, and neither sources nor compression.
+VERSION = 2
 _CAMERA = ('width', 'height', 'fx', 'fy', 'cx', 'cy')
 _HASH_DIGITS = 12
 _MOST_DEVIATION = 1.0
 # If landmarks of the same name have moved farther than this (median), the layer belongs to another
 # map [m]. An update or an edit moves few landmarks.
 _MOST_MOVED_M = 0.25
+_OF_POINTS = ('pixels', 'points', 'descriptors', 'words')
+_OF_KEYFRAMES = ('map_from_camera', 'camera_rows', 'source_rows', 'deviation_per_metre')
+
+
+class Source(NamedTuple):
+    """A recording that keyframes are from."""
+
+    name: str
+    date: str = ''  #: As text, such as '2026-11-29'; '' if unknown
 
 
 @dataclass(frozen=True)
 class KeyframeLayer:
-    """K keyframes with n points in total."""
+    """K keyframes with n points in total.
+
+    Arrays of a large file are StoredArrays: slice them, or convert them with np.asarray.
+    """
 
     frame_id: str  #: Coordinate frame of the poses: the map's
     #: Landmarks of the map when the layer was made; they identify the map
@@ -64,13 +84,14 @@ class KeyframeLayer:
     offsets: NDArray[np.int64]
     #: (n, 2): position of each point in the undistorted image of its keyframe [1/16 px]
     pixels: NDArray[np.uint16]
-    points: NDArray[np.float32]  #: (n, 3): in the optical coordinate frame of their keyframe [m]
-    descriptors: NDArray[np.uint8]  #: (n, d)
+    #: (n, 3): in the optical coordinate frame of their keyframe [m]; float16 in a compressed layer
+    points: NDArray[np.floating]
+    descriptors: NDArray[np.uint8]  #: (n, d); (n, c) codes in a compressed layer
     words: NDArray[np.uint16]  #: (n,): visual word of each descriptor
     vocabulary: NDArray[np.uint8]  #: (W, d): mean descriptor of each word
-    #: Standard deviation on each axis of a pose found from a keyframe one metre away [m], due to
-    #: the common error of the keyframe's points
-    deviation_per_metre: float = FROM_DEPTH
+    #: (K,), or one for all: standard deviation on each axis of a pose found from a keyframe one
+    #: metre away [m], due to the common error of the keyframe's points
+    deviation_per_metre: NDArray[np.float64] | float = FROM_DEPTH
     #: (b,): small undistorted JPEG images, concatenated: for display only
     images: NDArray[np.uint8] | None = None
     #: (K + 1,): keyframe k has the bytes [image_offsets[k], image_offsets[k + 1])
@@ -79,24 +100,52 @@ class KeyframeLayer:
     camera_rows: NDArray[np.int64] | None = None
     kind: FeatureKind = SIFT  #: Kind of the descriptors
     set_digest: str = ''  #: Digest of the map that the layer was written with; '' if unknown
+    #: (c, 256, d / c): what each code adds to the mean of the word; None: not compressed
+    codebook: NDArray[np.int16] | None = None
+    sources: tuple[Source, ...] = ()  #: Recordings of the keyframes; empty if unknown
+    #: (K,): source of each keyframe; None: all are from the first one
+    source_rows: NDArray[np.int64] | None = None
+    #: (K,): in a view, keyframe k has the points [offsets[k], ends[k])
+    ends: NDArray[np.int64] | None = None
     #: Joined layers of several maps, each with its shift (3,), see MapPart. Poses, cameras and
-    #: deviation are then those of all keyframes, and everything else is only in the parts.
+    #: deviations are then those of all keyframes, and everything else is only in the parts.
     parts: tuple[tuple['KeyframeLayer', NDArray[np.float64]], ...] = ()
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
         return len(self.map_from_camera)
 
-    def select(self, chosen: NDArray[np.bool_]) -> 'KeyframeLayer':
-        """Return a layer of the keyframes that a mask (K,) selects, without their small images."""
-        counts = np.diff(self.offsets)
-        rows = np.repeat(chosen, counts)
+    def select(self, chosen: NDArray[np.bool_], points: NDArray[np.bool_] | None = None
+               ) -> 'KeyframeLayer':
+        """Return a layer of the keyframes that a mask (K,) selects, without their small images.
+
+        A mask of points (n,) leaves out others.
+        """
+        parts = [np.arange(rows.start, rows.stop) for rows in map(
+            self.rows, np.nonzero(chosen)[0].tolist())]
+        if points is not None:
+            parts = [part[points[part]] for part in parts]
+        rows = np.concatenate([np.empty(0, dtype=np.int64), *parts])
+        return replace(self.view(chosen), offsets=np.cumsum([0, *map(len, parts)]), ends=None, **{
+            name: getattr(self, name)[rows] for name in _OF_POINTS})
+
+    def view(self, chosen: NDArray[np.bool_]) -> 'KeyframeLayer':
+        """Like select, but the layers share the arrays of points; a view cannot be written."""
+        ends = self.offsets[1:] if self.ends is None else self.ends
+        columns: dict[str, Any] = {name: array[chosen] for name in _OF_KEYFRAMES if isinstance(
+            array := getattr(self, name), np.ndarray)}
+        return replace(self, offsets=self.offsets[:len(self)][chosen], ends=ends[chosen],
+                       images=None, image_offsets=None, **columns)
+
+    def plain(self) -> 'KeyframeLayer':
+        """Return the layer in memory, with uncompressed descriptors, to join or to change it."""
+        if self.ends is not None:
+            return self.select(np.ones(len(self), dtype=np.bool_)).plain()
         return replace(
-            self, map_from_camera=self.map_from_camera[chosen],
-            offsets=np.cumsum([0, *counts[chosen]]), images=None, image_offsets=None,
-            camera_rows=None if self.camera_rows is None else self.camera_rows[chosen],
-            **{name: getattr(self, name)[rows] for name in ('pixels', 'points', 'descriptors',
-                                                            'words')})
+            self, pixels=np.asarray(self.pixels), points=np.asarray(self.points, np.float32),
+            descriptors=np.concatenate([self.descriptors_of(self.rows(keyframe))
+                                        for keyframe in range(len(self))]),
+            images=None if self.images is None else np.asarray(self.images), codebook=None)
 
     def prepare(self) -> None:
         """Compute the indices in advance, so that the first request does not wait for them."""
@@ -118,7 +167,17 @@ class KeyframeLayer:
 
     def rows(self, keyframe: int) -> slice:
         """Return the slice of the points of a keyframe."""
-        return slice(int(self.offsets[keyframe]), int(self.offsets[keyframe + 1]))
+        ends = self.offsets[1:] if self.ends is None else self.ends
+        return slice(int(self.offsets[keyframe]), int(ends[keyframe]))
+
+    def source_of(self, keyframe: int) -> Source | None:
+        """Return the recording of a keyframe; None if it is unknown."""
+        row = 0 if self.source_rows is None else int(self.source_rows[keyframe])
+        return self.sources[row] if self.sources else None
+
+    def deviations(self, keyframes: Any = slice(None)) -> NDArray[np.float64]:
+        """Return the deviation_per_metre (k,) of keyframes, by default of all."""
+        return np.broadcast_to(self.deviation_per_metre, len(self))[keyframes]
 
     def image_rgb(self, keyframe: int) -> NDArray[np.uint8] | None:
         """Return the small image (h, w, 3) of a keyframe; None if it is missing or damaged."""
@@ -136,7 +195,15 @@ class KeyframeLayer:
 
     def unit_descriptors(self, keyframe: int) -> NDArray[np.float32]:
         """Return the descriptors (m, d) of a keyframe as unit vectors."""
-        return self.kind.units(np.asarray(self.descriptors[self.rows(keyframe)]))
+        return self.kind.units(self.descriptors_of(self.rows(keyframe)))
+
+    def descriptors_of(self, rows: Any) -> NDArray[np.uint8]:
+        """Return the descriptors (m, d) of points, given as a slice or an array."""
+        codes = np.asarray(self.descriptors[rows])
+        if self.codebook is None:
+            return codes
+        added = self.codebook[np.arange(codes.shape[1]), codes].reshape(len(codes), -1)
+        return np.clip(self.vocabulary[self.words[rows]] + added, 0, 255).astype(np.uint8)
 
     def similarities(self, descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the similarity (K,) of each keyframe to an image.
@@ -147,43 +214,66 @@ class KeyframeLayer:
             Descriptors of the image as unit vectors.
         """
         profiles, weights = self._profiles
-        counts = np.bincount(nearest_words(descriptors, self._unit_vocabulary),
-                             minlength=len(self.vocabulary))
-        return np.asarray(profiles @ (np.sqrt(counts) * weights).astype(np.float32))
+        found, counts = np.unique(nearest_words(descriptors, self._unit_vocabulary),
+                                  return_counts=True)
+        return np.asarray(profiles[:, found] @ (np.sqrt(counts) * weights[found]).astype(
+            np.float32))
 
     @cached_property
     def _unit_vocabulary(self) -> NDArray[np.float32]:
         return self.kind.units(self.vocabulary)
 
     @cached_property
-    def _profiles(self) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Return the weighted word histograms (K, W) as unit rows, and the weights (W,)."""
-        size = len(self.vocabulary)
-        profiles = np.zeros((len(self), size), dtype=np.float32)
-        for row in range(len(self)):
-            words = np.asarray(self.words[self.rows(row)], dtype=np.int64)
-            profiles[row] = np.sqrt(np.bincount(words, minlength=size)[:size])
+    def _profiles(self) -> tuple[csc_array, NDArray[np.float64]]:
+        """Return the weighted word histograms (K, W) as unit rows, and the weights (W,).
+
+        They are stored by word, so that a request reads those of its words only.
+        """
+        words = [self.words[self.rows(row)] for row in range(len(self))]
+        starts = np.cumsum([0, *map(len, words)])
+        profiles = csr_array((np.ones(starts[-1], np.float32), np.concatenate(words), starts),
+                             (len(self), len(self.vocabulary)))
+        profiles.sum_duplicates()
         # + 1, so that the weights of a layer with a single keyframe are not zero
-        weights = np.log((len(self) + 1.0) / np.maximum(1, (profiles > 0).sum(axis=0)))
-        profiles *= weights.astype(np.float32)
-        profiles /= np.maximum(np.linalg.norm(profiles, axis=1, keepdims=True), 1e-9)
-        return profiles, weights
+        weights = np.log((len(self) + 1.0) / np.maximum(1, np.bincount(
+            profiles.indices, minlength=len(self.vocabulary))))
+        profiles.data = np.sqrt(profiles.data) * weights.astype(np.float32)[profiles.indices]
+        norms = np.sqrt(profiles.multiply(profiles).sum(axis=1))
+        profiles.data /= np.repeat(np.maximum(norms, 1e-9), np.diff(profiles.indptr))
+        return profiles.tocsc(), weights
 
 
 def nearest_words(descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
                   ) -> NDArray[np.int64]:
-    """Return the index (n,) of the most similar word of each descriptor; both are unit vectors."""
-    found = [np.argmax(part @ vocabulary.T, axis=1) for part in np.array_split(
-        descriptors.reshape(-1, vocabulary.shape[1]), 1 + len(descriptors) // 4096)]
+    """Return the index (n,) of the most similar word of each descriptor; both are unit vectors.
+
+    Of more than WORDS words, those of the group with the most similar mean are compared.
+    """
+    groups = vocabulary.reshape(min(WORDS, len(vocabulary)), -1, vocabulary.shape[1])
+    means, size = groups[:, 0], groups.shape[1]
+    if size > 1:
+        means = groups.sum(axis=1)
+        means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
+    found = []
+    for part in np.array_split(descriptors.reshape(-1, vocabulary.shape[1]),
+                               1 + len(descriptors) // 4096):
+        nearest = np.argmax(part @ means.T, axis=1)
+        if size > 1:
+            nearest = size * nearest + np.argmax(np.matmul(
+                groups[nearest], part[:, :, None])[..., 0], axis=1)
+        found.append(nearest)
     return np.concatenate(found)
 
 
 def _check_words(name: str, arrays: Arrays) -> None:
-    if (arrays[name] >= len(arrays['vocabulary'])).any():
+    count = len(arrays['vocabulary'])
+    if count > WORDS and count % WORDS:
+        raise ArrayError(f'array vocabulary has {count} words, expected a multiple of {WORDS}')
+    if (arrays[name] >= count).any():
         raise ArrayError(f'array {name} contains a word that the vocabulary lacks')
 
 
-# K keyframes, n points, L landmarks, W words, b bytes.
+# K keyframes, n points, L landmarks, W words, b bytes, c codes.
 _SCHEMA = Schema('file of keyframes', {
     'header': Field('text'),
     'landmark_ids': Field('text', ('L',)),
@@ -191,13 +281,17 @@ _SCHEMA = Schema('file of keyframes', {
     'map_from_camera': Field('float64', ('K', 4, 4), (
         FINITE, Check('is not a rigid transform', lambda poses: ~are_rigid(poses)))),
     'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
-    'pixels': Field('uint16', ('n', 2)),
-    'points': Field('float32', ('n', 3), (FINITE,)),
-    'descriptors': Field('uint8', ('n', 'd')),
+    'pixels': Field('uint16', ('n', 2), may_stay=True),
+    'points': Field('floats', ('n', 3), (FINITE,), may_stay=True),
+    'descriptors': Field('uint8', ('n', 'c'), may_stay=True),
     'words': Field('uint16', ('n',), (_check_words,)),
     'vocabulary': Field('uint8', ('W', 'd')),
+    'codebook': Field('int16', ('c', 256, 's'), is_optional=True),  # if they are compressed
+    # missing in version 1
+    'deviation_per_metre': Field('float64', ('K',), is_optional=True),
+    'source_rows': Field('int64', ('K',), is_optional=True),  # missing if there is one source
     # both missing unless images were requested
-    'images': Field('uint8', ('b',), is_optional=True),
+    'images': Field('uint8', ('b',), is_optional=True, may_stay=True),
     'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
     # missing if there is a single camera; the header contains the cameras
     'camera_rows': Field('int64', ('K',), is_optional=True),
@@ -223,11 +317,12 @@ def save_layer(path: Path, layer: KeyframeLayer) -> None:
     first, *others = ({name: getattr(camera, name) for name in _CAMERA}
                       for camera in layer.cameras)
     header = {'version': VERSION, 'descriptors': layer.kind.name, 'frame_id': layer.frame_id,
-              'deviation_per_metre': layer.deviation_per_metre, 'camera': first,
-              'other_cameras': others, 'set': layer.set_digest}
+              'sources': layer.sources, 'camera': first, 'other_cameras': others,
+              'set': layer.set_digest}
+    layer = replace(layer, deviation_per_metre=layer.deviations())
     _SCHEMA.write(path, {'header': np.array(json.dumps(header))} | {
-        name: np.asarray(getattr(layer, name), np.str_ if entry.type == 'text' else entry.type)
-        for name, entry in _SCHEMA.fields.items()
+        name: np.asarray(getattr(layer, name), {'text': np.str_, 'floats': None}.get(
+            entry.type, entry.type)) for name, entry in _SCHEMA.fields.items()
         if name != 'header' and getattr(layer, name) is not None})
 
 
@@ -265,7 +360,7 @@ def load_layers(paths: Sequence[Path], landmark_map: LandmarkMap, kinds: Feature
         layers[0], cameras=sum((layer.cameras for layer in layers), ()),
         map_from_camera=np.concatenate([*map(shifted, (
             layer.map_from_camera for layer in layers), shifts)]),
-        deviation_per_metre=max(layer.deviation_per_metre for layer in layers),
+        deviation_per_metre=np.concatenate([layer.deviations() for layer in layers]),
         parts=tuple(zip(layers, shifts, strict=True)))
 
 
@@ -287,30 +382,36 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
         version, name = header.get('version'), str(header.get('descriptors'))
     except (AttributeError, ValueError) as error:
         raise ArrayError(f'its header is not a JSON object ({error})') from error
-    if version != VERSION:
-        raise ArrayError(f'has version {version!r}, expected {VERSION}')
+    if version not in (1, VERSION):
+        raise ArrayError(f'has version {version!r}, expected up to {VERSION}')
     if name not in kinds:
         raise ArrayError(f'has descriptors of kind {name!r}, expected {" or ".join(kinds)}')
     try:
         cameras = tuple(Camera(*(numbers[name] for name in _CAMERA))
                         for numbers in (header['camera'], *header.get('other_cameras', ())))
-        deviation = float(header['deviation_per_metre'])
+        sources = tuple(Source(*map(str, source)) for source in header.get('sources', ()))
+        if 'deviation_per_metre' not in arrays:
+            arrays['deviation_per_metre'] = np.full(
+                len(arrays['offsets']) - 1, float(header['deviation_per_metre']))
     except (CameraError, KeyError, TypeError, ValueError) as error:
         raise ArrayError(f'has no valid camera or deviation in its header ({error})') from error
-    if not 0.0 <= deviation <= _MOST_DEVIATION:
-        raise ArrayError(f'deviation_per_metre is {deviation}, expected 0 to {_MOST_DEVIATION}')
-    rows = arrays.get('camera_rows', np.zeros(1, dtype=np.int64))
-    if not ((rows >= 0) & (rows < len(cameras))).all():
-        raise ArrayError(f'array camera_rows has an entry outside the {len(cameras)} cameras')
-    kind, dimensions = kinds[name](), arrays['descriptors'].shape[1]
-    if dimensions != kind.dimensions:
+    deviations = arrays['deviation_per_metre']
+    if not ((deviations >= 0.0) & (deviations <= _MOST_DEVIATION)).all():
+        raise ArrayError(f'deviation_per_metre is not 0 to {_MOST_DEVIATION}')
+    for what, count in (('camera', len(cameras)), ('source', len(sources) or 1)):
+        rows = arrays.get(f'{what}_rows', np.zeros(1, dtype=np.int64))
+        if not ((rows >= 0) & (rows < count)).all():
+            raise ArrayError(f'array {what}_rows has an entry outside the {count} {what}s')
+    kind, dimensions = kinds[name](), arrays['vocabulary'].shape[1]
+    parts, _, length = (arrays['codebook'].shape if 'codebook' in arrays
+                        else (arrays['descriptors'].shape[1], 1, 1))
+    if {dimensions, parts * length} != {kind.dimensions}:
         raise ArrayError(f'has descriptors of {dimensions} dimensions, expected '
                          f'{kind.dimensions} for kind {name}')
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
-                         arrays.pop('landmark_centers'), cameras, **arrays, parts=(),
-                         deviation_per_metre=deviation, kind=kind,
-                         set_digest=str(header.get('set', '')))
+                         arrays.pop('landmark_centers'), cameras, **arrays, kind=kind,
+                         set_digest=str(header.get('set', '')), sources=sources, parts=())
 
 
 def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:

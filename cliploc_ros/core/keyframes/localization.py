@@ -391,10 +391,11 @@ class KeyframeLocalizer:
         used = np.nonzero(counts)[0]
         shares = counts[used] / counts.sum()
         poses = self.layer.map_from_camera[used]
-        distance = shares @ np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
+        grown_m = shares @ (self.layer.deviations(used) * np.linalg.norm(
+            poses[:, :3, 3] - pose[:3, 3], axis=1))
         turns = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1) @ pose[:3, :3])
         angle = shares @ turns.magnitude()
-        position = _KEYFRAME_M**2 + (self.layer.deviation_per_metre * distance) ** 2
+        position = _KEYFRAME_M**2 + grown_m ** 2
         rotation = _KEYFRAME_RAD**2 + (PER_RADIAN * angle) ** 2
         return np.diag(np.repeat([position, rotation], 3))
 
@@ -534,10 +535,9 @@ class ImageRecognizer:
             self._begin_stage('search')
         return self._known[1]
 
-    @property
-    def deviation_per_metre(self) -> float:
-        """Return deviation_per_metre of the KeyframeLayer."""
-        return self._keyframes.layer.deviation_per_metre
+    def deviation_per_metre(self, place: RecognizedPlace) -> float:
+        """Return the mean deviation_per_metre of the keyframes of a place."""
+        return float(np.dot(place.shares, self._keyframes.layer.deviations(list(place.keyframes))))
 
     def coverage(self, map_from_camera: NDArray[np.float64]) -> float:
         """Return KeyframeLocalizer.coverage for the camera of the image."""

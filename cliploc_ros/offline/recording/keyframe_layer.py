@@ -18,12 +18,13 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import DepthImage, points_in_color
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes import layer
-from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
+from cliploc_ros.core.keyframes.features import SIFT, FeatureKind
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.files.parallel import map_tasks
 from cliploc_ros.offline.datasets.frames import Frames, PosedImage, RawFrame, undistorted
 from cliploc_ros.offline.mapping.triangulation import check_scale
+from cliploc_ros.offline.recording.layer_words import with_words
 from cliploc_ros.units import NS_PER_S
 
 # Features extracted from an image, before those without a point are left out.
@@ -51,11 +52,6 @@ _COMPARED = 6
 _JUMP_M, _UNUSUAL, _ACROSS, _AGREE, _JUMP_SPREAD = 0.12, 8.0, 3, 0.6, 0.5
 # Least number of points that locate an image.
 _LEAST_SEEN = 12
-# Number of words. 1,024 words find the keyframes of the kitchen as well as comparing all
-# descriptors.
-_WORDS = 1024
-# Descriptors that the words are learned from, and steps of k-means.
-_MOST_LEARNED, _STEPS = 50_000, 8
 # A neighbouring pixel whose depth is greater by this share belongs to another surface.
 _BESIDE, _EDGE = np.ones((3, 3), dtype=np.uint8), 0.1
 
@@ -145,20 +141,18 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         keyframe.posed.bearings[rows] * (keyframe.camera.fx, keyframe.camera.fy)
         + (keyframe.camera.cx, keyframe.camera.cy) for keyframe, _, rows in chosen])
     different = tuple(dict.fromkeys(cameras))
-    vocabulary = learn_words(descriptors, kind)
-    built = layer.KeyframeLayer(
+    built = with_words(layer.KeyframeLayer(
         landmark_map.frame_id, landmark_map.landmark_ids,
         landmark_map.centers.astype(np.float32), different,
         np.array([keyframe.posed.map_from_camera for keyframe, _, _ in chosen]),
         np.cumsum([0, *(len(rows) for _, _, rows in chosen)]),
         np.clip(np.round(pixels * layer.PIXEL_SCALE), 0, 65535).astype(np.uint16),
         np.concatenate([points for _, points, _ in chosen]).astype(np.float32),
-        descriptors, layer.nearest_words(kind.units(descriptors), kind.units(vocabulary)
-                                         ).astype(np.uint16), vocabulary,
+        descriptors, np.zeros(len(descriptors), np.uint16), descriptors[:1],
         layer.FROM_DEPTH if any(np.isfinite(keyframe.depths).any() for keyframe in seen)
         else layer.TRIANGULATED,
         camera_rows=None if len(different) == 1 else np.array(
-            [different.index(own) for own in cameras]), kind=kind)
+            [different.index(own) for own in cameras]), kind=kind))
     if not options.images:
         return built
     jpegs = [keyframe.jpeg for keyframe, _, _ in chosen]
@@ -413,21 +407,3 @@ def depths_of_points(depth: DepthImage, camera: Camera, pixels: NDArray[np.float
     with np.errstate(invalid='ignore'):
         return np.where(np.isfinite(found) & (other - found <= _EDGE * found), found,
                         np.float32(np.nan))
-
-
-def learn_words(descriptors: NDArray[np.uint8], kind: FeatureKind = SIFT) -> NDArray[np.uint8]:
-    """Learn a vocabulary (W, d) from descriptors (n, d) by k-means.
-
-    The initial words are evenly spaced descriptors, so that equal layers have equal words.
-    """
-    step = max(1, len(descriptors) // _MOST_LEARNED)
-    learned = kind.units(descriptors[::step])
-    count = min(_WORDS, len(learned))
-    means = learned[np.linspace(0, len(learned) - 1, count).astype(np.int64)]
-    for _ in range(_STEPS):
-        words = layer.nearest_words(learned, means)
-        order = np.argsort(words, kind='stable')
-        found, starts = np.unique(words[order], return_index=True)
-        sums = np.add.reduceat(learned[order], starts, axis=0)
-        means[found] = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
-    return compact(means, kind.zero, kind.scale)
