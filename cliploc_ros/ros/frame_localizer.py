@@ -20,7 +20,7 @@ from rclpy.node import Node
 
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
-from cliploc_ros.core.geometry.transforms import invert_transform, shifted
+from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.kernels.compiled import KernelCache
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layers
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
@@ -112,9 +112,6 @@ class FrameLocalizer:
         self.landmark_map = landmark_map
         self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
         self.observer = observer
-        #: The layer to draw; None with several maps
-        self.shown = None if keyframes is None or len(self.frame_ids) > 1 else \
-            keyframes.localizer.layer
         self.instants = Instants(landmark_map, options.matching != 'clip')
         self._options, self.watch = options, Watch(relocalizer)
         self.localizer = Localizer(relocalizer, None if keyframes is None else keyframes.localizer)
@@ -156,8 +153,9 @@ class FrameLocalizer:
             seen = replace(seen, similarities=np.asarray(seen.similarities)[
                 :, own.first:own.first + len(own.landmark_map)])
         names = [camera_frame.camera_name for camera_frame in query.frames]
+        layer = None if self.keyframes is None else self.keyframes.localizer.layer
         return Localized(
-            found, own.landmark_map, SeenImage(query.images[-1], seen, self.shown), for_filter,
+            found, own.landmark_map, SeenImage(query.images[-1], seen, layer), for_filter,
             (*frame.left_out, *(beside.camera for beside, _ in known.beside
                                             if beside.camera not in names)), query)
 
@@ -197,8 +195,9 @@ class FrameLocalizer:
         query = self.instants.query(frame, parameters, KnownBefore(state))
         observation = localizer.with_free_crops(query, 0, self.observer) \
             if can_do_without_crops(options) else by_classes(query.newest, len(self.landmark_map))
-        return self.watch.look(observation, shifted(map_from_camera, shift), query.images[-1],
-                               localizer.recognizer(query))
+        pose = map_from_camera.copy()
+        pose[:3, 3] += shift
+        return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
 
     def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
         """Return the localizer. If the options changed, it uses them, and the watch is new."""

@@ -80,7 +80,8 @@ class Pipeline:
         """Load map and network, and return them. Keep the network of a former localizer."""
         localizer = load_localizer(self._node, self._node.settings.snapshot(), former)
         self.localizer = localizer
-        self._visualization.set_map(localizer.landmark_map, localizer.shown)
+        self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
+                                    else localizer.keyframes.localizer.layer)
         self.on_map()
         return localizer
 

@@ -63,11 +63,6 @@ def move_poses(poses: NDArray[np.float64], scale: float, rotation: NDArray[np.fl
     return moved
 
 
-def shifted(poses: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return poses (..., 4, 4) shifted by (3,)."""
-    return make_transform(np.eye(3), shift) @ poses
-
-
 def rotation_angle_deg(rotation: NDArray[np.float64]) -> float:
     """Return the angle [deg] of a rotation (3, 3)."""
     return float(np.degrees(Rotation.from_matrix(rotation).magnitude()))

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import are_rigid, shifted
+from cliploc_ros.core.geometry.transforms import are_rigid, make_transform
 from cliploc_ros.core.keyframes.features import ONLY_SIFT, SIFT, FeatureKind, FeatureKinds
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -107,9 +107,9 @@ class KeyframeLayer:
     source_rows: NDArray[np.int64] | None = None
     #: (K,): in a view, keyframe k has the points [offsets[k], ends[k])
     ends: NDArray[np.int64] | None = None
-    #: Joined layers of several maps, each with its shift (3,), see MapPart. Poses, cameras and
-    #: deviations are then those of all keyframes, and everything else is only in the parts.
-    parts: tuple[tuple['KeyframeLayer', NDArray[np.float64]], ...] = ()
+    #: Layers of several maps, in the frame of the joined map. Poses, cameras and deviations are
+    #: then those of all keyframes, and everything else is only in the parts.
+    parts: tuple['KeyframeLayer', ...] = ()
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -355,13 +355,13 @@ def load_layers(paths: Sequence[Path], landmark_map: LandmarkMap, kinds: Feature
     if len(layers) < len(parts) or len({layer.kind.name for layer in layers}) > 1:
         raise MapError(f'{", ".join(map(str, paths))}: {len(parts)} maps need a layer each, of '
                        'the same --keyframe-features, next to the maps')
-    shifts = [part.shift for part in parts]
+    layers = [replace(layer, map_from_camera=make_transform(np.eye(3), part.shift)
+                      @ layer.map_from_camera) for layer, part in zip(layers, parts, strict=True)]
     return layers[0] if len(layers) == 1 else replace(
         layers[0], cameras=sum((layer.cameras for layer in layers), ()),
-        map_from_camera=np.concatenate([*map(shifted, (
-            layer.map_from_camera for layer in layers), shifts)]),
+        map_from_camera=np.concatenate([layer.map_from_camera for layer in layers]),
         deviation_per_metre=np.concatenate([layer.deviations() for layer in layers]),
-        parts=tuple(zip(layers, shifts, strict=True)))
+        parts=tuple(layers))
 
 
 def layer_hash(path: Path) -> str:

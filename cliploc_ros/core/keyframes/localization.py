@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform, shifted
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
@@ -160,15 +160,14 @@ class _Place(NamedTuple):
 class KeyframeLocalizer:
     """Localizes images in a layer of keyframes, or in the joined layers of several maps.
 
-    Each joined layer is searched in the coordinate frame of its map, since single precision is too
-    coarse for the joined map. The time grows with their number.
+    Each joined layer is searched alone, and the time grows with their number: a pose is solved in
+    single precision, which is too coarse for points of several maps.
     """
 
-    def __init__(self, layer: KeyframeLayer) -> None:
-        self.layer = layer
-        firsts = np.cumsum([0, *(len(part) for part, _ in layer.parts)]).tolist()
-        self._parts = [(KeyframeLocalizer(part), shift, first)
-                       for (part, shift), first in zip(layer.parts, firsts, strict=False)]
+    def __init__(self, layer: KeyframeLayer, first: int = 0) -> None:
+        self.layer, self._first = layer, first  # of a part: number of its first keyframe
+        self._parts = [*map(KeyframeLocalizer, layer.parts, np.cumsum(
+            [0, *map(len, layer.parts)]).tolist())]
         layer.prepare()
 
     def localize_features(self, features: Features, camera: Camera,
@@ -198,10 +197,14 @@ class KeyframeLocalizer:
             The features are not of the kind of the layer.
         """
         if self._parts:
-            return _joined([part.localize_features(
-                features, camera, [shifted(guess, -shift) for guess in guesses], deadline,
-                constraint, fast and fast.shifted(-shift)).shifted(shift, first)
-                for part, shift, first in self._parts])
+            # those of the map with the most inliers first
+            found = sorted((part.localize_features(
+                features, camera, guesses, deadline, constraint, fast) for part in self._parts),
+                key=lambda seen: (seen.is_complete, -max((
+                    place.inliers for place in seen.places), default=0), seen.outside_m is None))
+            # if one search is incomplete, rivals may be missing
+            return found[0]._replace(places=tuple(
+                place for seen in found for place in seen.places if found[0].is_complete))
         kind, is_thorough = self.layer.kind, fast is not None
         if features.descriptors.shape[1] != kind.dimensions:
             raise MapError(f'features have {features.descriptors.shape[1]} dimensions, but the '
@@ -336,8 +339,7 @@ class KeyframeLocalizer:
         it is 0, no keyframe is near: failed recognition is then no evidence against this place.
         """
         if self._parts:  # the keyframes of other maps are far away
-            return max(part.coverage(shifted(map_from_camera, -shift), camera)
-                       for part, shift, _ in self._parts)
+            return max(part.coverage(map_from_camera, camera) for part in self._parts)
         near = keyframes_near(self.layer.map_from_camera, map_from_camera)
         return float(self._expects(near, map_from_camera, camera).mean())
 
@@ -360,9 +362,10 @@ class KeyframeLocalizer:
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
         return RecognizedPlace(
             pose, covariance, shared, place.agreed, confirmed, ratio, deviation,
-            aspect, of_aspect, look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
-            tuple(shares.tolist()), look.features.pixels[place.inliers.features],
-            place.inliers.rows, place.inliers.points, is_thorough,
+            aspect, of_aspect, look.constraint.tilt_error(pose, covariance),
+            tuple((self._first + used).tolist()), tuple(shares.tolist()),
+            look.features.pixels[place.inliers.features], place.inliers.rows,
+            place.inliers.points, is_thorough,
             float(_distances(self.layer.map_from_camera[used], pose).min()))
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
@@ -398,17 +401,6 @@ class KeyframeLocalizer:
         position = _KEYFRAME_M**2 + grown_m ** 2
         rotation = _KEYFRAME_RAD**2 + (PER_RADIAN * angle) ** 2
         return np.diag(np.repeat([position, rotation], 3))
-
-
-def _joined(found: list[Recognition]) -> Recognition:
-    """Return the places in all maps, those of the map with the most inliers first.
-
-    If one search is incomplete, rivals may be missing, and there are no places.
-    """
-    found.sort(key=lambda seen: (seen.is_complete, -max((
-        place.inliers for place in seen.places), default=0), seen.outside_m is None))
-    return found[0]._replace(places=tuple(
-        place for seen in found for place in seen.places if found[0].is_complete))
 
 
 def _places(first: _Place | None, matched: _Matched, look: _Look

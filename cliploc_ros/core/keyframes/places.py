@@ -7,8 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cliploc_ros.core.geometry.transforms import shifted
-
 
 class RecognizedPlace(NamedTuple):
     """A pose found from keyframes, with the evidence for and against it."""
@@ -48,12 +46,6 @@ class RecognizedPlace(NamedTuple):
     #: distance / 2 m and angle / 40 degrees
     apart: float = 0.5
 
-    def shifted(self, shift: NDArray[np.float64], first: int = 0) -> 'RecognizedPlace':
-        """Return the place shifted by (3,) [m], with `first` added to its keyframes."""
-        return self._replace(
-            map_from_camera=shifted(self.map_from_camera, shift), points=self.points + shift,
-            keyframes=tuple(first + keyframe for keyframe in self.keyframes))
-
 
 class Recognition(NamedTuple):
     """The places where keyframes recognize an image."""
@@ -67,7 +59,3 @@ class Recognition(NamedTuple):
     is_thorough: bool = False  #: Whether the thorough pass found the places, see ImageRecognizer
     #: Height of the best place, if it is outside the range of heights and no place is inside [m]
     outside_m: float | None = None
-
-    def shifted(self, shift: NDArray[np.float64], first: int = 0) -> 'Recognition':
-        """Return the places shifted, see RecognizedPlace."""
-        return self._replace(places=tuple(place.shifted(shift, first) for place in self.places))

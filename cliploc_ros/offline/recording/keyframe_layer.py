@@ -85,10 +85,10 @@ class PosedFeatures(NamedTuple):
 
 
 class _Keyframe(NamedTuple):
-    """A keyframe: its features (strongest first), their depths, its JPEG, and its camera."""
+    """A keyframe: its features (strongest first), their points, its JPEG, and its camera."""
 
     posed: PosedFeatures
-    depths: NDArray[np.float64]
+    points: NDArray[np.float64]  #: (n, 3): from depth, in the optical frame [m]; NaN: unknown
     jpeg: bytes
     camera: Camera  #: Camera of the undistorted image
     stamp_ns: int
@@ -149,7 +149,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         np.clip(np.round(pixels * layer.PIXEL_SCALE), 0, 65535).astype(np.uint16),
         np.concatenate([points for _, points, _ in chosen]).astype(np.float32),
         descriptors, np.zeros(len(descriptors), np.uint16), descriptors[:1],
-        layer.FROM_DEPTH if any(np.isfinite(keyframe.depths).any() for keyframe in seen)
+        layer.FROM_DEPTH if any(np.isfinite(keyframe.points).any() for keyframe in seen)
         else layer.TRIANGULATED,
         camera_rows=None if len(different) == 1 else np.array(
             [different.index(own) for own in cameras]), kind=kind))
@@ -162,15 +162,12 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
 
 def _points_of(seen: Sequence[_Keyframe], kind: FeatureKind, run: _Run
                ) -> list[NDArray[np.float64]]:
-    """Return the points (n, 3) of each keyframe in its camera's coordinate frame; NaN: unknown."""
-    images = [keyframe.posed for keyframe in seen]
-    found = [np.column_stack([keyframe.posed.bearings, np.ones(len(keyframe.depths))])
-             * keyframe.depths[:, None] for keyframe in seen]
-    without = [row for row, points in enumerate(found) if not np.isfinite(points).any()]
-    neighbours = neighbours_of(images)
+    """Return the points of each keyframe, triangulated where there is no depth."""
+    neighbours = _neighbours_of(seen)
+    without = [row for row, own in enumerate(seen) if not np.isfinite(own.points).any()]
     triangulated = dict(zip(without, run(partial(triangulate, kind=kind), (
-        (images[row], neighbours[row]) for row in without)), strict=True))
-    return [triangulated.get(row, points) for row, points in enumerate(found)]
+        (seen[row].posed, neighbours[row]) for row in without)), strict=True))
+    return [triangulated.get(row, own.points) for row, own in enumerate(seen)]
 
 
 def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
@@ -178,12 +175,11 @@ def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
 
     DatasetError: points that are triangulated in a sample of the images have other depths.
     """
-    images, ratios = [keyframe.posed for keyframe in seen], list[float]()
-    neighbours = neighbours_of(images)
+    neighbours, ratios = _neighbours_of(seen), list[float]()
     for number in range(0, len(seen), 1 + len(seen) // _COMPARED):
-        if np.isfinite(seen[number].depths).any():
-            found = triangulate(images[number], neighbours[number], kind
-                                )[:, 2] / seen[number].depths
+        if np.isfinite(seen[number].points).any():
+            found = (triangulate(seen[number].posed, neighbours[number], kind)
+                     / seen[number].points)[:, 2]
             ratios += found[np.isfinite(found)].tolist()
     if len(ratios) >= _LEAST_POINTS:
         check_scale(float(np.median(ratios)), of, 'triangulated points')
@@ -282,8 +278,9 @@ def _look(options: LayerOptions, raw: RawFrame) -> _Keyframe | None:
         depths = depths_of_points(frame.depth, frame.camera, features.pixels).astype(np.float64)
         known &= np.isfinite(depths)
         known &= np.cumsum(known) <= options.most_points
+    points = np.column_stack([bearings, np.ones(len(bearings))]) * depths[:, None]
     return _Keyframe(PosedFeatures(frame.map_from_camera, bearings[known],
-                                   features.descriptors[known]), depths[known],
+                                   features.descriptors[known]), points[known],
                      _small_jpeg(frame) if options.images else b'', frame.camera.pinhole,
                      frame.stamp_ns)
 
@@ -303,12 +300,9 @@ def _small_jpeg(frame: PosedImage) -> bytes:
     return bytes(content)
 
 
-def neighbours_of(images: Sequence[PosedFeatures]) -> list[list[PosedFeatures]]:
-    """Return the images to match each image with.
-
-    These are the nearest images with a similar direction, the nearest first.
-    """
-    poses = np.array([image.map_from_camera for image in images]).reshape(-1, 4, 4)
+def _neighbours_of(seen: Sequence[_Keyframe]) -> list[list[PosedFeatures]]:
+    """Return the nearest images with a similar direction, to match each image with them."""
+    poses = np.array([keyframe.posed.map_from_camera for keyframe in seen]).reshape(-1, 4, 4)
     tree, found = cKDTree(poses[:, :3, 3]), []
     for pose in poses:
         near = np.array(tree.query_ball_point(pose[:3, 3], _MOST_M, return_sorted=True), np.int64)
@@ -316,7 +310,7 @@ def neighbours_of(images: Sequence[PosedFeatures]) -> list[list[PosedFeatures]]:
         cosines = 0.5 * (np.einsum('kij,ij->k', poses[near, :3, :3], pose[:3, :3]) - 1.0)
         fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
         order = np.argsort(distances, kind='stable')
-        found.append([images[row] for row in near[order[fit[order]][:_NEIGHBOURS]]])
+        found.append([seen[row].posed for row in near[order[fit[order]][:_NEIGHBOURS]]])
     return found
 
 
