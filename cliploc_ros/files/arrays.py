@@ -96,7 +96,6 @@ class Field:
     #: Checks that take the name and all arrays, and raise ArrayError
     checks: tuple[Callable[[str, Arrays], None], ...] = ()
     is_optional: bool = False
-    may_stay: bool = False  #: Whether a large array stays in the file, see StoredArray
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ words of a large layer have two levels (Nister and Stewenius, "Scalable recognit
 vocabulary tree", 2006), and its descriptors are compressed: to the word and a product-quantized
 residual (Jegou et al., "Product quantization for nearest neighbor search", 2011).
 
-The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Large arrays of points stay in it.
+The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Its arrays are read completely.
 """
 
 import hashlib
@@ -69,10 +69,7 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True)
 class KeyframeLayer:
-    """K keyframes with n points in total.
-
-    Arrays of a large file are StoredArrays: slice them, or convert them with np.asarray.
-    """
+    """K keyframes with n points in total."""
 
     frame_id: str  #: Coordinate frame of the poses: the map's
     #: Landmarks of the map when the layer was made; they identify the map
@@ -138,14 +135,12 @@ class KeyframeLayer:
                        images=None, image_offsets=None, **columns)
 
     def plain(self) -> 'KeyframeLayer':
-        """Return the layer in memory, with uncompressed descriptors, to join or to change it."""
+        """Return the layer without compression and no view, to join or to change it."""
         if self.ends is not None:
             return self.select(np.ones(len(self), dtype=np.bool_)).plain()
         return replace(
-            self, pixels=np.asarray(self.pixels), points=np.asarray(self.points, np.float32),
-            descriptors=np.concatenate([self.descriptors_of(self.rows(keyframe))
-                                        for keyframe in range(len(self))]),
-            images=None if self.images is None else np.asarray(self.images), codebook=None)
+            self, points=self.points.astype(np.float32), codebook=None, descriptors=np.concatenate(
+                [self.descriptors_of(self.rows(keyframe)) for keyframe in range(len(self))]))
 
     def prepare(self) -> None:
         """Compute the indices in advance, so that the first request does not wait for them."""
@@ -169,11 +164,6 @@ class KeyframeLayer:
         """Return the slice of the points of a keyframe."""
         ends = self.offsets[1:] if self.ends is None else self.ends
         return slice(int(self.offsets[keyframe]), int(ends[keyframe]))
-
-    def source_of(self, keyframe: int) -> Source | None:
-        """Return the recording of a keyframe; None if it is unknown."""
-        row = 0 if self.source_rows is None else int(self.source_rows[keyframe])
-        return self.sources[row] if self.sources else None
 
     def deviations(self, keyframes: Any = slice(None)) -> NDArray[np.float64]:
         """Return the deviation_per_metre (k,) of keyframes, by default of all."""
@@ -199,7 +189,7 @@ class KeyframeLayer:
 
     def descriptors_of(self, rows: Any) -> NDArray[np.uint8]:
         """Return the descriptors (m, d) of points, given as a slice or an array."""
-        codes = np.asarray(self.descriptors[rows])
+        codes = self.descriptors[rows]
         if self.codebook is None:
             return codes
         added = self.codebook[np.arange(codes.shape[1]), codes].reshape(len(codes), -1)
@@ -250,27 +240,20 @@ def nearest_words(descriptors: NDArray[np.float32], vocabulary: NDArray[np.float
     Of more than WORDS words, those of the group with the most similar mean are compared.
     """
     groups = vocabulary.reshape(min(WORDS, len(vocabulary)), -1, vocabulary.shape[1])
-    means, size = groups[:, 0], groups.shape[1]
-    if size > 1:
-        means = groups.sum(axis=1)
-        means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
-    found = []
+    means, found = groups.sum(axis=1), []
+    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
     for part in np.array_split(descriptors.reshape(-1, vocabulary.shape[1]),
                                1 + len(descriptors) // 4096):
         nearest = np.argmax(part @ means.T, axis=1)
-        if size > 1:
-            nearest = size * nearest + np.argmax(np.matmul(
-                groups[nearest], part[:, :, None])[..., 0], axis=1)
-        found.append(nearest)
+        found.append(groups.shape[1] * nearest + np.argmax(
+            (groups[nearest] @ part[:, :, None])[..., 0], axis=1))
     return np.concatenate(found)
 
 
 def _check_words(name: str, arrays: Arrays) -> None:
     count = len(arrays['vocabulary'])
-    if count > WORDS and count % WORDS:
-        raise ArrayError(f'array vocabulary has {count} words, expected a multiple of {WORDS}')
-    if (arrays[name] >= count).any():
-        raise ArrayError(f'array {name} contains a word that the vocabulary lacks')
+    if (arrays[name] >= count).any() or count % min(count, WORDS):
+        raise ArrayError(f'array {name} does not fit the vocabulary of {count} words')
 
 
 # K keyframes, n points, L landmarks, W words, b bytes, c codes.
@@ -281,9 +264,9 @@ _SCHEMA = Schema('file of keyframes', {
     'map_from_camera': Field('float64', ('K', 4, 4), (
         FINITE, Check('is not a rigid transform', lambda poses: ~are_rigid(poses)))),
     'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
-    'pixels': Field('uint16', ('n', 2), may_stay=True),
-    'points': Field('floats', ('n', 3), (FINITE,), may_stay=True),
-    'descriptors': Field('uint8', ('n', 'c'), may_stay=True),
+    'pixels': Field('uint16', ('n', 2)),
+    'points': Field('floats', ('n', 3), (FINITE,)),
+    'descriptors': Field('uint8', ('n', 'c')),
     'words': Field('uint16', ('n',), (_check_words,)),
     'vocabulary': Field('uint8', ('W', 'd')),
     'codebook': Field('int16', ('c', 256, 's'), is_optional=True),  # if they are compressed
@@ -291,7 +274,7 @@ _SCHEMA = Schema('file of keyframes', {
     'deviation_per_metre': Field('float64', ('K',), is_optional=True),
     'source_rows': Field('int64', ('K',), is_optional=True),  # missing if there is one source
     # both missing unless images were requested
-    'images': Field('uint8', ('b',), is_optional=True, may_stay=True),
+    'images': Field('uint8', ('b',), is_optional=True),
     'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
     # missing if there is a single camera; the header contains the cameras
     'camera_rows': Field('int64', ('K',), is_optional=True),
@@ -390,12 +373,10 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
         cameras = tuple(Camera(*(numbers[name] for name in _CAMERA))
                         for numbers in (header['camera'], *header.get('other_cameras', ())))
         sources = tuple(Source(*map(str, source)) for source in header.get('sources', ()))
-        if 'deviation_per_metre' not in arrays:
-            arrays['deviation_per_metre'] = np.full(
-                len(arrays['offsets']) - 1, float(header['deviation_per_metre']))
+        deviations = arrays.setdefault('deviation_per_metre', np.full(
+            len(arrays['map_from_camera']), header.get('deviation_per_metre', FROM_DEPTH), float))
     except (CameraError, KeyError, TypeError, ValueError) as error:
         raise ArrayError(f'has no valid camera or deviation in its header ({error})') from error
-    deviations = arrays['deviation_per_metre']
     if not ((deviations >= 0.0) & (deviations <= _MOST_DEVIATION)).all():
         raise ArrayError(f'deviation_per_metre is not 0 to {_MOST_DEVIATION}')
     for what, count in (('camera', len(cameras)), ('source', len(sources) or 1)):
@@ -403,9 +384,8 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
         if not ((rows >= 0) & (rows < count)).all():
             raise ArrayError(f'array {what}_rows has an entry outside the {count} {what}s')
     kind, dimensions = kinds[name](), arrays['vocabulary'].shape[1]
-    parts, _, length = (arrays['codebook'].shape if 'codebook' in arrays
-                        else (arrays['descriptors'].shape[1], 1, 1))
-    if {dimensions, parts * length} != {kind.dimensions}:
+    length = arrays['codebook'].shape[2] if 'codebook' in arrays else 1
+    if {dimensions, length * arrays['descriptors'].shape[1]} != {kind.dimensions}:
         raise ArrayError(f'has descriptors of {dimensions} dimensions, expected '
                          f'{kind.dimensions} for kind {name}')
     return KeyframeLayer(str(header.get('frame_id', '')),

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Visual words of a layer of keyframes, and the compression of a large layer."""
 
-import warnings
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2, vq
+from scipy.cluster.vq import vq
 
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
 from cliploc_ros.core.keyframes.layer import WORDS, KeyframeLayer, nearest_words
@@ -69,11 +69,10 @@ def _compressed(layer: KeyframeLayer) -> KeyframeLayer:
         own = layer.vocabulary[layer.words[rows]].astype(np.float32)
         return (layer.descriptors[rows] - own).reshape(len(own), _CODES, -1).transpose(1, 0, 2)
     learned = parts(slice(None, None, 1 + len(layer.words) // _ROWS))
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # codes without a descriptor
-        codebook = np.round([kmeans2(part, part[np.linspace(
-            0, len(part) - 1, 256).astype(np.int64)], _STEPS, minit='matrix')[0]
-            for part in learned]).astype(np.int16)
+    cv2.setRNGSeed(0)  # equal layers have equal codes
+    codebook = np.array([cv2.kmeans(
+        part, 256, None, (cv2.TERM_CRITERIA_MAX_ITER, _STEPS, 0.0), 1,  # type: ignore[call-overload]
+        cv2.KMEANS_PP_CENTERS)[2] for part in learned]).round().astype(np.int16)
     codes = [np.column_stack([vq(part, book.astype(np.float32))[0] for part, book in zip(
         parts(slice(start, start + _ROWS)), codebook, strict=True)])
         for start in range(0, len(layer.words), _ROWS)]
