@@ -139,8 +139,8 @@ class Doctor(RelocalizerNode):
             report.add('map', State.FAIL, self._map_error)
         else:
             report.add('map', State.PASS, localizer.description)
-            keyframes = localizer.keyframes
-            file = ', '.join(map(str, keyframes_paths(parameters)))
+            keyframes, file = localizer.keyframes, ', '.join(map(
+                str, keyframes_paths(parameters)))
             if not file:
                 report.add('keyframes', State.NOT_CHECKED,
                            'none next to the map: build_map makes them from images')

@@ -329,15 +329,16 @@ def load_layers(paths: Sequence[Path], landmark_map: LandmarkMap, kinds: Feature
                 ) -> KeyframeLayer:
     """Read the layer of each part of a map, and join them; see load_layer_of_map.
 
-    MapError: a layer is missing or invalid. With the keyframes of some maps only, a place that
-    looks the same in another map, such as a staircase, would seem unique.
+    MapError: a layer is missing, invalid or of another kind. With the keyframes of some maps only,
+    a place that looks the same in another map, such as a staircase, would seem unique.
     """
     parts = parts_of(landmark_map)
-    layers = [load_layer_of_map(path, part.landmark_map, kinds)
-              for path, part in zip(paths, parts, strict=False)]
+    layers = [load_layer_of_map(path, part.landmark_map, kinds) for path, part in zip(
+        paths, parts, strict=False) if len(parts) == 1 or path.exists()]
     if len(layers) < len(parts) or len({layer.kind.name for layer in layers}) > 1:
-        raise MapError(f'{", ".join(map(str, paths))}: {len(parts)} maps need a layer each, of '
-                       'the same --keyframe-features, next to the maps')
+        lacking = [str(path) for path in paths if not path.exists()]
+        raise MapError(f'{", ".join(lacking) or paths[0]}: several maps need a layer each, of the '
+                       'same --keyframe-features, next to the maps: build them with build_map')
     layers = [replace(layer, map_from_camera=make_transform(np.eye(3), part.shift)
                       @ layer.map_from_camera) for layer, part in zip(layers, parts, strict=True)]
     return layers[0] if len(layers) == 1 else replace(
