@@ -235,13 +235,14 @@ class KeyframeLayer:
 
 def nearest_words(descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
                   ) -> NDArray[np.int64]:
-    """Return the index (n,) of the most similar word of each descriptor; both are unit vectors.
+    """Return the word (n,) with the greatest product with each descriptor; both are unit vectors.
 
     Of more than WORDS words, those of the group with the most similar mean are compared.
     """
     groups = vocabulary.reshape(min(WORDS, len(vocabulary)), -1, vocabulary.shape[1])
     means, found = groups.sum(axis=1), []
-    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
+    if groups.shape[1] > 1:
+        means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
     for part in np.array_split(descriptors.reshape(-1, vocabulary.shape[1]),
                                1 + len(descriptors) // 4096):
         nearest = np.argmax(part @ means.T, axis=1)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import vq
 
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, compact
 from cliploc_ros.core.keyframes.layer import WORDS, KeyframeLayer, nearest_words
@@ -73,8 +72,12 @@ def _compressed(layer: KeyframeLayer) -> KeyframeLayer:
     codebook = np.array([cv2.kmeans(
         part, 256, None, (cv2.TERM_CRITERIA_MAX_ITER, _STEPS, 0.0), 1,  # type: ignore[call-overload]
         cv2.KMEANS_PP_CENTERS)[2] for part in learned]).round().astype(np.int16)
-    codes = [np.column_stack([vq(part, book.astype(np.float32))[0] for part, book in zip(
-        parts(slice(start, start + _ROWS)), codebook, strict=True)])
+    # the nearest code has the greatest product after half of its square
+    squares = -0.5 * (codebook.astype(np.float32) ** 2).sum(axis=2)
+    books = np.dstack([codebook, squares]).astype(np.float32)
+    codes = [np.column_stack([
+        nearest_words(np.pad(part, ((0, 0), (0, 1)), constant_values=1.0), book)
+        for part, book in zip(parts(slice(start, start + _ROWS)), books, strict=True)])
         for start in range(0, len(layer.words), _ROWS)]
     return replace(layer, descriptors=np.concatenate(codes).astype(np.uint8), codebook=codebook,
                    points=layer.points.astype(np.float16))
