@@ -363,7 +363,7 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
     return FrameLocalizer(landmark_map, observer, relocalizer, options, map_hash, keyframes)
 
 
-def keyframes_paths(parameters: RelocalizerParameters) -> list[Path]:
+def layer_paths(parameters: RelocalizerParameters) -> list[Path]:
     """Return the paths of keyframes_file, or next to the maps; none if there is no layer."""
     named = parameters.keyframes_file
     if named != NEXT_TO_MAP:
@@ -374,12 +374,12 @@ def keyframes_paths(parameters: RelocalizerParameters) -> list[Path]:
 
 def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
                    ) -> Keyframes | None:
-    """Load the layers of keyframes_paths; None if there is no layer or one is invalid.
+    """Load the layers of layer_paths; None if there is no layer or one is invalid.
 
     If a layer is invalid or its features cannot be computed here, the error is logged, and the
     relocalizer uses the landmarks only.
     """
-    paths = keyframes_paths(parameters)
+    paths = layer_paths(parameters)
     if not paths:
         return None
     from cliploc_ros.models.xfeat import feature_kinds

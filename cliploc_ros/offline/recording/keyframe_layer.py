@@ -163,7 +163,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
 def _points_of(seen: Sequence[_Keyframe], kind: FeatureKind, run: _Run
                ) -> list[NDArray[np.float64]]:
     """Return the points of each keyframe, triangulated where there is no depth."""
-    neighbours = _neighbours_of(seen)
+    neighbours = neighbours_of([own.posed for own in seen])
     without = [row for row, own in enumerate(seen) if not np.isfinite(own.points).any()]
     triangulated = dict(zip(without, run(partial(triangulate, kind=kind), (
         (seen[row].posed, neighbours[row]) for row in without)), strict=True))
@@ -175,7 +175,7 @@ def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
 
     DatasetError: points that are triangulated in a sample of the images have other depths.
     """
-    neighbours, ratios = _neighbours_of(seen), list[float]()
+    neighbours, ratios = neighbours_of([own.posed for own in seen]), list[float]()
     for number in range(0, len(seen), 1 + len(seen) // _COMPARED):
         if np.isfinite(seen[number].points).any():
             found = (triangulate(seen[number].posed, neighbours[number], kind)
@@ -300,9 +300,9 @@ def _small_jpeg(frame: PosedImage) -> bytes:
     return bytes(content)
 
 
-def _neighbours_of(seen: Sequence[_Keyframe]) -> list[list[PosedFeatures]]:
+def neighbours_of(images: Sequence[PosedFeatures]) -> list[list[PosedFeatures]]:
     """Return the nearest images with a similar direction, to match each image with them."""
-    poses = np.array([keyframe.posed.map_from_camera for keyframe in seen]).reshape(-1, 4, 4)
+    poses = np.array([image.map_from_camera for image in images]).reshape(-1, 4, 4)
     tree, found = cKDTree(poses[:, :3, 3]), []
     for pose in poses:
         near = np.array(tree.query_ball_point(pose[:3, 3], _MOST_M, return_sorted=True), np.int64)
@@ -310,7 +310,7 @@ def _neighbours_of(seen: Sequence[_Keyframe]) -> list[list[PosedFeatures]]:
         cosines = 0.5 * (np.einsum('kij,ij->k', poses[near, :3, :3], pose[:3, :3]) - 1.0)
         fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
         order = np.argsort(distances, kind='stable')
-        found.append([seen[row].posed for row in near[order[fit[order]][:_NEIGHBOURS]]])
+        found.append([images[row] for row in near[order[fit[order]][:_NEIGHBOURS]]])
     return found
 
 
