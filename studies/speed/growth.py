@@ -153,7 +153,7 @@ def _columns(real: Sequence[KeyframeLayer], rng: np.random.Generator, count: int
 def _measure(path: Path, asked: Sequence[_Asked]) -> list[str]:
     """Return the columns of load, check and requests."""
     cv2.setNumThreads(1)
-    begin = time.process_time()
+    before_mb, begin = _resident_mb(), time.process_time()
     layer = load_layer_of_map(path, LandmarkMap.empty('map'))
     localizer = KeyframeLocalizer(layer)
     load_s, errors_m, times_s = time.process_time() - begin, [], []
@@ -165,12 +165,16 @@ def _measure(path: Path, asked: Sequence[_Asked]) -> list[str]:
         times_s.append((middle - start, time.process_time() - start))
         errors_m.append([pose_error(seen.places[0].map_from_camera, query.map_from_camera)[0]
                          if seen.places else np.inf for seen in (fast, both)])
-    resident = re.search(r'VmRSS:\s+(\d+) kB', Path('/proc/self/status').read_text())
+    resident_mb = _resident_mb() - before_mb
     fold = time.process_time()
     KeyframeLocalizer(layer.view(np.arange(len(layer)) % 5 > 0))
     fold_s = time.process_time() - fold
     requests = [cell for passes in (0, 1) for cell in (
         f'{1e3 * np.median([taken[passes] for taken in times_s]):.0f}',
         f'{np.mean([error[passes] < _NEAR_M for error in errors_m]):.2f}')]
-    return [f'{load_s:.1f}', f'{int(resident[1]) * 1.024e-3:.0f}' if resident else '',
-            f'{fold_s:.1f}', *requests]
+    return [f'{load_s:.1f}', f'{resident_mb:.0f}', f'{fold_s:.1f}', *requests]
+
+
+def _resident_mb() -> float:
+    resident = re.search(r'VmRSS:\s+(\d+) kB', Path('/proc/self/status').read_text())
+    return int(resident[1]) * 1.024e-3 if resident else 0.0
