@@ -168,7 +168,7 @@ def test_a_large_layer_is_compressed_and_finds_the_same_places(corridor, monkeyp
     near = np.clip(random.integers(0, 120, (30, DIMENSIONS))[random.integers(0, 30, 20 * POINTS)]
                    + random.normal(0.0, 12.0, corridor.descriptors.shape), 0, 255)
     corridor = replace(corridor, descriptors=near.astype(np.uint8))
-    for name, value in (('_LARGE', 1), ('_POINTS_PER_WORD', 300), ('WORDS', 32)):
+    for name, value in (('_LARGE', 1), ('_TWO_LEVELS', 1), ('_IN_GROUP', 3), ('WORDS', 32)):
         monkeypatch.setattr(layer_words, name, value)
     monkeypatch.setattr('cliploc_ros.core.keyframes.layer.WORDS', 32)
     save_layer(file, layer_words.with_words(corridor))
