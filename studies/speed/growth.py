@@ -73,7 +73,6 @@ def run(arguments: Sequence[str]) -> int:
     rows = []
     with tempfile.TemporaryDirectory(prefix='cliploc_ros_growth_') as folder:
         for count in options.keyframes:
-            begin = time.process_time()
             layer = _grown(real, count)
             grown_s = time.process_time()
             neighbours_of([PosedFeatures(pose, np.empty((0, 2)), np.empty((0, 128), np.uint8))
@@ -82,11 +81,11 @@ def run(arguments: Sequence[str]) -> int:
             path = Path(folder, f'{count}.keyframes.npz')
             save_layer(path, with_words(layer))
             words_s = time.process_time()
-            print(f'{count}: made in {grown_s - begin:.0f} s', flush=True)
             with multiprocessing.get_context('spawn').Pool(1) as pool:
                 rows.append([f'{len(layer):,d}', f'{near_s - grown_s:.1f}',
                              f'{words_s - near_s:.0f}', f'{path.stat().st_size / 1e6:.0f}',
                              *pool.apply(_measure, (path, asked))])
+            print(*rows[-1], flush=True)
     print(f'{len(asked)} queries; processor time of one core:\n' + table(
         ['keyframes', 'neighbours [s]', 'words, file [s]', 'file [MB]', 'load [s]',
          'resident [MB]', 'a fold of the check [s]', 'fast pass [ms]', f'within {_NEAR_M} m',

@@ -178,8 +178,8 @@ def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
     neighbours, ratios = neighbours_of([own.posed for own in seen]), list[float]()
     for number in range(0, len(seen), 1 + len(seen) // _COMPARED):
         if np.isfinite(seen[number].points).any():
-            found = (triangulate(seen[number].posed, neighbours[number], kind)
-                     / seen[number].points)[:, 2]
+            found = triangulate(seen[number].posed, neighbours[number], kind
+                                )[:, 2] / seen[number].points[:, 2]
             ratios += found[np.isfinite(found)].tolist()
     if len(ratios) >= _LEAST_POINTS:
         check_scale(float(np.median(ratios)), of, 'triangulated points')
