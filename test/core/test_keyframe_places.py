@@ -74,6 +74,20 @@ def test_a_layer_of_version_1_has_one_deviation_and_no_recordings(file):
         load_layer_of_map(file, ROOM)
 
 
+def test_mapped_arrays_survive_a_replaced_file_and_a_flipped_bit_is_found(file, monkeypatch):
+    monkeypatch.setattr('cliploc_ros.files.arrays._MAPPED_BYTES', 0)
+    before, layer = make_layer(ROOM), load_layer_of_map(file, ROOM)
+    assert not layer.descriptors.flags.owndata
+    save_layer(file, replace(before, descriptors=before.descriptors[::-1]))
+    for name in ('pixels', 'points', 'descriptors'):
+        np.testing.assert_array_equal(getattr(layer, name), getattr(before, name))
+    content = bytearray(file.read_bytes())
+    content[content.index(before.descriptors[-1].tobytes()) + 5] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(MapError, match='descriptors cannot be read: Bad CRC'):
+        load_layer_of_map(file, ROOM)
+
+
 def test_an_edited_map_keeps_its_layer(file):
     fewer = ROOM.select(range(1, len(ROOM)))
     moved = replace(fewer, centers=fewer.centers + np.eye(len(fewer))[:, :1] * 3.0)

@@ -39,8 +39,7 @@ def learn_words(descriptors: NDArray[np.uint8], kind: FeatureKind = SIFT) -> NDA
     The initial words are evenly spaced descriptors, so that equal layers have equal words.
     """
     size = _IN_GROUP if len(descriptors) >= _TWO_LEVELS else 1
-    step = max(1, len(descriptors) // (size * _MOST_LEARNED))
-    learned = kind.units(descriptors[::step])
+    learned = kind.units(descriptors[::max(1, len(descriptors) // (size * _MOST_LEARNED))])
     means = _means(learned[::size], WORDS)
     if size > 1:
         groups = nearest_words(learned, means)
