@@ -106,7 +106,7 @@ def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
     image_of = None
     if detections is not None and images is not None:
         image_of = partial(images.of, detections)
-    layer = read_layer(options.map, landmark_map, options.keyframes)
+    layer = read_layer([options.map], landmark_map, options.keyframes)
     out = options.out or options.map.with_name(f'{options.map.stem}_check')
     make_folder(out)
     with command.StageBar() as bar:

@@ -227,7 +227,7 @@ def _describe(options: argparse.Namespace, given: Mapping[str, Any], has_layer: 
              *(word for word in options.methods if word.endswith(('.yaml', '.yml'))),
              *(word.partition('=')[2] for word in options.poses)]
     if has_layer:
-        files.append(layer_path(options.map[0]))
+        files += map(layer_path, options.map)
     if options.queries is not None:
         detector = 'unknown: query files do not name it'
         similarities = 'unknown: query files do not say whether CLIP or a simulation made them'
@@ -279,7 +279,7 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
     """
     problem = _why_no_keyframes(options, methods)
     if not problem:
-        return shared.read_layer(options.map[0], landmark_map, options.keyframes)
+        return shared.read_layer(options.map, landmark_map, options.keyframes)
     if options.keyframes:
         raise OptionsError(f'--keyframes: {problem}')
     return None
@@ -288,7 +288,6 @@ def _read_layer(options: argparse.Namespace, landmark_map: 'LandmarkMap',
 def _why_no_keyframes(options: argparse.Namespace, methods: 'Sequence[Method]') -> str:
     """Return why the methods cannot use keyframes; '' if they can."""
     return (f"no method uses them: add '{AUTO}'" if not any(method.keyframes for method in methods)
-            else 'several maps are searched by objects only' if len(options.map) > 1
             else '--queries has no images: give --bag or a folder' if options.queries else '')
 
 
@@ -311,9 +310,7 @@ def _replay_case(options: argparse.Namespace, landmark_map: 'LandmarkMap') -> in
     wanted = options.keyframes
     if wanted is None and not case.report.get('parameters', {}).get('keyframes_file', True):
         wanted = False
-    layer = None
-    if len(options.map) == 1:
-        layer = shared.read_layer(options.map[0], landmark_map, wanted)
+    layer = shared.read_layer(options.map, landmark_map, wanted)
     again = repeat(case, Localizer(Relocalizer(landmark_map, case.options),
                                    None if layer is None else KeyframeLocalizer(layer)), observer)
     is_same = again.accepted == (case.report.get('found') == 'accepted')

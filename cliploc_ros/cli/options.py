@@ -6,7 +6,7 @@ All programs share them.
 """
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -199,7 +199,8 @@ def layer_options(options: argparse.Namespace) -> 'tuple[LayerOptions | None, st
     distance_m, angle_deg = options.keyframes
     return LayerOptions(
         distance_m, angle_deg, options.keyframe_points, options.keyframe_images,
-        load_xfeat() if options.keyframe_features == XFEAT else features.SIFT), ''
+        load_xfeat() if options.keyframe_features == XFEAT else features.SIFT,
+        options.workers or 1, options.scheduler), ''
 
 
 def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:
@@ -208,21 +209,21 @@ def add_use_option(parser: argparse.ArgumentParser, what: str) -> None:
            action=argparse.BooleanOptionalAction)
 
 
-def read_layer(map_file: Path, landmark_map: 'LandmarkMap', wanted: bool | None
+def read_layer(map_files: Sequence[Path], landmark_map: 'LandmarkMap', wanted: bool | None
                ) -> 'KeyframeLayer | None':
-    """Return the layer next to a map; None if there is none, or it is not wanted.
+    """Return the layer next to a map, or to each map; None if there is none, or it is not wanted.
 
     If `wanted` is None, an invalid layer is left out with a note, as in the relocalizer. MapError,
     ModelError: the wanted layer, or the network of its features, is missing or invalid.
     """
-    from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map
+    from cliploc_ros.core.keyframes.layer import layer_path, load_layers
     from cliploc_ros.models.xfeat import feature_kinds
 
-    path = layer_path(map_file)
-    if wanted is False or (wanted is None and not path.exists()):
+    paths = [*map(layer_path, map_files)]
+    if wanted is False or (wanted is None and not any(path.exists() for path in paths)):
         return None
     try:
-        return load_layer_of_map(path, landmark_map, feature_kinds())
+        return load_layers(paths, landmark_map, feature_kinds())
     except (MapError, ModelError) as error:
         if wanted:
             raise

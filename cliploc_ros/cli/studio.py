@@ -130,7 +130,7 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     names = itertools.chain(['map.yaml'], (f'map-{number}.yaml' for number in itertools.count(2)))
     document = Document(options.map or next(
         path for path in map(Path, names) if not path.exists()))
-    layer = read_layer(document.path, document.to_map(), None)
+    layer = read_layer([document.path], document.to_map(), None)
     walls = None if options.occupancy_grid is None else read_walls(options.occupancy_grid)
     return Studio(document, recording, layer, walls)
 

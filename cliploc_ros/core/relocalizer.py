@@ -152,7 +152,11 @@ def in_its_map(found: Relocalization, landmark_map: LandmarkMap) -> tuple[Reloca
                          if place.name == name),
         frame_matches=tuple(tuple(replace(match, landmark=match.landmark - part.first)
                                   for match in of_frame if match.landmark in rows)
-                            for of_frame in found.frame_matches)), part
+                            for of_frame in found.frame_matches),
+        recognition=found.recognition and found.recognition._replace(places=tuple(
+            place._replace(map_from_camera=own.map_from_camera, points=place.points - part.shift)
+            for place in found.recognition.places
+            if (own := place_of(landmark_map, place.map_from_camera)).name == name))), part
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,18 @@ def run_tasks(make_work: MakeWork, tasks: Iterable[Any], *, workers: int = 1, sc
                 yield in_flight.pop(future), future.result()
 
 
+def map_tasks(work: Callable[..., Any], tasks: Iterable[tuple[Any, ...]], **running: Any
+              ) -> list[Any]:
+    """Return work(*task) of all tasks in their order; `running`: see run_tasks."""
+    found = {number: result for (number, _), result in run_tasks(
+        partial(partial, _do_numbered, work), enumerate(tasks), **running)}
+    return [found[number] for number in range(len(found))]
+
+
+def _do_numbered(work: Callable[..., Any], task: tuple[int, tuple[Any, ...]]) -> Any:
+    return work(*task[1])
+
+
 class _Work:
     """Runs tasks with a function that is made at the first task. It is pickled as its MakeWork."""
 

@@ -41,7 +41,7 @@ from cliploc_ros.nodes.relocalizer import RelocalizerNode
 from cliploc_ros.ros.answer import Verdict
 from cliploc_ros.ros.clients import NotRunningError, ask, check_name
 from cliploc_ros.ros.conversions import of_camera
-from cliploc_ros.ros.frame_localizer import FrameLocalizer, keyframes_path
+from cliploc_ros.ros.frame_localizer import FrameLocalizer, layer_paths
 from cliploc_ros.ros.inputs.frame_source import NoFrameError
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.threads import NodeExecutor
@@ -139,8 +139,8 @@ class Doctor(RelocalizerNode):
             report.add('map', State.FAIL, self._map_error)
         else:
             report.add('map', State.PASS, localizer.description)
-            keyframes, file = localizer.keyframes, keyframes_path(parameters)
-            if file is None:
+            keyframes, file = localizer.keyframes, ', '.join(map(str, layer_paths(parameters)))
+            if not file:
                 report.add('keyframes', State.NOT_CHECKED,
                            'none next to the map: build_map makes them from images')
             else:

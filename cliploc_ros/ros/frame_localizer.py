@@ -23,7 +23,7 @@ from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.kernels.compiled import KernelCache
-from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layer_of_map
+from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layers
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
 from cliploc_ros.core.map.joined_map import join_maps, parts_of
@@ -39,7 +39,7 @@ from cliploc_ros.models.protocols import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.robot_state import KnownBefore, RobotState
 from cliploc_ros.ros.node.diagnostics import StageTimes
-from cliploc_ros.ros.parameters import RelocalizerParameters, map_files, path_of
+from cliploc_ros.ros.parameters import RelocalizerParameters, map_files
 from cliploc_ros.ros.visualization import SeenImage
 
 if TYPE_CHECKING:  # loaded where crops are compared
@@ -56,7 +56,7 @@ _LEAST_Z, _MOST_Y = 0.7, 0.3
 
 
 class Keyframes(NamedTuple):
-    """The keyframes of a map, and their file and its hash for the diagnostics."""
+    """The keyframes of the maps, and their files and hashes for the diagnostics."""
 
     localizer: KeyframeLocalizer
     file: str = ''
@@ -355,29 +355,30 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
     return FrameLocalizer(landmark_map, observer, relocalizer, options, map_hash, keyframes)
 
 
-def keyframes_path(parameters: RelocalizerParameters) -> Path | None:
-    """Return the path of the layer in keyframes_file, or next to the map; None without a layer."""
-    named, map_file = parameters.keyframes_file, parameters.map_file
+def layer_paths(parameters: RelocalizerParameters) -> list[Path]:
+    """Return the paths of keyframes_file, or next to the maps; none if there is no layer."""
+    named = parameters.keyframes_file
     if named != NEXT_TO_MAP:
-        return Path(named) if named else None
-    path = layer_path(path_of(map_file)) if map_file else None
-    return path if path is not None and path.exists() else None
+        return [Path(named)] if named else []
+    paths = [*map(layer_path, map_files(parameters))]
+    return paths if any(path.exists() for path in paths) else []
 
 
 def load_keyframes(parameters: RelocalizerParameters, landmark_map: LandmarkMap
                    ) -> Keyframes | None:
-    """Load the layer of keyframes_path; None if there is no layer or it is invalid.
+    """Load the layers of layer_paths; None if there is no layer or one is invalid.
 
-    If the layer is invalid or its features cannot be computed here, the error is logged, and the
+    If a layer is invalid or its features cannot be computed here, the error is logged, and the
     relocalizer uses the landmarks only.
     """
-    path = keyframes_path(parameters)
-    if path is None:
+    paths = layer_paths(parameters)
+    if not paths:
         return None
     from cliploc_ros.models.xfeat import feature_kinds
     try:
-        layer = load_layer_of_map(path, landmark_map, feature_kinds(parameters.cache_dir))
-        return Keyframes(KeyframeLocalizer(layer), str(path), layer_hash(path))
+        layer = load_layers(paths, landmark_map, feature_kinds(parameters.cache_dir))
+        return Keyframes(KeyframeLocalizer(layer), *(', '.join(map(str, texts)) for texts in (
+            paths, map(layer_hash, paths))))
     except (MapError, ModelError) as error:
         logger.error('localizing without keyframes: %s', error)
         return None

@@ -102,8 +102,8 @@ class RelocalizerParameters(CommonParameters):
     map_files: list[str] = parameter([''],
         'Map files of floors and buildings, each with its own frame_id, instead of map_file.')
     keyframes_file: str = parameter('auto',
-        "Layer of keyframes; 'auto': NAME.keyframes.npz next to map_file NAME.yaml, if it "
-        'exists; empty: none.')
+        "Layer of keyframes; 'auto': NAME.keyframes.npz next to each map NAME.yaml, if they "
+        'exist; empty: none.')
     prior_probability: float = parameter(0.9,
         'Probability that a pose on ~/prior is correct.', low=0.0, high=0.99)
     last_pose_file: str = parameter('',

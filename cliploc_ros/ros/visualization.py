@@ -61,12 +61,12 @@ def landmark_markers(landmark_map: LandmarkMap, layer: KeyframeLayer | None = No
     """Return an ellipsoid and a text for each landmark, coloured by class.
 
     With several maps, the markers are in the coordinate frame of their map. The cameras of
-    keyframes are in the namespace `keyframes`.
+    keyframes are in the namespace `keyframes`; with several maps, they are not shown.
     """
     markers = [Marker(header=Header(frame_id=landmark_map.frame_id), action=Marker.DELETEALL)]
     for part in parts_of(landmark_map):
         markers += _markers_of(part.landmark_map, part.first)
-    if layer is not None:
+    if layer is not None and not layer.parts:
         shown = range(0, len(layer), -(-len(layer) // MAX_SHOWN))  # every n-th of a large layer
         markers.append(_line_marker(Header(frame_id=layer.frame_id), 'keyframes', _KEYFRAMES, [
             end for edge in frusta([layer.camera_of(row) for row in shown],
@@ -261,7 +261,7 @@ def draw_debug_image(seen: SeenImage, found: Relocalization, landmark_map: Landm
                                                 np.array([match.landmark]))
                 label = f'{label} CLIP {similarity:.2f}'
             _write_near(canvas, f'{label} IoU {match.iou:.2f}', boxes[match.detection], taken)
-    if seen.layer is not None and found.recognized is not None:
+    if seen.layer is not None and not seen.layer.parts and found.recognized is not None:
         canvas = beside_keyframe(canvas, found.recognized, seen.layer)
     return canvas if not verdict else _above_bar(
         canvas, verdict, _ACCEPTED_BAR if found.accepted else _REFUSED_BAR)

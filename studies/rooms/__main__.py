@@ -166,7 +166,8 @@ def _count(cause: str) -> Callable[[Sequence[asking.Outcome]], int]:
 def _room_table(answers: Sequence[asking.Answers], rooms: Sequence[Room]) -> str:
     rows = []
     for room in rooms:
-        maps = [answer for answer in answers if answer.task.room == room.name and answer.landmarks]
+        maps = [answer for answer in answers if answer.task.room == room.name
+                and not answer.failure]
         boxes = np.diff(room.detections.frame_offsets)
         size = np.ptp(room.detections.map_from_camera[:, :3, 3], axis=0)
         rows.append((room.name, len(room), f'{boxes.mean():.1f}', f'{np.mean(boxes >= 3):.2f}',

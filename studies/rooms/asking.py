@@ -17,9 +17,9 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
 from cliploc_ros.errors import MappingError
-from cliploc_ros.offline.mapping.building import build_map
+from cliploc_ros.offline.mapping.make_map import Labeller, make_map
 from cliploc_ros.offline.posed_query import PosedQuery
-from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.offline.recording.keyframe_layer import LayerOptions
 from studies.blame import blame
 from studies.reports import Answer, judged
 from studies.rooms.rooms import ROBOT, Room, RoomOptions, known_of, read_room, without_boxes
@@ -84,7 +84,7 @@ class Outcome(Answer):
 
 @dataclass(frozen=True)
 class Answers:
-    """All outcomes of a part, and the size of its map."""
+    """All outcomes of a part, and the size of its map, which may have no landmarks."""
 
     task: Task
     landmarks: int = 0
@@ -107,11 +107,12 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
         mapped, asked = next((mapped, asked) for _, part, mapped, asked in room.parts()
                              if part == task.part)
         try:
-            landmark_map = build_map(room.detections.select_frames(mapped)).landmark_map
-            layer = build_layer(room.frames.select(mapped.tolist()), landmark_map, LayerOptions())
+            made = make_map(room.detections.select_frames(mapped), Labeller({}), frames=
+                            room.frames.select(mapped.tolist()), layer=LayerOptions())
         except MappingError as error:
             return [Answers(task, failure=str(error))]
-        keyframes, baseline = KeyframeLocalizer(layer), None
+        landmark_map, layer, baseline = made.landmark_map, made.layer, None
+        keyframes = None if layer is None else KeyframeLocalizer(layer)
         if options.with_baseline:
             from studies.rooms.baseline import SiftMap  # needs pycolmap
             baseline = SiftMap(room.raws[row].decode() for row in mapped)
@@ -129,13 +130,13 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
                                    keyframes)
                           for row in some for way, known in product(WAYS[:3], options.known)
                           if known == NOTHING or (known == VERTICAL and other.has_poses)]
-        return [Answers(task, len(landmark_map), len(layer), tuple(found))]
+        return [Answers(task, len(landmark_map), len(layer or ()), tuple(found))]
     return ask
 
 
 def _ask_here(task: Task, names: Sequence[str], room: Room, landmark_map: LandmarkMap,
-              keyframes: KeyframeLocalizer, baseline: 'SiftMap | None', query: PosedQuery
-              ) -> Iterator[Outcome]:
+              keyframes: KeyframeLocalizer | None, baseline: 'SiftMap | None',
+              query: PosedQuery) -> Iterator[Outcome]:
     """Yield the answers to an image of the mapped room."""
     for way, known in product((OBJECTS, BOTH, KEYFRAMES), names):
         if known not in (NOTHING, VERTICAL) and (way == KEYFRAMES or not room.has_depth):
@@ -152,7 +153,7 @@ def _ask_here(task: Task, names: Sequence[str], room: Room, landmark_map: Landma
 
 
 def _outcome(task: Task, asked: Room, query: PosedQuery, way: str, known: str,
-             landmark_map: LandmarkMap, keyframes: KeyframeLocalizer) -> Outcome:
+             landmark_map: LandmarkMap, keyframes: KeyframeLocalizer | None) -> Outcome:
     """Ask an independent question: without evidence of earlier images about the camera.
 
     The relocalizer is asked, not a localizer, because the features of the images are stored.
@@ -162,7 +163,7 @@ def _outcome(task: Task, asked: Room, query: PosedQuery, way: str, known: str,
         observation = without_boxes(observation)
     relocalizer = Relocalizer(landmark_map, RelocalizerOptions(matching='class'))
     recognizer = None
-    if way != OBJECTS:
+    if way != OBJECTS and keyframes is not None:
         recognizer = ImageRecognizer(keyframes, asked.features[query.number])
     found = relocalizer.relocalize([observation], recognizer)
     outcome = Outcome(
@@ -171,7 +172,8 @@ def _outcome(task: Task, asked: Room, query: PosedQuery, way: str, known: str,
         boxes=len(observation.detections),
         inliers=len(found.matches),
         **judged(found, query.map_from_camera if asked.name == task.room else None))
-    if way == OBJECTS and known == NOTHING and outcome.is_here and outcome.error_m > _FAILED_M:
+    if (way == OBJECTS and known == NOTHING and outcome.is_here and len(landmark_map)
+            and outcome.error_m > _FAILED_M):
         return replace(outcome, cause=blame(
             landmark_map, relocalizer, replace(query, observation=observation), _FAILED_M).cause)
     return outcome

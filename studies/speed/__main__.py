@@ -10,6 +10,7 @@ from cliploc_ros.command import run_command
 
 STUDIES = {
     'search': 'the search, compared with a plain loop in the same run, and by size of the map',
+    'growth': 'build, check, load and request of 300 to 20,000 keyframes',
     'frame': 'a request by stage, for two pairs of networks',
     'node_start': 'the start of the relocalizer'}
 

@@ -426,7 +426,7 @@ def test_rays_of_equal_features_meet_in_their_point():
         inside = (points - pose[:3, 3]) @ pose[:3, :3]
         images.append(PosedFeatures(pose, inside[:, :2] / inside[:, 2:], descriptors))
     images[2].bearings[:5] += 0.1  # mismatched there, but not in the second image
-    assert np.abs(triangulate(images, 0) - points).max() < 1e-6
+    assert np.abs(triangulate(images[0], images[1:]) - points).max() < 1e-6
 
 
 def test_features_are_found_in_any_image():

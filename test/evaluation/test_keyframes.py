@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.core.keyframes.layer import load_layer_of_map, save_layer
+from cliploc_ros.core.keyframes.layer import load_layer_of_map, load_layers, save_layer
 from cliploc_ros.core.keyframes.localization import (
     ImageFeatures,
     ImageRecognizer,
@@ -18,12 +18,14 @@ from cliploc_ros.core.keyframes.localization import (
     query_features,
 )
 from cliploc_ros.core.localizer import Localizer
+from cliploc_ros.core.map.joined_map import join_maps
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
-from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.relocalizer import Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch
+from cliploc_ros.errors import MapError
 from cliploc_ros.offline.datasets.folders import read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.frames import FolderOptions
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
@@ -69,9 +71,10 @@ def layer(kitchen, room, tmp_path_factory):
 @pytest.fixture
 def answer(room):
     """Request a pose for an image without detections."""
-    def relocalize(localizer, image_rgb, camera):
+    def relocalize(localizer, image_rgb, camera, landmark_map=room):
         recognizer = ImageRecognizer(localizer, ImageFeatures(lambda: image_rgb, camera))
-        return Relocalizer(room, OPTIONS).relocalize([Observation(camera, NO_OBJECTS)], recognizer)
+        return Relocalizer(landmark_map, OPTIONS).relocalize(
+            [Observation(camera, NO_OBJECTS)], recognizer)
     return relocalize
 
 
@@ -162,6 +165,64 @@ def test_a_second_room_that_looks_the_same_is_refused(layer, room, queries, answ
         assert not cut.places and not cut.is_complete
         assert seen.places[1].inliers > 0.5 * seen.places[0].inliers
         assert not answer(twins, frame.image_rgb, frame.camera).accepted
+
+
+@pytest.fixture
+def floors(layer, office, room, tmp_path):
+    """Return a function that writes the layers of floors, and returns files and joined map.
+
+    'kitchen' and 'office' name the images of a floor, '' a floor without keyframes.
+    """
+    seen = {'kitchen': layer, 'office': build_layer(office.select(range(0, 17, 2)), room, EVERY)}
+
+    def write(*names):
+        maps = [replace(room, frame_id=f'floor_{number}') for number in range(len(names))]
+        files = [tmp_path / f'{each.frame_id}.keyframes.npz' for each in maps]
+        for name, each, file in zip(names, maps, files, strict=True):
+            file.unlink(missing_ok=True)
+            if name:
+                save_layer(file, replace(seen[name].plain(), frame_id=each.frame_id))
+        return files, join_maps(maps, names)
+    return write
+
+
+@pytest.mark.parametrize('names', [('office', 'kitchen'), ('kitchen', 'office', 'office')])
+def test_each_floor_is_found_by_its_keyframes_in_its_own_frame(names, floors, layer, queries,
+                                                               answer, room):
+    files, joined = floors(*names)
+    both = load_layers(files, joined)
+    localizer, alone = KeyframeLocalizer(both), KeyframeLocalizer(layer)
+    assert len(both) == len(localizer.layer.map_from_camera) > len(layer)
+    first = sum(map(len, both.parts[:names.index('kitchen')]))
+    for frame in queries[:2]:
+        found, part = in_its_map(answer(localizer, frame.image_rgb, frame.camera, joined), joined)
+        expected = answer(alone, frame.image_rgb, frame.camera)
+        assert found.accepted, found.reason
+        assert part.landmark_map.frame_id == f'floor_{names.index("kitchen")}'
+        for pose in (found.map_from_camera, found.recognized.map_from_camera):
+            assert np.allclose(pose, expected.map_from_camera, atol=1e-3)
+        assert np.allclose(found.recognized.points, expected.recognized.points, atol=1e-5)
+        assert found.recognized.keyframes == tuple(
+            first + row for row in expected.recognized.keyframes)
+        pose = frame.map_from_camera.copy()
+        assert localizer.coverage(pose, frame.camera) == (
+            alone.coverage(pose, frame.camera) if first == 0 else 0.0)
+
+
+def test_equal_floors_are_refused_and_a_floor_without_keyframes_turns_them_off(
+        floors, queries, answer):
+    files, joined = floors('kitchen', 'kitchen')
+    localizer = KeyframeLocalizer(load_layers(files, joined))
+    found = answer(localizer, queries[0].image_rgb, queries[0].camera, joined)
+    assert not found.accepted and len(found.recognition.places) >= 2
+    recognizer = ImageRecognizer(localizer, ImageFeatures(lambda: queries[0].image_rgb,
+                                                          queries[0].camera), 0.0)
+    assert recognizer.recognize([]).places == (), 'time is up: rivals may be missing'
+    files, joined = floors('kitchen', '')
+    with pytest.raises(MapError, match=r'floor_1\.keyframes\.npz: several maps need a layer each'):
+        load_layers(files, joined)
+    with pytest.raises(MapError, match='several maps need a layer each'):
+        load_layers(files[:1], joined)  # one layer is named for both
 
 
 def test_the_office_is_triangulated_without_depth(office, room, answer):

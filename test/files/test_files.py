@@ -15,7 +15,7 @@ from disks import read_only_disk, small_disk
 
 from cliploc_ros.errors import DatasetError, OptionsError
 from cliploc_ros.files.log import Log
-from cliploc_ros.files.parallel import WorkersError, run_tasks
+from cliploc_ros.files.parallel import WorkersError, map_tasks, run_tasks
 from cliploc_ros.files.storage import is_foreign, read_file
 
 PROJECT = Path(__file__).resolve().parents[2]
@@ -173,6 +173,12 @@ def test_in_this_process_or_in_two_others(workers):
     finished = dict(run_tasks(Square(), range(12), workers=workers))
     assert {task: result[0] for task, result in finished.items()} == SQUARES
     assert (os.getpid() in {result[1] for result in finished.values()}) == (workers == 1)
+
+
+@pytest.mark.parametrize('workers', [1, 2])
+def test_results_in_the_order_of_the_tasks(workers):
+    tasks = ((number, 2) for number in range(12))
+    assert map_tasks(pow, tasks, workers=workers) == [*SQUARES.values()]
 
 
 def test_tasks_are_taken_as_workers_become_free():

@@ -185,4 +185,4 @@ def test_programs_take_the_kind_from_the_layer(cache_dir, tmp_path, monkeypatch)
         '--out', str(tmp_path / 'map.yaml')])
     save_layer(layer_path(options.out), build_layer(
         read_cameras(each_recording(options)[0])[''], landmark_map, layer_options(options)[0]))
-    assert read_layer(options.out, landmark_map, wanted=True).kind.dimensions == 64
+    assert read_layer([options.out], landmark_map, wanted=True).kind.dimensions == 64

@@ -55,6 +55,15 @@ def wall(frame):
     return Frames(ASSETS, 1, read_raw)
 
 
+def test_several_workers_build_the_same_layer(demo_map):
+    walk = read_folder(ASSETS / 'mapping', FolderOptions(layout='tum')).select(range(2, 8))
+    one, two = (build_layer(walk, demo_map, LayerOptions(0.0, 0.0, 200, workers=workers))
+                for workers in (1, 2))
+    assert len(one) == 6
+    for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words'):
+        assert getattr(one, name).tobytes() == getattr(two, name).tobytes(), name
+
+
 def test_at_the_edge_of_a_depth_image_a_pixel_without_depth_has_none(frame):
     depths = np.full((480, 640), 2.0, np.float32)
     depths[:, :320] = np.nan

@@ -16,6 +16,7 @@ import hashlib
 import json
 import os
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,8 +28,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import are_rigid
+from cliploc_ros.core.geometry.transforms import are_rigid, make_transform
 from cliploc_ros.core.keyframes.features import ONLY_SIFT, SIFT, FeatureKind, FeatureKinds
+from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.parameter_file import check_set
 from cliploc_ros.errors import CameraError, MapError
@@ -102,6 +104,9 @@ class KeyframeLayer:
     source_rows: NDArray[np.int64] | None = None
     #: (K,): in a view, keyframe k has the points [offsets[k], ends[k])
     ends: NDArray[np.int64] | None = None
+    #: Layers of several maps, in the frame of the joined map. Poses, cameras and deviations are
+    #: then those of all keyframes, and everything else is only in the parts.
+    parts: tuple['KeyframeLayer', ...] = ()
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -139,7 +144,7 @@ class KeyframeLayer:
 
     def prepare(self) -> None:
         """Compute the indices in advance, so that the first request does not wait for them."""
-        _ = self._profiles, self._unit_vocabulary
+        _ = self.parts or (self._profiles, self._unit_vocabulary)
 
     def camera_of(self, keyframe: int) -> Camera:
         """Return the camera that took a keyframe."""
@@ -321,6 +326,29 @@ def load_layer_of_map(path: Path, landmark_map: LandmarkMap, kinds: FeatureKinds
     return layer
 
 
+def load_layers(paths: Sequence[Path], landmark_map: LandmarkMap, kinds: FeatureKinds = ONLY_SIFT
+                ) -> KeyframeLayer:
+    """Read the layer of each part of a map, and join them; see load_layer_of_map.
+
+    MapError: a layer is missing, invalid or of another kind. With the keyframes of some maps only,
+    a place that looks the same in another map, such as a staircase, would seem unique.
+    """
+    parts = parts_of(landmark_map)
+    layers = [load_layer_of_map(path, part.landmark_map, kinds) for path, part in zip(
+        paths, parts, strict=False) if len(parts) == 1 or path.exists()]
+    if len(layers) < len(parts) or len({layer.kind.name for layer in layers}) > 1:
+        lacking = [str(path) for path in paths if not path.exists()]
+        raise MapError(f'{", ".join(lacking) or paths[0]}: several maps need a layer each, of the '
+                       'same --keyframe-features, next to the maps: build them with build_map')
+    layers = [replace(layer, map_from_camera=make_transform(np.eye(3), part.shift)
+                      @ layer.map_from_camera) for layer, part in zip(layers, parts, strict=True)]
+    return layers[0] if len(layers) == 1 else replace(
+        layers[0], cameras=sum((layer.cameras for layer in layers), ()),
+        map_from_camera=np.concatenate([layer.map_from_camera for layer in layers]),
+        deviation_per_metre=np.concatenate([layer.deviations() for layer in layers]),
+        parts=tuple(layers))
+
+
 def layer_hash(path: Path) -> str:
     """Return a digest of a layer file, from the names, sizes and checksums of its arrays.
 
@@ -365,7 +393,7 @@ def _layer_of(arrays: dict[str, NDArray[Any]], kinds: FeatureKinds) -> KeyframeL
     return KeyframeLayer(str(header.get('frame_id', '')),
                          tuple(map(str, arrays.pop('landmark_ids'))),
                          arrays.pop('landmark_centers'), cameras, **arrays, kind=kind,
-                         set_digest=str(header.get('set', '')), sources=sources)
+                         set_digest=str(header.get('set', '')), sources=sources, parts=())
 
 
 def _check_map(layer: KeyframeLayer, landmark_map: LandmarkMap) -> None:

@@ -160,10 +160,16 @@ class _Place(NamedTuple):
 
 
 class KeyframeLocalizer:
-    """Localizes images in a layer of keyframes."""
+    """Localizes images in a layer of keyframes, or in the joined layers of several maps.
 
-    def __init__(self, layer: KeyframeLayer) -> None:
-        self.layer = layer
+    Each joined layer is searched alone, and the time grows with their number: a pose is solved in
+    single precision, which is too coarse for points of several maps.
+    """
+
+    def __init__(self, layer: KeyframeLayer, first: int = 0) -> None:
+        self.layer, self._first = layer, first  # of a part: number of its first keyframe
+        self._parts = [*map(KeyframeLocalizer, layer.parts, np.cumsum(
+            [0, *map(len, layer.parts)]).tolist())]
         layer.prepare()
 
     def localize_features(self, features: Features, camera: Camera,
@@ -192,6 +198,15 @@ class KeyframeLocalizer:
         MapError
             The features are not of the kind of the layer.
         """
+        if self._parts:
+            # those of the map with the most inliers first
+            found = sorted((part.localize_features(
+                features, camera, guesses, deadline, constraint, fast) for part in self._parts),
+                key=lambda seen: (seen.is_complete, -max((
+                    place.inliers for place in seen.places), default=0), seen.outside_m is None))
+            # if one search is incomplete, rivals may be missing
+            return found[0]._replace(places=tuple(
+                place for seen in found for place in seen.places if found[0].is_complete))
         kind, is_thorough = self.layer.kind, fast is not None
         if features.descriptors.shape[1] != kind.dimensions:
             raise MapError(f'features have {features.descriptors.shape[1]} dimensions, but the '
@@ -325,6 +340,8 @@ class KeyframeLocalizer:
         It is the share of cells of the image in which keyframes near the pose predict points. If
         it is 0, no keyframe is near: failed recognition is then no evidence against this place.
         """
+        if self._parts:  # the keyframes of other maps are far away
+            return max(part.coverage(map_from_camera, camera) for part in self._parts)
         near = keyframes_near(self.layer.map_from_camera, map_from_camera)
         return float(self._expects(near, map_from_camera, camera).mean())
 
@@ -347,9 +364,10 @@ class KeyframeLocalizer:
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
         return RecognizedPlace(
             pose, covariance, shared, place.agreed, confirmed, ratio, deviation,
-            aspect, of_aspect, look.constraint.tilt_error(pose, covariance), tuple(used.tolist()),
-            tuple(shares.tolist()), look.features.pixels[place.inliers.features],
-            place.inliers.rows, place.inliers.points, is_thorough,
+            aspect, of_aspect, look.constraint.tilt_error(pose, covariance),
+            tuple((self._first + used).tolist()), tuple(shares.tolist()),
+            look.features.pixels[place.inliers.features], place.inliers.rows,
+            place.inliers.points, is_thorough,
             float(_distances(self.layer.map_from_camera[used], pose).min()),
             place.parted / (place.agreed + place.parted))
 

@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build a layer of keyframes: choose images, extract features, and place them in the map."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
@@ -20,7 +21,8 @@ from cliploc_ros.core.keyframes import layer
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.errors import DatasetError, MappingError
-from cliploc_ros.offline.datasets.frames import Frames, PosedImage, undistorted
+from cliploc_ros.files.parallel import map_tasks
+from cliploc_ros.offline.datasets.frames import Frames, PosedImage, RawFrame, undistorted
 from cliploc_ros.offline.mapping.triangulation import check_scale
 from cliploc_ros.offline.recording.layer_words import with_words
 from cliploc_ros.units import NS_PER_S
@@ -66,6 +68,9 @@ class LayerOptions:
     #: Whether to store small images of the keyframes, for visual inspection
     images: bool = False
     kind: FeatureKind = SIFT  #: Kind of the features
+    #: See cliploc_ros.files.parallel.run_tasks; the layer does not depend on them
+    workers: int = 1
+    scheduler: str = ''
 
 
 _DEFAULT = LayerOptions()
@@ -80,13 +85,17 @@ class PosedFeatures(NamedTuple):
 
 
 class _Keyframe(NamedTuple):
-    """A keyframe: its features (strongest first), their depths, its JPEG, and its camera."""
+    """A keyframe: its features (strongest first), their points, its JPEG, and its camera."""
 
     posed: PosedFeatures
-    depths: NDArray[np.float64]
+    points: NDArray[np.float64]  #: (n, 3): from depth, in the optical frame [m]; NaN: unknown
     jpeg: bytes
     camera: Camera  #: Camera of the undistorted image
     stamp_ns: int
+
+
+# map_tasks with the workers of the user.
+_Run = Callable[..., list[Any]]
 
 
 def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions = _DEFAULT
@@ -107,26 +116,20 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     DatasetError
         The images show that depth has another unit, or that the poses jump.
     """
-    parts = [[_look(frame, options) for frame in _chosen(part, options)] for part in frames.each]
-    seen = list(chain.from_iterable(parts))
-    images, kind = [keyframe.posed for keyframe in seen], options.kind
-    of_images = list[NDArray[np.float64]]()
+    run = partial(map_tasks, workers=options.workers, scheduler=options.scheduler)
+    parts = [list(filter(None, run(partial(_look, options), zip(_chosen(part, options)))))
+             for part in frames.each]
+    seen, kind = list(chain.from_iterable(parts)), options.kind
+    of_images = _points_of(seen, kind, run)
     chosen = []  # keyframes, the points of their features, and the rows of these features
-    for number, keyframe in enumerate(seen):
-        # points (n, 3) in the camera's coordinate frame; NaN where unknown
-        if np.isfinite(keyframe.depths).any():
-            points = np.column_stack([keyframe.posed.bearings, np.ones(len(keyframe.depths))]
-                                     ) * keyframe.depths[:, None]
-        else:
-            points = triangulate(images, number, kind)
-        of_images.append(points)
+    for keyframe, points in zip(seen, of_images, strict=True):
         # the strongest features that have a point
         rows = np.nonzero(np.isfinite(points).all(axis=1))[0][:options.most_points]
         if len(rows) >= LEAST_POINTS:
             chosen.append((keyframe, points[rows], rows))
     for part, own in zip(frames.each, parts, strict=True):
         _check_depth(own, kind, f' of {part.camera}' if part.camera else '')
-        _check_steps(own, [of_images.pop(0) for _ in own], kind, frames.source)
+        _check_steps(own, [of_images.pop(0) for _ in own], kind, frames.source, run)
     if not chosen:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
                            f'{LEAST_POINTS} points; record depth, or overlapping '
@@ -148,7 +151,7 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         np.clip(np.round(pixels * layer.PIXEL_SCALE), 0, 65535).astype(np.uint16),
         np.concatenate([points for _, points, _ in chosen]).astype(np.float32),
         descriptors, np.zeros(len(descriptors), np.uint16), descriptors[:1],
-        np.array([layer.FROM_DEPTH if np.isfinite(keyframe.depths).any() else layer.TRIANGULATED
+        np.array([layer.FROM_DEPTH if np.isfinite(keyframe.points).any() else layer.TRIANGULATED
                   for keyframe, _, _ in chosen]),
         camera_rows=None if len(different) == 1 else np.array(
             [different.index(own) for own in cameras]), kind=kind,
@@ -160,30 +163,44 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
                    image_offsets=np.cumsum([0, *map(len, jpegs)]))
 
 
+def _points_of(seen: Sequence[_Keyframe], kind: FeatureKind, run: _Run
+               ) -> list[NDArray[np.float64]]:
+    """Return the points of each keyframe, triangulated where there is no depth."""
+    neighbours = neighbours_of([own.posed for own in seen])
+    without = [row for row, own in enumerate(seen) if not np.isfinite(own.points).any()]
+    triangulated = dict(zip(without, run(partial(triangulate, kind=kind), (
+        (seen[row].posed, neighbours[row]) for row in without)), strict=True))
+    return [triangulated.get(row, own.points) for row, own in enumerate(seen)]
+
+
 def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
     """Refuse keyframes with depth in another unit than their poses.
 
     DatasetError: points that are triangulated in a sample of the images have other depths.
     """
-    images, ratios = [keyframe.posed for keyframe in seen], list[float]()
+    neighbours, ratios = neighbours_of([own.posed for own in seen]), list[float]()
     for number in range(0, len(seen), 1 + len(seen) // _COMPARED):
-        if np.isfinite(seen[number].depths).any():
-            found = triangulate(images, number, kind)[:, 2] / seen[number].depths
+        if np.isfinite(seen[number].points).any():
+            found = triangulate(seen[number].posed, neighbours[number], kind
+                                )[:, 2] / seen[number].points[:, 2]
             ratios += found[np.isfinite(found)].tolist()
     if len(ratios) >= LEAST_POINTS:
         check_scale(float(np.median(ratios)), of, 'triangulated points')
 
 
 def _check_steps(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.float64]],
-                 kind: FeatureKind, where: object) -> None:
+                 kind: FeatureKind, where: object, run: _Run) -> None:
     """Refuse poses that jump against the images, which are in order, with the points of each.
 
     DatasetError: images after a step are located elsewhere than their poses say, by the points of
     images before it, and the reverse, and most pairs across the step agree by how far.
     """
-    found = [(first, second, shift) for first in range(len(keyframes))
-             for second in range(first + 1, min(first + 1 + _ACROSS, len(keyframes)))
-             for shift in _shifts(keyframes, points, first, second, kind)]
+    pairs = [(first, second) for first in range(len(keyframes))
+             for second in range(first + 1, min(first + 1 + _ACROSS, len(keyframes)))]
+    shifted = run(partial(_shifts, kind), (
+        tuple((keyframes[row].posed, points[row]) for row in pair) for pair in pairs))
+    found = [(*pair, shift) for pair, shifts in zip(pairs, shifted, strict=True)
+             for shift in shifts]
     of_pair = np.array([pair for *pair, _ in found], dtype=np.int64).reshape(-1, 2)
     shifts = np.array([shift for *_, shift in found]).reshape(-1, 3)
     median_m = float(np.median([0.0, *np.linalg.norm(shifts, axis=1)]))
@@ -205,31 +222,32 @@ def _check_steps(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.flo
             'before or after it alone, or give corrected poses as `trajectory`')
 
 
-def _shifts(keyframes: Sequence[_Keyframe], points: Sequence[NDArray[np.float64]], first: int,
-            second: int, kind: FeatureKind) -> Iterator[NDArray[np.float64]]:
-    """Yield how far (3,) the second image is displaced against the first one, in map axes [m].
+def _shifts(kind: FeatureKind, *pair: tuple[PosedFeatures, NDArray[np.float64]]
+            ) -> list[NDArray[np.float64]]:
+    """Return how far (3,) the second image is displaced against the first one, in map axes [m].
 
     There are two measurements, by the points of each image, or fewer if these do not locate the
     other one.
     """
-    rows, _ = kind.match(*(kind.units(keyframes[row].posed.descriptors)
-                           for row in (first, second)))
-    for source, target, pairs, sign in ((first, second, rows, 1.0),
-                                        (second, first, rows[:, ::-1], -1.0)):
-        pairs = pairs[np.isfinite(points[source][pairs[:, 0]]).all(axis=1)]
+    (first, own), (second, others) = pair
+    rows, _ = kind.match(kind.units(first.descriptors), kind.units(second.descriptors))
+    found = []
+    for ours, theirs, points, pairs, sign in ((first, second, own, rows, 1.0),
+                                              (second, first, others, rows[:, ::-1], -1.0)):
+        pairs = pairs[np.isfinite(points[pairs[:, 0]]).all(axis=1)]
         if len(pairs) < _LEAST_SEEN:
             continue
-        ours, theirs = (keyframes[row].posed for row in (source, target))
         _, turn, shift, kept = cv2.solvePnPRansac(
-            points[source][pairs[:, 0]], theirs.bearings[pairs[:, 1]], np.eye(3), None,
+            points[pairs[:, 0]], theirs.bearings[pairs[:, 1]], np.eye(3), None,
             reprojectionError=2.0 * _MOST_ERROR, iterationsCount=200)
         if kept is not None and len(kept) >= max(_LEAST_SEEN, 0.3 * len(pairs)):
             place = -Rotation.from_rotvec(turn[:, 0]).inv().apply(shift[:, 0])
-            yield sign * (theirs.map_from_camera[:3, 3] - ours.map_from_camera[:3, 3]
-                          - ours.map_from_camera[:3, :3] @ place)
+            found.append(sign * (theirs.map_from_camera[:3, 3] - ours.map_from_camera[:3, 3]
+                                 - ours.map_from_camera[:3, :3] @ place))
+    return found
 
 
-def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
+def _chosen(frames: Frames, options: LayerOptions) -> Iterator[RawFrame]:
     """Yield the images of the keyframes: those without an earlier keyframe nearby."""
     chosen = np.empty((0, 4, 4))
 
@@ -245,13 +263,15 @@ def _chosen(frames: Frames, options: LayerOptions) -> Iterator[PosedImage]:
             return False
         chosen = np.concatenate([chosen, pose[None]])
         return True
-    for raw in frames.read_raw(is_new):
-        with suppress(DatasetError):  # the recorder reports unusable images
-            yield raw.decode()
+    return frames.read_raw(is_new)
 
 
-def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
+def _look(options: LayerOptions, raw: RawFrame) -> _Keyframe | None:
     """Extract the features of an image; if it has depth, only features with known depth."""
+    try:
+        frame = raw.decode()
+    except DatasetError:  # the recorder reports unusable images
+        return None
     assert frame.map_from_camera is not None
     features = options.kind.extract(frame.image_rgb, _MOST_FOUND, _LONGEST_PX)
     bearings = frame.camera.normalize_points(features.pixels)
@@ -261,8 +281,9 @@ def _look(frame: PosedImage, options: LayerOptions) -> _Keyframe:
         depths = depths_of_points(frame.depth, frame.camera, features.pixels).astype(np.float64)
         known &= np.isfinite(depths)
         known &= np.cumsum(known) <= options.most_points
+    points = np.column_stack([bearings, np.ones(len(bearings))]) * depths[:, None]
     return _Keyframe(PosedFeatures(frame.map_from_camera, bearings[known],
-                                   features.descriptors[known]), depths[known],
+                                   features.descriptors[known]), points[known],
                      _small_jpeg(frame) if options.images else b'', frame.camera.pinhole,
                      frame.stamp_ns)
 
@@ -282,28 +303,35 @@ def _small_jpeg(frame: PosedImage) -> bytes:
     return bytes(content)
 
 
-def triangulate(images: Sequence[PosedFeatures], row: int, kind: FeatureKind = SIFT
-                ) -> NDArray[np.float64]:
+def neighbours_of(images: Sequence[PosedFeatures]) -> list[list[PosedFeatures]]:
+    """Return the nearest images with a similar direction, to match each image with them."""
+    poses = np.array([image.map_from_camera for image in images]).reshape(-1, 4, 4)
+    tree, found = cKDTree(poses[:, :3, 3]), []
+    for pose in poses:
+        near = np.array(tree.query_ball_point(pose[:3, 3], _MOST_M, return_sorted=True), np.int64)
+        distances = np.linalg.norm(poses[near, :3, 3] - pose[:3, 3], axis=1)
+        cosines = 0.5 * (np.einsum('kij,ij->k', poses[near, :3, :3], pose[:3, :3]) - 1.0)
+        fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
+        order = np.argsort(distances, kind='stable')
+        found.append([images[row] for row in near[order[fit[order]][:_NEIGHBOURS]]])
+    return found
+
+
+def triangulate(ours: PosedFeatures, neighbours: Sequence[PosedFeatures],
+                kind: FeatureKind = SIFT) -> NDArray[np.float64]:
     """Triangulate the points (n, 3) of an image's features, in its camera's frame [m].
 
     Each feature is matched in the neighbouring images, and each match gives a point. The point
     that most matches agree with is kept; ties are broken by the widest angle. NaN: no point.
     """
-    ours = images[row]
-    poses = np.array([image.map_from_camera for image in images])
-    distances = np.linalg.norm(poses[:, :3, 3] - poses[row, :3, 3], axis=1)
-    cosines = 0.5 * (np.einsum('kij,ij->k', poses[:, :3, :3], poses[row, :3, :3]) - 1.0)
-    fit = (distances > _LEAST_M) & (distances < _MOST_M) & (cosines > _MOST_COS)
-    order = np.argsort(distances, kind='stable')
-    neighbours = order[fit[order]][:_NEIGHBOURS].tolist()
     count = len(ours.bearings)
     seen = np.full((len(neighbours), count, 2), np.nan)
-    cameras = np.array([invert_transform(images[neighbour].map_from_camera) @ ours.map_from_camera
-                        for neighbour in neighbours]).reshape(-1, 4, 4)
+    cameras = np.array([invert_transform(theirs.map_from_camera) @ ours.map_from_camera
+                        for theirs in neighbours]).reshape(-1, 4, 4)
     descriptors = kind.units(ours.descriptors)
-    for number, neighbour in enumerate(neighbours):
-        pairs, _ = kind.match(descriptors, kind.units(images[neighbour].descriptors))
-        seen[number, pairs[:, 0]] = images[neighbour].bearings[pairs[:, 1]]
+    for number, theirs in enumerate(neighbours):
+        pairs, _ = kind.match(descriptors, kind.units(theirs.descriptors))
+        seen[number, pairs[:, 0]] = theirs.bearings[pairs[:, 1]]
     best = np.full((count, 3), np.nan)
     scores = np.zeros(count)
     for number in range(len(neighbours)):

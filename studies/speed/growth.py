@@ -1,0 +1,179 @@
+# SPDX-FileCopyrightText: 2026 the cliploc_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Measure layers of many keyframes: ``python -m studies.speed growth FOLDER...``.
+
+A layer is built from the images of the folders, except every 12th, which is asked. It is then
+extended by **synthetic keyframes**: points of two real keyframes, with their descriptors mirrored
+and disturbed, far away from the rooms. They look like images of other rooms, and match no query.
+Each layer is loaded and asked in a process of its own.
+"""
+
+import os
+
+# As in the nodes. NumPy reads it when it is imported.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import argparse
+import multiprocessing
+import re
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cliploc_ros.command import positive_int
+from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.keyframes.features import Features
+from cliploc_ros.core.keyframes.layer import KeyframeLayer, load_layer_of_map, save_layer
+from cliploc_ros.core.keyframes.localization import KeyframeLocalizer, query_features
+from cliploc_ros.core.map.landmark_map import LandmarkMap
+from cliploc_ros.offline.recording.keyframe_layer import (
+    LayerOptions,
+    PosedFeatures,
+    build_layer,
+    neighbours_of,
+)
+from cliploc_ros.offline.recording.layer_words import with_words
+from studies.reports import table
+from studies.rooms.rooms import open_folder
+
+_ASKED, _APART_M, _NEAR_M = 12, 1000.0, 0.25
+# Extent of the synthetic building, and noise of its descriptors, in bytes.
+_EXTENT_M, _NOISE = (400.0, 400.0, 20.0), 8.0
+# Index of each entry of a SIFT descriptor in that of the mirrored image: 4 rows and 4 columns of
+# cells with 8 directions.
+_MIRROR = np.arange(128).reshape(4, 4, 8)[:, ::-1][:, :, -np.arange(8) % 8].ravel()
+
+
+class _Asked(NamedTuple):
+    """A query: its features for both passes, its camera, and its true pose."""
+
+    fast: Features
+    thorough: Features
+    camera: Camera
+    map_from_camera: NDArray[np.float64]
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Print the table; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('folders', nargs='+', metavar='DIR[@METRES]')
+    parser.add_argument('--keyframes', nargs='+', type=positive_int, default=(300, 3000, 20_000),
+                        metavar='N', help='(300 3000 20000)')
+    parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
+    options = parser.parse_args(arguments)
+    real, asked = _read(options.folders, options.workers)
+    rows = []
+    with tempfile.TemporaryDirectory(prefix='cliploc_ros_growth_') as folder:
+        for count in options.keyframes:
+            layer = _grown(real, count)
+            grown_s = time.process_time()
+            neighbours_of([PosedFeatures(pose, np.empty((0, 2)), np.empty((0, 128), np.uint8))
+                           for pose in layer.map_from_camera])
+            near_s = time.process_time()
+            path = Path(folder, f'{count}.keyframes.npz')
+            save_layer(path, with_words(layer))
+            words_s = time.process_time()
+            with multiprocessing.get_context('spawn').Pool(1) as pool:
+                rows.append([f'{len(layer):,d}', f'{near_s - grown_s:.1f}',
+                             f'{words_s - near_s:.0f}', f'{path.stat().st_size / 1e6:.0f}',
+                             *pool.apply(_measure, (path, asked))])
+            print(*rows[-1], flush=True)
+    print(f'{len(asked)} queries; processor time of one core:\n' + table(
+        ['keyframes', 'neighbours [s]', 'words, file [s]', 'file [MB]', 'load [s]',
+         'resident [MB]', 'a fold of the check [s]', 'fast pass [ms]', f'within {_NEAR_M} m',
+         'both passes [ms]', f'within {_NEAR_M} m'], rows), flush=True)
+    return 0
+
+
+def _read(folders: Sequence[str], workers: int) -> tuple[list[KeyframeLayer], list[_Asked]]:
+    """Build a layer of each folder, and return the queries; the rooms are far apart."""
+    layers, asked = [], []
+    for number, where in enumerate(folders):
+        _, frames, _ = open_folder(where)
+        places = range(frames.count)
+        begin, shift = time.perf_counter(), np.array([number * _APART_M, 0.0, 0.0])
+        layer = build_layer(frames.select([row for row in places if row % _ASKED]),
+                            LandmarkMap.empty('map'), LayerOptions(workers=workers)).plain()
+        print(f'{where}: {(time.perf_counter() - begin) / len(layer):.2f} s a keyframe to build '
+              f'{len(layer)} keyframes, {workers} workers', flush=True)
+        layer.map_from_camera[:, :3, 3] += shift
+        layers.append(layer)
+        for frame in frames.select(places[::_ASKED]).read():
+            if frame.map_from_camera is not None:
+                pose = frame.map_from_camera.copy()
+                pose[:3, 3] += shift
+                asked.append(_Asked(query_features(frame.image_rgb), query_features(
+                    frame.image_rgb, is_thorough=True), frame.camera, pose))
+    return layers, asked
+
+
+def _grown(real: Sequence[KeyframeLayer], count: int) -> KeyframeLayer:
+    """Return the first `count` keyframes of the real layers, extended by synthetic ones."""
+    rng = np.random.default_rng(0)
+    parts = list(_columns(real, rng, count))
+    poses, rows, pixels, points, descriptors = zip(*parts, strict=True)
+    return replace(
+        real[0], map_from_camera=np.array(poses), offsets=np.cumsum([0, *rows]),
+        pixels=np.concatenate(pixels), points=np.concatenate(points),
+        descriptors=np.concatenate(descriptors), words=np.zeros(sum(rows), np.uint16),
+        deviation_per_metre=0.1, camera_rows=None)
+
+
+def _columns(real: Sequence[KeyframeLayer], rng: np.random.Generator, count: int
+             ) -> Iterator[tuple[NDArray[np.float64], int, NDArray[np.uint16],
+                                 NDArray[np.floating], NDArray[np.uint8]]]:
+    """Yield pose, number of points, pixels, points and descriptors of each keyframe."""
+    own = [(layer, row) for layer in real for row in range(len(layer))][:count]
+    for layer, row in own:
+        rows = layer.rows(row)
+        yield (layer.map_from_camera[row], rows.stop - rows.start, layer.pixels[rows],
+               layer.points[rows], layer.descriptors[rows])
+    for number in range(len(own), count):
+        layer = real[number % len(real)]
+        first, second = rng.integers(len(layer), size=2)
+        chosen = np.sort(np.concatenate([rng.permutation(np.arange(rows.start, rows.stop))[::2]
+                                         for rows in map(layer.rows, (first, second))]))
+        pose = layer.map_from_camera[first].copy()
+        pose[:3, 3] = rng.uniform(0.0, _EXTENT_M) - (0.0, _APART_M, 0.0)
+        mirrored = layer.descriptors[chosen][:, _MIRROR]
+        noisy = mirrored + rng.normal(0.0, _NOISE, mirrored.shape) * (mirrored > 0)
+        yield (pose, len(chosen), layer.pixels[chosen], layer.points[chosen],
+               np.clip(np.round(noisy), 0, 255).astype(np.uint8))
+
+
+def _measure(path: Path, asked: Sequence[_Asked]) -> list[str]:
+    """Return the columns of load, check and requests."""
+    cv2.setNumThreads(1)
+    before_mb, begin = _resident_mb(), time.process_time()
+    layer = load_layer_of_map(path, LandmarkMap.empty('map'))
+    localizer = KeyframeLocalizer(layer)
+    load_s, errors_m, times_s = time.process_time() - begin, [], []
+    for query in asked:
+        start = time.process_time()
+        fast = localizer.localize_features(query.fast, query.camera)
+        middle = time.process_time()
+        both = localizer.localize_features(query.thorough, query.camera, fast=fast)
+        times_s.append((middle - start, time.process_time() - start))
+        errors_m.append([pose_error(seen.places[0].map_from_camera, query.map_from_camera)[0]
+                         if seen.places else np.inf for seen in (fast, both)])
+    resident_mb = _resident_mb() - before_mb
+    fold = time.process_time()
+    KeyframeLocalizer(layer.view(np.arange(len(layer)) % 5 > 0))
+    fold_s = time.process_time() - fold
+    requests = [cell for passes in (0, 1) for cell in (
+        f'{1e3 * np.median([taken[passes] for taken in times_s]):.0f}',
+        f'{np.mean([error[passes] < _NEAR_M for error in errors_m]):.2f}')]
+    return [f'{load_s:.1f}', f'{resident_mb:.0f}', f'{fold_s:.1f}', *requests]
+
+
+def _resident_mb() -> float:
+    resident = re.search(r'VmRSS:\s+(\d+) kB', Path('/proc/self/status').read_text())
+    return int(resident[1]) * 1.024e-3 if resident else 0.0
