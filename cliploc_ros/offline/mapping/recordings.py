@@ -90,11 +90,10 @@ def recognize(new: KeyframeLayer, layer: KeyframeLayer) -> list[Sight]:
         found = localizer.localize_features(features, camera)
         if not found.places or found.places[0].inliers < _LEAST_POINTS:
             found = localizer.localize_features(features, camera, fast=found)
-        for place in found.places[:1]:
-            if place.inliers >= _LEAST_POINTS:
-                own = new.points[rows][cKDTree(pixels).query(place.pixels)[1]]
-                sights.append(Sight(keyframe, pose, place.map_from_camera, place.points,
-                                    own.astype(float), place.inliers, np.array(place.keyframes)))
+        for place in (one for one in found.places[:1] if one.inliers >= _LEAST_POINTS):
+            own = new.points[rows][cKDTree(pixels).query(place.pixels)[1]]
+            sights.append(Sight(keyframe, pose, place.map_from_camera, place.points,
+                                own.astype(float), place.inliers, np.array(place.keyframes)))
     return sights
 
 
@@ -115,16 +114,18 @@ def find_placing(sights: Sequence[Sight], is_scaled: bool = False) -> tuple[Plac
     for _ in range(2 * bool(kept.sum() >= _LEAST_AGREEING)):
         placing = _refined([*compress(sights, kept)], placing, is_scaled)
         kept = np.array([sight.agrees(placing) for sight in sights])
-    agreeing, rivals = kept.sum(), (agree & ~kept).sum(axis=1).max()
+    scale = float(np.cbrt(np.linalg.det(placing[:3, :3])))
+    found, agreeing = Placing(scale, placing[:3, :3] / scale, placing[:3, 3]), int(kept.sum())
+    rivals = max((int((others & ~kept).sum()) for others, sight in zip(agree, sights, strict=False)
+                  if not transforms.SAME_LOOK.agree(sight.found, transforms.move_poses(
+                      sight.pose[None], *found)[0])), default=0)
     if agreeing < max(_LEAST_AGREEING, _PER_RIVAL * rivals):
         raise MappingError(f'its place in the map is unknown: {agreeing} of {len(sights)} '
                            f'recognized keyframes agree about it, {rivals} about another place')
-    scale = float(np.cbrt(np.linalg.det(placing[:3, :3])))
-    return Placing(scale, placing[:3, :3] / scale, placing[:3, 3]), int(agreeing)
+    return found, agreeing
 
 
-def _refined(sights: Sequence[Sight], start: NDArray[np.float64], is_scaled: bool
-             ) -> NDArray[np.float64]:
+def _refined(sights: list[Sight], start: Any, is_scaled: bool) -> NDArray[np.float64]:
     """Refine a placing (4, 4) by robust least squares."""
     def moved(step: NDArray[np.float64]) -> NDArray[np.float64]:
         turn = Rotation.from_rotvec(step[:3]).as_matrix() * np.exp(step[6:].sum())
