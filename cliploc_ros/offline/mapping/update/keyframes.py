@@ -39,6 +39,7 @@ _SHARES = (0.02, 0.95)
 # Least number of looks for the points of a keyframe that can retire it. A keyframe that lost a
 # greater share of its points shows a changed place. Chosen.
 _FEW_LOOKS, _LOST = 20, 0.05
+_FATES = 'confirmed', 'retired', 'added', 'not observed'
 # Least share of the keyframes that a recording of the place confirms.
 _MIN_CONFIRMED_SHARE = 0.3
 
@@ -46,7 +47,7 @@ _MIN_CONFIRMED_SHARE = 0.3
 class KeyframeFate(NamedTuple):
     """What became of a keyframe."""
 
-    fate: str  #: 'confirmed', 'retired', 'not observed' or 'added'
+    fate: str  #: One of _FATES
     position: list[float]  #: Of the camera in the map [m]
     points: int  #: Number of its points
     removed: int = 0  #: Number of points that were removed
@@ -61,13 +62,15 @@ class UpdatedLayer(NamedTuple):
     removed: KeyframeLayer | None  #: The points that were removed; None without any
     fates: tuple[KeyframeFate, ...]  #: Of the old keyframes in their order, then of new ones
 
+    def count(self, fate: str) -> int:
+        """Return the number of keyframes with a fate."""
+        return sum(keyframe.fate == fate for keyframe in self.fates)
+
     def line(self) -> str:
         """Return the numbers of keyframes as text."""
-        fates = [fate.fate for fate in self.fates]
-        counts = (f'{fates.count(name)} {name}' for name in
-                  ('confirmed', 'retired', 'added', 'not observed'))
-        return f'keyframes: {", ".join(counts)}; {sum(fate.removed for fate in self.fates)} ' \
-               'points removed'
+        counts = [f'{self.count(name)} {name}' for name in _FATES]
+        removed = sum(fate.removed for fate in self.fates)
+        return f'keyframes: {", ".join(counts)}; {removed} points removed'
 
 
 # A point without partner: not found, found elsewhere in the image, out of view.
@@ -103,13 +106,11 @@ def check_belongs(updated: UpdatedLayer) -> None:
 
     Without landmarks, nothing else shows that its poses are in the coordinate frame of the map.
     """
-    fates = [fate.fate for fate in updated.fates]
-    there = fates.count('confirmed')
-    if there < max(1.0, _MIN_CONFIRMED_SHARE * (there + fates.count('retired'))):
+    there, gone = updated.count('confirmed'), updated.count('retired')
+    if there < max(1.0, _MIN_CONFIRMED_SHARE * (there + gone)):
         raise MappingError(
-            f'the recording does not belong to this map: it confirms {there} keyframes, and '
-            f'{fates.count("retired")} are not where the map says; check the frame of the poses, '
-            'or build a new map')
+            f'the recording does not belong to this map: {there} keyframes are where it says, '
+            f'{gone} are not; check the frame of the poses, or build a new map')
 
 
 def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks) -> UpdatedLayer:
