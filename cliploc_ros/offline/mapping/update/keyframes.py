@@ -22,7 +22,6 @@ from cliploc_ros.core.map.presence import probability_there
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import Landmarks
 from cliploc_ros.offline.mapping.recordings import join_layers
-from cliploc_ros.offline.recording.keyframe_layer import LEAST_POINTS
 
 # A keyframe is looked for in this number of nearest views, up to this distance of views: 1.2 m or
 # 24 degrees. A feature is at the projection of a point up to this angle: 8 px at f = 525 px.
@@ -36,6 +35,8 @@ _BESIDE = 40.0 / 525.0
 _CUBE_M, _CHANCE, _WORTH, _GONE_BELOW = 0.5, 0.005, 8.0, 0.05
 # Limits of the usual share.
 _SHARES = (0.02, 0.95)
+# A keyframe with fewer points is retired; with fewer found points, it is not confirmed. Chosen.
+_LEAST_POINTS = 20
 # Least number of looks for the points of a keyframe that can retire it. A keyframe that lost a
 # greater share of its points shows a changed place. Chosen.
 _FEW_LOOKS, _LOST = 20, 0.05
@@ -141,11 +142,11 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
     is_searched, removed = expected >= _FEW_LOOKS, np.bincount(owners, is_gone, count)
     is_gone |= (is_searched & (removed > _LOST * sizes))[owners] & ~np.isin(
         np.arange(len(points)), looks.points[is_found])
-    is_kept = (removed == 0) | ((np.bincount(owners, ~is_gone, count) >= LEAST_POINTS) & (
-        ~is_searched | (found >= LEAST_POINTS)))
+    is_kept = (removed == 0) | ((np.bincount(owners, ~is_gone, count) >= _LEAST_POINTS) & (
+        ~is_searched | (found >= _LEAST_POINTS)))
     is_gone |= ~is_kept[owners]
     removed = np.bincount(owners, is_gone, count).astype(np.int64)
-    names = np.where(found >= LEAST_POINTS, 'confirmed', 'not observed')
+    names = np.where(found >= _LEAST_POINTS, 'confirmed', 'not observed')
     shown = np.unique(looks.partners[is_found & ~is_gone[looks.points]])
     is_needed = np.diff(np.searchsorted(shown, new.offsets)) < ENOUGH_INLIERS
     kept, added = old.select(is_kept, ~is_gone), new.select(is_needed)
