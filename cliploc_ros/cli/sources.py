@@ -200,8 +200,7 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
     if options.add is not None:
         if (recording := load_recording(options.add)) is None:
             raise OptionsError(f'--add {options.add}: its recording is missing: give all again')
-        detections, layer = recording.load(), read_layer(
-            options.add, LandmarkMap.from_file(options.add), None)
+        layer = read_layer(options.add, LandmarkMap.from_file(options.add), None)
     else:
         first, *recordings = recordings
         detections, file, images = read_source(first)
@@ -214,7 +213,7 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
             return detections, recording, images, None
         if images is not None and wanted is not None:
             layer = build_layer(images, LandmarkMap.empty(options.frame_id), wanted)
-    parts = [detections]
+    parts = [recording.load() if options.add else detections]
     for own in recordings:
         (seen, _, images), placing = read_source(own), Placing()
         with naming(source_of(own), MappingError):

@@ -157,7 +157,7 @@ def test_observations_are_joined_and_added(run_here, halves, tmp_path):
     assert LandmarkMap.from_file(out).frame_id == 'office'
     assert LandmarkMap.from_file(out).landmark_ids == LandmarkMap.from_file(both).landmark_ids
     assert len(load_recording(out).load()) == 162
-    for wrong, named in ((['--update', out], 'in turn'), (['--keyframe-images'], 'one recording')):
+    for wrong, named in ((['--update', out], 'in turn'), (['--refine-mount'], 'one recording')):
         done = run_here(build_map.main, *options, *wrong, '--out', out)
         assert done.returncode == 1 and named in done.stderr
     done = run_here(build_map.main, '--out', out)
