@@ -212,6 +212,18 @@ def test_a_place_tells_the_distance_of_its_nearest_keyframe(corridor):
     assert set(place.keyframes) == {0, 1} and place.apart == pytest.approx(0.1 / 2.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(('moved_m', 'moved', 'parted'), [
+    (0.6, 15, 15 / 40), (0.1, 15, 0.0), (0.6, 5, 0.0), (0.0, 15, 0.0)])
+def test_a_place_of_which_a_part_was_elsewhere_is_parted(corridor, moved_m, moved, parted):
+    """Less than 8 points agree on no pose, and errors of the map are not a changed place."""
+    layer = corridor.select(np.arange(20) == 18)
+    seen = features_at(layer, 0)
+    layer.points[:moved, 0] += moved_m
+    place = KeyframeLocalizer(layer).localize_features(seen, CAMERA).places[0]
+    # either part may come first: that in more cells of the image
+    assert min(place.parted, 1.0 - place.parted) == pytest.approx(parted, abs=0.03)
+
+
 def test_a_pose_is_refined_by_points_that_matching_missed(corridor):
     """Each point of the second half looks like its neighbour, so none of its matches is clear."""
     layer = corridor.select(np.arange(20) == 18)

@@ -31,8 +31,8 @@ from cliploc_ros.units import NS_PER_S
 _MOST_FOUND = 2000
 # A larger image is scaled down first.
 _LONGEST_PX = 800
-#: An image with fewer points is not a keyframe. Both limit --keyframe-points of build_map.
-LEAST_POINTS = 20
+# An image with fewer points is not a keyframe. Both limit --keyframe-points of build_map.
+_LEAST_POINTS = 20
 # Stored images are for visual inspection; each takes 7 to 9 kB.
 _IMAGE_PX, _JPEG_QUALITY = 256, 60
 # Rays that cross at a smaller angle do not locate a point accurately enough.
@@ -125,14 +125,14 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
     for keyframe, points in zip(seen, of_images, strict=True):
         # the strongest features that have a point
         rows = np.nonzero(np.isfinite(points).all(axis=1))[0][:options.most_points]
-        if len(rows) >= LEAST_POINTS:
+        if len(rows) >= _LEAST_POINTS:
             chosen.append((keyframe, points[rows], rows))
     for part, own in zip(frames.each, parts, strict=True):
         _check_depth(own, kind, f' of {part.camera}' if part.camera else '')
         _check_steps(own, [of_images.pop(0) for _ in own], kind, frames.source, run)
     if not chosen:
         raise MappingError(f'{frames.source}: no keyframe: of {len(seen)} images, none has '
-                           f'{LEAST_POINTS} points; record depth, or overlapping '
+                           f'{_LEAST_POINTS} points; record depth, or overlapping '
                            'images 5 cm apart')
     cameras = [keyframe.camera for keyframe, _, _ in chosen]
     descriptors = np.concatenate([keyframe.posed.descriptors[rows]
@@ -184,7 +184,7 @@ def _check_depth(seen: Sequence[_Keyframe], kind: FeatureKind, of: str) -> None:
             found = triangulate(seen[number].posed, neighbours[number], kind
                                 )[:, 2] / seen[number].points[:, 2]
             ratios += found[np.isfinite(found)].tolist()
-    if len(ratios) >= LEAST_POINTS:
+    if len(ratios) >= _LEAST_POINTS:
         check_scale(float(np.median(ratios)), of, 'triangulated points')
 
 

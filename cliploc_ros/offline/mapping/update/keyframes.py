@@ -22,7 +22,6 @@ from cliploc_ros.core.map.presence import probability_there
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import Landmarks
 from cliploc_ros.offline.mapping.recordings import join_layers
-from cliploc_ros.offline.recording.keyframe_layer import LEAST_POINTS
 
 # A keyframe is looked for in this number of nearest views, up to this distance of views: 1.2 m or
 # 24 degrees. A feature is at the projection of a point up to this angle: 8 px at f = 525 px.
@@ -36,9 +35,12 @@ _BESIDE = 40.0 / 525.0
 _CUBE_M, _CHANCE, _WORTH, _GONE_BELOW = 0.5, 0.005, 8.0, 0.05
 # Limits of the usual share.
 _SHARES = (0.02, 0.95)
+# A keyframe with fewer points is retired; with fewer found points, it is not confirmed. Chosen.
+_LEAST_POINTS = 20
 # Least number of looks for the points of a keyframe that can retire it. A keyframe that lost a
 # greater share of its points shows a changed place. Chosen.
 _FEW_LOOKS, _LOST = 20, 0.05
+_FATES = 'confirmed', 'retired', 'added', 'not observed'
 # Least share of the keyframes that a recording of the place confirms.
 _MIN_CONFIRMED_SHARE = 0.3
 
@@ -46,7 +48,7 @@ _MIN_CONFIRMED_SHARE = 0.3
 class KeyframeFate(NamedTuple):
     """What became of a keyframe."""
 
-    fate: str  #: 'confirmed', 'retired', 'not observed' or 'added'
+    fate: str  #: One of _FATES
     position: list[float]  #: Of the camera in the map [m]
     points: int  #: Number of its points
     removed: int = 0  #: Number of points that were removed
@@ -61,13 +63,15 @@ class UpdatedLayer(NamedTuple):
     removed: KeyframeLayer | None  #: The points that were removed; None without any
     fates: tuple[KeyframeFate, ...]  #: Of the old keyframes in their order, then of new ones
 
+    def count(self, fate: str) -> int:
+        """Return the number of keyframes with a fate."""
+        return sum(keyframe.fate == fate for keyframe in self.fates)
+
     def line(self) -> str:
         """Return the numbers of keyframes as text."""
-        fates = [fate.fate for fate in self.fates]
-        counts = (f'{fates.count(name)} {name}' for name in
-                  ('confirmed', 'retired', 'added', 'not observed'))
-        return f'keyframes: {", ".join(counts)}; {sum(fate.removed for fate in self.fates)} ' \
-               'points removed'
+        counts = [f'{self.count(name)} {name}' for name in _FATES]
+        removed = sum(fate.removed for fate in self.fates)
+        return f'keyframes: {", ".join(counts)}; {removed} points removed'
 
 
 # A point without partner: not found, found elsewhere in the image, out of view.
@@ -103,13 +107,11 @@ def check_belongs(updated: UpdatedLayer) -> None:
 
     Without landmarks, nothing else shows that its poses are in the coordinate frame of the map.
     """
-    fates = [fate.fate for fate in updated.fates]
-    there = fates.count('confirmed')
-    if there < max(1.0, _MIN_CONFIRMED_SHARE * (there + fates.count('retired'))):
+    there, gone = updated.count('confirmed'), updated.count('retired')
+    if there < max(1.0, _MIN_CONFIRMED_SHARE * (there + gone)):
         raise MappingError(
-            f'the recording does not belong to this map: it confirms {there} keyframes, and '
-            f'{fates.count("retired")} are not where the map says; check the frame of the poses, '
-            'or build a new map')
+            f'the recording does not belong to this map: {there} keyframes are where it says, '
+            f'{gone} are not; check the frame of the poses, or build a new map')
 
 
 def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks) -> UpdatedLayer:
@@ -140,11 +142,11 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
     is_searched, removed = expected >= _FEW_LOOKS, np.bincount(owners, is_gone, count)
     is_gone |= (is_searched & (removed > _LOST * sizes))[owners] & ~np.isin(
         np.arange(len(points)), looks.points[is_found])
-    is_kept = (removed == 0) | ((np.bincount(owners, ~is_gone, count) >= LEAST_POINTS) & (
-        ~is_searched | (found >= LEAST_POINTS)))
+    is_kept = (removed == 0) | ((np.bincount(owners, ~is_gone, count) >= _LEAST_POINTS) & (
+        ~is_searched | (found >= _LEAST_POINTS)))
     is_gone |= ~is_kept[owners]
     removed = np.bincount(owners, is_gone, count).astype(np.int64)
-    names = np.where(found >= LEAST_POINTS, 'confirmed', 'not observed')
+    names = np.where(found >= _LEAST_POINTS, 'confirmed', 'not observed')
     shown = np.unique(looks.partners[is_found & ~is_gone[looks.points]])
     is_needed = np.diff(np.searchsorted(shown, new.offsets)) < ENOUGH_INLIERS
     kept, added = old.select(is_kept, ~is_gone), new.select(is_needed)

@@ -237,26 +237,34 @@ def _renew(known: alignment.OldMap, views: Views, judged: judging.Judgement,
     centers, details = old.centers.copy(), list(old.details)
     semi_axes, quats = old.semi_axes.copy(), old.quats_xyzw.copy()
     new_axes, new_quats = judged.landmarks.axes_and_quats()
+    # how well the old ellipsoids fit the boxes
+    rows_of = np.full(len(judged.sight.seen) + 1, -1, dtype=np.int64)
+    rows_of[fates.objects[fates.confirmed]] = fates.confirmed
+    rows_of[-1] = -1
+    fits = gather_evidence(views, known.landmarks, rows_of[judged.shown]).median_iou
+
+    def place(row: int, number: int, weight: float) -> None:
+        centers[row] += weight * (judged.landmarks.centers[number] - centers[row])
+        semi_axes[row], quats[row] = new_axes[number], new_quats[number]
     for row in fates.confirmed:
-        number = fates.objects[row]
-        updated = _looked_for(details[row], judged.sight, number)
+        number, own = fates.objects[row], _looked_for(
+            details[row], judged.sight, fates.objects[row])
         details[row] = replace(
-            updated, baseline_deg=max(updated.baseline_deg or 0.0,
-                                      float(evidence.baseline_deg[number])),
-            last_seen=max(updated.last_seen or 0.0, float(evidence.last_seen[number])))
+            own, baseline_deg=max(own.baseline_deg or 0.0, float(evidence.baseline_deg[number])),
+            last_seen=max(own.last_seen or 0.0, float(evidence.last_seen[number])))
+        sigma, old_sigma = float(judged.refits.sigmas[number]), known.sigmas[row]
+        # a fit to other sides of the object differs, too, but then the old ellipsoid fits
+        is_nudged = fits[row] < MIN_MEDIAN_IOU
+        if own.position_sigma is not None and np.isfinite(sigma) and (
+                is_nudged or sigma < old_sigma):
+            weight = 1.0 if is_nudged else float(old_sigma**2 / (old_sigma**2 + sigma**2))
+            place(row, number, weight)
+            details[row] = replace(details[row], position_sigma=np.sqrt(weight) * sigma)
     for row in fates.moved:
+        place(row, fates.objects[row], 1.0)
         details[row] = _in_new_place(details[row], judged.sight, evidence, fates.objects[row])
     for row in fates.not_observed[judged.is_doubtful[fates.not_observed]].tolist():
         details[row] = _looked_for(details[row], judged.sight, row)
-    placed = dict.fromkeys(fates.moved.tolist(), 1.0) | _refitted(known, views, judged, fates)
-    for row, weight in placed.items():
-        number = fates.objects[row]
-        centers[row] += weight * (judged.landmarks.centers[number] - centers[row])
-        semi_axes[row], quats[row] = new_axes[number], new_quats[number]
-        if row not in fates.moved:
-            sigma = judged.refits.sigmas[number]
-            details[row] = replace(details[row], position_sigma=float(
-                sigma if weight == 1.0 else np.sqrt(weight) * sigma))
     names = tuple(class_names[number] for number in judged.landmarks.classes[fates.new])
     added = LandmarkMap(
         old.frame_id, unused_ids(names, old.landmark_ids), names, names,
@@ -301,24 +309,6 @@ def _one_of_each(updated: LandmarkMap, views: Views, shown: NDArray[np.int64], f
                               class_weights=detail.class_weights)
                       for shape, detail in zip(shapes, joined.details, strict=True))
     ).select(kept.tolist()), numbers[shown], int(np.sum(kept < first_new)), notes
-
-
-def _refitted(known: alignment.OldMap, views: Views, judged: judging.Judgement,
-              fates: identity.Fates) -> dict[int, float]:
-    """Return the weight of the new centre for each confirmed landmark that is refitted."""
-    rows = np.array([row for row in fates.confirmed
-                     if known.map.details[row].position_sigma is not None
-                     and judged.refits.is_known[fates.objects[row]]], dtype=np.int64)
-    numbers = fates.objects[rows]
-    renumbered = np.full(len(judged.sight.seen) + 1, -1, dtype=np.int64)
-    renumbered[numbers] = np.arange(len(rows))
-    before = gather_evidence(views, known.landmarks.select(rows), renumbered[judged.shown])
-    # a fit to other sides of the object also differs, but then the old ellipsoid fits the boxes
-    nudged = before.median_iou < MIN_MEDIAN_IOU
-    old_sigmas, new_sigmas = known.sigmas[rows], judged.refits.sigmas[numbers]
-    weights = np.where(nudged, 1.0, old_sigmas ** 2 / (old_sigmas ** 2 + new_sigmas ** 2))
-    better = nudged | (new_sigmas < old_sigmas)
-    return dict(zip(rows[better].tolist(), weights[better].tolist(), strict=True))
 
 
 def _looked_for(details: LandmarkDetails, sight: Sight, number: int) -> LandmarkDetails:
