@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
 from cliploc_ros.core.map.presence import STAYS, probability_there, worth_of
-from cliploc_ros.offline.mapping.association import associate, find_overlaps
+from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.building import LeftOut, NothingFoundError, build_map, rounded
 from cliploc_ros.offline.mapping.doubles import Relation, close_pairs, relation
 from cliploc_ros.offline.mapping.evidence import MIN_MEDIAN_IOU, Sight, gather_evidence, look_for
@@ -107,7 +107,9 @@ def judge(detections: PosedDetections, aligned: alignment.Aligned, known: alignm
           options: MappingOptions) -> Judgement:
     """Judge each place of the map by the recording, and find the other objects that it shows."""
     count, views = len(known.landmarks.centers), aligned.views
-    finds = _find_new(detections, views, _free(views, known), options)
+    # boxes that no old landmark fits well may show new objects
+    finds = _find_new(detections, views, associate(views, known.landmarks, MIN_MEDIAN_IOU) < 0,
+                      options)
     # weak finds beside an old landmark would take its boxes
     _, sight = _look(views, known, finds, np.zeros(count, dtype=np.bool_))
     beside = {new for new, _, _ in _pairs_between(finds.landmarks, known.landmarks)}
@@ -197,25 +199,6 @@ def _look(views: Views, known: alignment.OldMap, finds: Finds, is_gone: NDArray[
     is_solid = np.concatenate([~is_gone, np.ones(len(finds.each), dtype=np.bool_)])
     shown = associate(views, places, among=is_solid)
     return shown, look_for(views, places, shown, is_solid)
-
-
-def _free(views: Views, known: alignment.OldMap) -> NDArray[np.bool_]:
-    """Return a mask of the boxes (n,) that may show new objects: no old landmark fits them well.
-
-    Boxes of other classes on a landmark are excluded if it has at least as many boxes of its
-    classes: they may be another name for it.
-    """
-    own = associate(views, known.landmarks, MIN_MEDIAN_IOU)
-    boxes, landmarks, _ = find_overlaps(
-        views._replace(classes=np.zeros_like(views.classes)),
-        Landmarks(known.landmarks.centers, known.landmarks.bases,
-                  np.zeros_like(known.landmarks.classes)), MIN_MEDIAN_IOU)
-    others = own[boxes] < 0
-    on, count = landmarks[others], len(known.sigmas)
-    is_named = np.bincount(own[own >= 0], minlength=count) >= np.bincount(on, minlength=count)
-    free = own < 0
-    free[boxes[others][is_named[on]]] = False
-    return free
 
 
 def _find_new(detections: PosedDetections, views: Views, is_free: NDArray[np.bool_],
