@@ -41,7 +41,9 @@ def detail_of(found: Relocalization, frame_id: str, figures: Mapping[str, Any] |
     assert found.map_from_camera is not None and found.covariance is not None
     evidence, points, depth = found.evidence, found.recognized, found.depth
     by = [f'{evidence.inliers} landmarks'] if evidence and found.source != 'keyframes' else []
-    by += [f'{points.inliers} keyframe points'] if points and found.source != 'objects' else []
+    if points and found.source != 'objects':
+        by.append(f'{points.inliers} keyframe points'
+                  + f' of {points.recorded}' * bool(points.recorded))
     by += [f'depth of {depth.objects} objects'] if depth and depth.is_passed else []
     by += ['the prior'] if evidence and evidence.prior else []
     images = len(found.frame_matches)

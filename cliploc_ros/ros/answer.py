@@ -107,6 +107,7 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
         f'{compared} of {len(seen.detections)}',
         'keyframe points': 0 if points is None else points.inliers,
         'keyframe search': found.keyframe_search,
+        'keyframe recording': '' if points is None else points.recorded,
         'depth': '' if depth is None else f'depth of {depth.objects} objects' if depth.is_passed
         else 'depth contradicts the boxes',
         'cameras': len(localized.query.frames), 'left out': ', '.join(localized.left_out),

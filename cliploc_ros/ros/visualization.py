@@ -61,16 +61,20 @@ def landmark_markers(landmark_map: LandmarkMap, layer: KeyframeLayer | None = No
     """Return an ellipsoid and a text for each landmark, coloured by class.
 
     With several maps, the markers are in the coordinate frame of their map. The cameras of
-    keyframes are in the namespace `keyframes`; with several maps, they are not shown.
+    keyframes are in the namespace `keyframes`, of several recordings with the name of theirs; with
+    several maps, they are not shown.
     """
     markers = [Marker(header=Header(frame_id=landmark_map.frame_id), action=Marker.DELETEALL)]
     for part in parts_of(landmark_map):
         markers += _markers_of(part.landmark_map, part.first)
     if layer is not None and not layer.parts:
-        shown = range(0, len(layer), -(-len(layer) // MAX_SHOWN))  # every n-th of a large layer
-        markers.append(_line_marker(Header(frame_id=layer.frame_id), 'keyframes', _KEYFRAMES, [
-            end for edge in frusta([layer.camera_of(row) for row in shown],
-                                   layer.map_from_camera[shown], _FRUSTUM_M) for end in edge]))
+        parts: dict[str, list[int]] = {}
+        for row in range(0, len(layer), -(-len(layer) // MAX_SHOWN)):  # every n-th of many
+            parts.setdefault(f'keyframes {layer.recorded(row)}'.strip(), []).append(row)
+        markers += [_line_marker(Header(frame_id=layer.frame_id), name, _KEYFRAMES, [
+            end for edge in frusta([layer.camera_of(row) for row in rows],
+                                   layer.map_from_camera[rows], _FRUSTUM_M) for end in edge])
+            for name, rows in parts.items()]
     return MarkerArray(markers=markers)
 
 

@@ -160,6 +160,11 @@ class KeyframeLayer:
         return (f'the camera differs from that of the keyframes: fx {camera.fx:.1f} at width '
                 f'{camera.width} px, theirs {own.fx:.1f} at {own.width} px; check camera_info')
 
+    def recorded(self, keyframe: int) -> str:
+        """Return recording and date of a keyframe; '' if all are of one recording."""
+        row = 0 if self.source_rows is None else int(self.source_rows[keyframe])
+        return ' '.join(self.sources[row]).strip() if len(self.sources) > 1 else ''
+
     def rows(self, keyframe: int) -> slice:
         """Return the slice of the points of a keyframe."""
         ends = self.offsets[1:] if self.ends is None else self.ends

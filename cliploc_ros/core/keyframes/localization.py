@@ -369,7 +369,8 @@ class KeyframeLocalizer:
             look.features.pixels[place.inliers.features], place.inliers.rows,
             place.inliers.points, is_thorough,
             float(_distances(self.layer.map_from_camera[used], pose).min()),
-            place.parted / (place.agreed + place.parted))
+            place.parted / (place.agreed + place.parted),
+            self.layer.recorded(int(used[0])))
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
                ) -> _Matched:

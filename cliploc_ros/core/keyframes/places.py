@@ -48,6 +48,7 @@ class RecognizedPlace(NamedTuple):
     #: Share, 0 to 1, of the agreeing features that agree on another pose nearby: a part of the
     #: place was elsewhere when it was mapped
     parted: float = 0.0
+    recorded: str = ''  #: Recording of the keyframe with most points, see KeyframeLayer.recorded
 
 
 class Recognition(NamedTuple):

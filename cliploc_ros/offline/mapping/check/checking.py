@@ -6,6 +6,7 @@ The report advises how to improve the map, the most urgent advice first. Causes 
 effects: a robot that is misled in a place that looks like another one needs no separate advice.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -118,6 +119,9 @@ def check_map(landmark_map: LandmarkMap, detections: PosedDetections | None = No
             None if layer is None or image_of is None else relocalization.RecordedKeyframes(
                 layer, image_of))
     notes.append(_where_cameras_can_be(recorded))
+    if layer is not None and len(layer.sources) > 1:
+        counts = Counter(map(layer.recorded, range(len(layer))))
+        notes.append('keyframes: ' + ', '.join(f'{counts[name]} of {name}' for name in counts))
     overlaps = findings.find_map_overlaps(landmark_map, witness, views)
     path = None if layer is None else layer.map_from_camera
     places = findings.make_grid(landmark_map, path if detections is None else
