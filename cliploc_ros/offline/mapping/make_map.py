@@ -260,11 +260,11 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
     if len(old):
         found = update_landmarks(old, detections, options, load_embeddings_of_map(
             path, old.landmark_ids, old.map_set), load_removed(path, old.map_set.family))
-        gone = found.gone
         made = _with_layer(_label_new(found, detections, labeller), frames, layer)
-        if made.layer is not None:
-            made = replace(made, layer=replace(made.layer, map_from_camera=(
-                found.map_from_given @ made.layer.map_from_camera)))
+        gone = found.gone
+        if (new := made.layer) is not None:
+            made = replace(made, layer=replace(
+                new, map_from_camera=found.map_from_given @ new.map_from_camera))
     else:
         made, gone = make_map(detections, labeller, options, frames, layer), Landmarks.none()
     made = replace(made, updated=old.map_set)
@@ -304,25 +304,24 @@ def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording
     CliplocError: a file cannot be written, or another program changed the map while it was
     updated; nothing was changed.
     """
-    layer, landmark_map, lines = made.layer, made.landmark_map, []
-    if made.updated is not None and updated is not None and path.resolve() == updated.resolve() \
-            and LandmarkMap.from_file(path).map_set != made.updated:
+    is_in_place = updated is not None and path.resolve() == updated.resolve()
+    if is_in_place and LandmarkMap.from_file(path).map_set != made.updated:
         raise MapError(f'{path}: another program changed it during this update; update again')
     besides: dict[Path, WriteOfSet | None] = {
-        recording_path(path): partial(save_recording, path, recording)}
-    if layer is not None:
-        besides[layer_path(path)] = lambda place, digest: save_layer(
-            place, replace(layer, set_digest=digest))
-    else:
-        lines += [removed_layer(path)] * layer_path(path).exists()
-        besides[layer_path(path)] = None
-    went = made.keyframes and made.keyframes.removed
-    besides[layer_path(removed_path(path))] = None if went is None else (
-        lambda place, digest: save_layer(place, replace(went, set_digest=digest)))
-    besides[removed_path(path)] = partial(write_landmarks, landmark_map=replace(
-        made.removed, map_set=landmark_map.map_set)) if made.removed else None
-    write_map(path, landmark_map, comments, made.embeddings, besides)
-    if layer is None:
-        return lines
+        recording_path(path): partial(save_recording, path, recording),
+        removed_path(path): partial(
+            write_landmarks, landmark_map=made.removed) if made.removed else None}
+    for place, layer in ((layer_path(path), made.layer), (
+            layer_path(removed_path(path)), made.keyframes and made.keyframes.removed)):
+        besides[place] = None if layer is None else partial(_write_layer, layer)
+    had_layer = layer_path(path).exists()
+    write_map(path, made.landmark_map, comments, made.embeddings, besides)
+    if made.layer is None:
+        return [removed_layer(path)] * had_layer
     megabytes = layer_path(path).stat().st_size / 1e6
-    return [f'{counted(len(layer), "keyframe")} of {megabytes:.1f} MB in {layer_path(path).name}']
+    return [f'{counted(len(made.layer), "keyframe")} of {megabytes:.1f} MB in '
+            f'{layer_path(path).name}']
+
+
+def _write_layer(layer: KeyframeLayer, place: Path, digest: str) -> None:
+    save_layer(place, replace(layer, set_digest=digest))

@@ -84,18 +84,13 @@ class _Looks(NamedTuple):
     points: NDArray[np.int64]  #: (l,): row of the old point
     partners: NDArray[np.int64]  #: (l,): row of the new point that it matches, or see above
 
-    @property
-    def matched(self) -> '_Looks':
-        """Return the looks that found the point, at its place or elsewhere."""
-        return _Looks(*(column[self.partners != _MISSED] for column in self))
-
     def are_gone(self, places: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return a mask of the points (n,) whose places are gone; `places` (n,) has numbers."""
         expected, found = (np.bincount(places[self.points], weights, places.max() + 1)
                            for weights in (None, self.partners >= 0))
         found = np.where(found > 2.0 * _CHANCE * expected, found, 0.0)
-        share = found.sum() / max(1.0, expected[found > 0.0].sum())
-        likely = probability_there(found, expected, np.clip(share, *_SHARES), _WORTH, _CHANCE)
+        share = np.clip(found.sum() / max(1.0, expected[found > 0.0].sum()), *_SHARES)
+        likely = probability_there(found, expected, share, _WORTH, _CHANCE)
         return np.asarray(likely < _GONE_BELOW)[places]
 
 
@@ -133,9 +128,10 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
     cubes, is_gone = cubes.ravel(), np.zeros(len(points), dtype=np.bool_)
     for center, basis in zip(gone.centers, gone.bases, strict=True):
         is_gone |= normalized_lengths(points - center, (basis @ basis.T)[None]) < 1.0
-    for seen, places in product((looks, looks.matched), (owners, cubes, cubes * count + owners)):
+    is_found, is_matched = looks.partners >= 0, looks.partners != _MISSED
+    matched = _Looks(looks.points[is_matched], looks.partners[is_matched])
+    for seen, places in product((looks, matched), (owners, cubes, cubes * count + owners)):
         is_gone |= seen.are_gone(places)
-    is_found = looks.partners >= 0
     expected, found = (np.bincount(owners[rows], minlength=count) for rows in (
         looks.points, looks.points[is_found]))
     # a keyframe of a changed place keeps the points that were found, if these are enough
