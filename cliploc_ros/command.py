@@ -277,7 +277,6 @@ class StageBar:
         from tqdm import tqdm  # late, so that --help is fast
 
         self._bar = tqdm(total=100, disable=None, bar_format='{desc}: {percentage:3.0f} % |{bar}|')
-        self._stage = ''
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -286,9 +285,8 @@ class StageBar:
 
     def show(self, stage: str, share: float) -> None:
         """Show a stage and how much of it is done, 0 to 1."""
-        if self._bar.disable and stage != self._stage:
+        if self._bar.disable and stage != getattr(self._bar, 'desc', ''):
             print(f'{stage} ...', file=sys.stderr, flush=True)
-        self._stage = stage
         self._bar.set_description_str(stage, refresh=False)
         self._bar.n = round(100 * share)
         self._bar.refresh()

@@ -41,9 +41,8 @@ def detail_of(found: Relocalization, frame_id: str, figures: Mapping[str, Any] |
     assert found.map_from_camera is not None and found.covariance is not None
     evidence, points, depth = found.evidence, found.recognized, found.depth
     by = [f'{evidence.inliers} landmarks'] if evidence and found.source != 'keyframes' else []
-    if points and found.source != 'objects':
-        by.append(f'{points.inliers} keyframe points'
-                  + f' of {points.recorded}' * bool(points.recorded))
+    by += [f'{points.inliers} keyframe points{points.recorded and f" of {points.recorded}"}'
+           ] if points and found.source != 'objects' else []
     by += [f'depth of {depth.objects} objects'] if depth and depth.is_passed else []
     by += ['the prior'] if evidence and evidence.prior else []
     images = len(found.frame_matches)

@@ -62,10 +62,10 @@ def resolved(node: Node, topic: str) -> str:
 def why_silent(node: Node, name: str, topic: str, message_type: type) -> str:
     """Return why nothing arrives on a topic (its full name), with the remedy."""
     offered = {info.topic_type for info in node.get_publishers_info_by_topic(topic)}
-    package, kind = message_type.__module__.split('.')[0], message_type.__name__
-    if offered and f'{package}/msg/{kind}' not in offered:
+    wanted = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
+    if offered and wanted not in offered:
         return (f'no {name}: {topic} has messages of type {", ".join(sorted(offered))}, expected '
-                f'{package}/msg/{kind}: remap {name}, or set image_transport')
+                f'{wanted}: remap {name}, or set image_transport')
     if offered:
         return (f'no {name} on {topic} from its {node.count_publishers(topic)} publisher(s): '
                 'check that it publishes, and that its QoS is compatible; or it is slow')

@@ -198,10 +198,8 @@ def find_misfit(results: Sequence[Result], queries: Sequence[PosedQuery], timed:
     pairs = [(result.map_from_camera, query.map_from_camera)
              for result, query in zip(results, queries, strict=True) if result.solved]
     pairs = pairs[::-(-len(pairs) // _COMPARED) or 1]
-    if len(pairs) < min(_LEAST_GIVEN, len(queries)):
-        return _late(results, timed)
     if len(pairs) < _LEAST_GIVEN:
-        return ''
+        return _late(results, timed)
     given, truth = np.array(pairs).transpose(1, 0, 2, 3)
 
     def errors_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -253,7 +251,7 @@ def _late(results: Sequence[Result], poses: TimedPoses) -> str:
         offsets_ms.append(gaps_ms[np.abs(gaps_ms).argmin()])
     median_ms = float(np.median(offsets_ms))
     spread_ms = float(np.median(np.abs(np.array(offsets_ms) - median_ms)))
-    return '' if spread_ms > GIVEN_TOLERANCE_MS else (
+    return '' if abs(median_ms) <= GIVEN_TOLERANCE_MS or spread_ms > GIVEN_TOLERANCE_MS else (
         f'note: {results[0].method}: its stamps are {median_ms:+.0f} ms off those of the queries: '
         'correct them')
 
