@@ -4,10 +4,12 @@
 
 A reader is defined by a table of fields. Files are untrusted: an invalid file causes an error that
 names the file, the array and the row. Pickles are refused, checksums are verified, and no array
-takes more memory than the file declares.
+takes more memory than the file declares. Large arrays may be mapped: such a file must be replaced,
+never overwritten.
 """
 
 import math
+import mmap
 import os
 import zipfile
 from collections.abc import Callable, Mapping
@@ -27,6 +29,8 @@ Arrays = Mapping[str, NDArray[Any]]
 # Groups of NumPy types by their kind codes. A field may also name a single NumPy type.
 _KINDS = {'text': 'U', 'numbers': 'fiu', 'floats': 'f', 'integers': 'iu', 'booleans': 'b'}
 _ROWS_AT_ONCE = 10_000
+# A larger array may be mapped; its checksum is verified in blocks of this size.
+_MAPPED_BYTES, _BLOCK_BYTES = 16 * 2**20, 2**20
 # Maximum memory of the arrays: this number of bytes, or this multiple of the file's size on disk.
 # A small or sparse file may declare arrays of any size.
 _MOST_BYTES, _MOST_GROWTH = 512 * 2**20, 8
@@ -96,6 +100,8 @@ class Field:
     #: Checks that take the name and all arrays, and raise ArrayError
     checks: tuple[Callable[[str, Arrays], None], ...] = ()
     is_optional: bool = False
+    #: Whether a large array is mapped: its rows are loaded when they are used
+    is_mapped: bool = False
 
 
 @dataclass(frozen=True)
@@ -205,24 +211,37 @@ class Schema:
         arrays = {}
         for name, member in wanted.items():
             try:
-                arrays[name] = _array(archive, member)
+                arrays[name] = _array(
+                    archive, member, file.fileno() if self.fields[name].is_mapped else None)
             except Exception as error:  # NumPy and zipfile may raise any exception, see above
                 raise ArrayError(f'array {name} cannot be read: {error}') from error
         return arrays
 
 
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read an array of a file; it takes no more memory than the archive declares."""
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, mapped: int | None) -> Any:
+    """Read an array of a file; it takes no more memory than the archive declares.
+
+    A large array is mapped if the file's descriptor is given.
+    """
     with archive.open(member) as stream:
         version = np.lib.format.read_magic(stream)
         read = (np.lib.format.read_array_header_1_0 if version == (1, 0)
                 else np.lib.format.read_array_header_2_0)
-        shape, _, dtype = read(stream)
+        shape, is_by_columns, dtype = read(stream)
         size, expected = member.file_size - stream.tell(), math.prod(shape) * dtype.itemsize
         if dtype.hasobject:
             raise ValueError('it contains Python objects')
         if size != expected:
             raise ValueError(f'it has {size} bytes, expected {expected}')
+        if mapped is not None and size > _MAPPED_BYTES and not (
+                is_by_columns or member.compress_type):
+            # the values follow the local header (30 bytes and two texts) and that of NumPy
+            lengths = np.frombuffer(os.pread(mapped, 4, member.header_offset + 26), '<u2')
+            start = member.header_offset + 30 + int(lengths.sum()) + stream.tell()
+            while stream.read(_BLOCK_BYTES):
+                pass  # the last block verifies the checksum
+            content = memoryview(mmap.mmap(mapped, 0, access=mmap.ACCESS_READ))
+            return np.frombuffer(content, dtype, math.prod(shape), start).reshape(shape)
         stream.seek(0)
         array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
     return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array

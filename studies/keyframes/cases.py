@@ -234,7 +234,8 @@ def twin(share: float, removed: int, world: World, rng: Rng) -> World:
             np.concatenate([landmarks.quats_xyzw, second.quats_xyzw]),
             landmarks.details + second.details),
         replace(layer, map_from_camera=np.concatenate([layer.map_from_camera, poses]),
-                offsets=np.concatenate([layer.offsets, offsets]), **columns), shift)
+                offsets=np.concatenate([layer.offsets, offsets]), deviation_per_metre=np.append(
+                    layer.deviations(), layer.deviations()[:count]), **columns), shift)
 
 
 def _level_direction(rng: Rng) -> Floats:

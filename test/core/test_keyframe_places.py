@@ -15,12 +15,13 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import invert_transform, make_transform, pose_error
 from cliploc_ros.core.keyframes import localization
 from cliploc_ros.core.keyframes.features import DIMENSIONS, SIFT, Features, extract
-from cliploc_ros.core.keyframes.layer import layer_path, load_layer_of_map, save_layer
+from cliploc_ros.core.keyframes.layer import Source, layer_path, load_layer_of_map, save_layer
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.keyframes.point_pose import find_pose, free_focal, refine
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
+from cliploc_ros.offline.recording import layer_words
 from cliploc_ros.offline.recording.keyframe_layer import PosedFeatures, triangulate
 
 KEYFRAMES, POINTS = 6, 40
@@ -49,6 +50,42 @@ def test_a_layer_comes_back_as_it_was(file):
     for name in ('map_from_camera', 'offsets', 'pixels', 'points', 'descriptors', 'words',
                  'vocabulary'):
         assert np.array_equal(getattr(after, name), getattr(before, name)), name
+
+
+def test_deviations_and_recordings_of_keyframes_come_back(tmp_path):
+    deviations, sources = np.linspace(0.0, 0.1, KEYFRAMES), (Source('monday', '2026-11-23'),
+                                                             Source('friday'))
+    save_layer(tmp_path / 'room.npz', replace(
+        make_layer(ROOM), deviation_per_metre=deviations, sources=sources,
+        source_rows=np.array([0, 0, 0, 1, 1, 1])))
+    after = load_layer_of_map(tmp_path / 'room.npz', ROOM)
+    np.testing.assert_array_equal(after.deviations(), deviations)
+    assert after.sources == sources and after.source_rows.tolist() == [0, 0, 0, 1, 1, 1]
+
+
+def test_a_layer_of_version_1_has_one_deviation_and_no_recordings(file):
+    rewrite(file, {'version': 1, 'deviation_per_metre': 0.02, 'sources': []},
+            deviation_per_metre=None)
+    layer = load_layer_of_map(file, ROOM)
+    assert layer.deviations().tolist() == [0.02] * KEYFRAMES
+    assert layer.sources == () and layer.source_rows is None
+    rewrite(file, {'deviation_per_metre': 1.5})
+    with pytest.raises(MapError, match='deviation_per_metre is not 0 to 1'):
+        load_layer_of_map(file, ROOM)
+
+
+def test_mapped_arrays_survive_a_replaced_file_and_a_flipped_bit_is_found(file, monkeypatch):
+    monkeypatch.setattr('cliploc_ros.files.arrays._MAPPED_BYTES', 0)
+    before, layer = make_layer(ROOM), load_layer_of_map(file, ROOM)
+    assert not layer.descriptors.flags.owndata
+    save_layer(file, replace(before, descriptors=before.descriptors[::-1]))
+    for name in ('pixels', 'points', 'descriptors'):
+        np.testing.assert_array_equal(getattr(layer, name), getattr(before, name))
+    content = bytearray(file.read_bytes())
+    content[content.index(before.descriptors[-1].tobytes()) + 5] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(MapError, match='descriptors cannot be read: Bad CRC'):
+        load_layer_of_map(file, ROOM)
 
 
 def test_an_edited_map_keeps_its_layer(file):
@@ -115,6 +152,53 @@ def test_one_keyframe_and_one_without_points_are_searched(corridor, has_empty, f
                                                         fast=fast).places
     assert place.inliers == POINTS
     assert place.map_from_camera[:3, 3] == pytest.approx([180.1, 0.0, 0.0], abs=1e-3)
+
+
+def test_a_view_finds_what_a_copy_finds(corridor):
+    chosen = np.arange(20) % 3 == 0
+    view, copy = corridor.view(chosen), corridor.select(chosen)
+    assert view.points is corridor.points
+    seen = features_at(corridor, 18)
+    units = SIFT.units(seen.descriptors)
+    np.testing.assert_array_equal(view.similarities(units), copy.similarities(units))
+    place, same = (KeyframeLocalizer(layer).localize_features(seen, CAMERA).places[0]
+                   for layer in (view, copy))
+    np.testing.assert_array_equal(place.map_from_camera, same.map_from_camera)
+    np.testing.assert_array_equal(view.view(np.arange(7) == 6).plain().points,
+                                  corridor.points[18 * POINTS:19 * POINTS])
+
+
+def test_points_are_left_out(corridor):
+    kept = np.arange(20 * POINTS) % POINTS < 30
+    layer = corridor.select(np.arange(20) > 9, kept)
+    assert np.diff(layer.offsets).tolist() == [30] * 10
+    np.testing.assert_array_equal(layer.descriptors[:30], corridor.descriptors[
+        10 * POINTS:10 * POINTS + 30])
+
+
+def test_a_large_layer_is_compressed_and_finds_the_same_places(corridor, monkeypatch, file):
+    """It has two levels of words, and codes; a layer that is joined or changed is plain again."""
+    random = np.random.default_rng(3)
+    near = np.clip(random.integers(0, 120, (30, DIMENSIONS))[random.integers(0, 30, 20 * POINTS)]
+                   + random.normal(0.0, 12.0, corridor.descriptors.shape), 0, 255)
+    corridor = replace(corridor, descriptors=near.astype(np.uint8))
+    for name, value in (('_LARGE', 1), ('_TWO_LEVELS', 1), ('_IN_GROUP', 3), ('WORDS', 32)):
+        monkeypatch.setattr(layer_words, name, value)
+    monkeypatch.setattr('cliploc_ros.core.keyframes.layer.WORDS', 32)
+    save_layer(file, layer_words.with_words(corridor))
+    layer = load_layer_of_map(file, ROOM)
+    assert layer.descriptors.shape[1] == 16 and layer.vocabulary.shape == (96, DIMENSIONS)
+    cosines = np.sum(SIFT.units(layer.plain().descriptors) * SIFT.units(corridor.descriptors), 1)
+    assert np.median(cosines) > 0.97
+    for keyframe in (0, 7, 18):
+        seen = features_at(corridor, keyframe)
+        assert np.argmax(layer.similarities(SIFT.units(seen.descriptors))) == keyframe
+        place, = KeyframeLocalizer(layer).localize_features(seen, CAMERA).places
+        assert place.map_from_camera[0, 3] == pytest.approx(10.0 * keyframe + 0.1, abs=0.01)
+    again = layer_words.with_words(layer.plain())
+    assert again.codebook is not None and again.points.dtype == np.float16
+    np.testing.assert_array_equal(layer_words.with_words(corridor).descriptors,
+                                  layer.descriptors, 'equal layers have equal codes')
 
 
 def test_a_place_tells_the_distance_of_its_nearest_keyframe(corridor):
@@ -230,6 +314,9 @@ def test_the_layer_of_another_map_is_named(file, other, message):
     ({'header': {'camera': 7}}, 'camera'), ({'points': None}, 'points'),
     ({'points': np.zeros((3, 3), np.float32)}, r'points has shape'),
     ({'camera_rows': np.ones(KEYFRAMES, np.int64)}, 'outside the 1 cameras'),
+    ({'source_rows': np.ones(KEYFRAMES, np.int64)}, 'outside the 1 sources'),
+    ({'codebook': np.zeros((DIMENSIONS, 256, 2), np.int16)}, 'of 128 dimensions'),
+    ({'vocabulary': np.zeros((1025, DIMENSIONS), np.uint8)}, '1025 words'),
     ({'map_from_camera': np.full((KEYFRAMES, 4, 4), np.nan)}, 'in row 0'),
     ({'words': np.full(KEYFRAMES * POINTS, 60_000, np.uint16)}, 'words')])
 def test_malformed_files_are_named(file, changes, message):

@@ -9,7 +9,7 @@ words of a large layer have two levels (Nister and Stewenius, "Scalable recognit
 vocabulary tree", 2006), and its descriptors are compressed: to the word and a product-quantized
 residual (Jegou et al., "Product quantization for nearest neighbor search", 2011).
 
-The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Its arrays are read completely.
+The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Large arrays of points are mapped.
 """
 
 import hashlib
@@ -230,13 +230,14 @@ class KeyframeLayer:
 
 def nearest_words(descriptors: NDArray[np.float32], vocabulary: NDArray[np.float32]
                   ) -> NDArray[np.int64]:
-    """Return the index (n,) of the most similar word of each descriptor; both are unit vectors.
+    """Return the word (n,) with the greatest product with each descriptor; both are unit vectors.
 
     Of more than WORDS words, those of the group with the most similar mean are compared.
     """
     groups = vocabulary.reshape(min(WORDS, len(vocabulary)), -1, vocabulary.shape[1])
     means, found = groups.sum(axis=1), []
-    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
+    if groups.shape[1] > 1:
+        means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
     for part in np.array_split(descriptors.reshape(-1, vocabulary.shape[1]),
                                1 + len(descriptors) // 4096):
         nearest = np.argmax(part @ means.T, axis=1)
@@ -259,9 +260,9 @@ _SCHEMA = Schema('file of keyframes', {
     'map_from_camera': Field('float64', ('K', 4, 4), (
         FINITE, Check('is not a rigid transform', lambda poses: ~are_rigid(poses)))),
     'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
-    'pixels': Field('uint16', ('n', 2)),
-    'points': Field('floats', ('n', 3), (FINITE,)),
-    'descriptors': Field('uint8', ('n', 'c')),
+    'pixels': Field('uint16', ('n', 2), is_mapped=True),
+    'points': Field('floats', ('n', 3), (FINITE,), is_mapped=True),
+    'descriptors': Field('uint8', ('n', 'c'), is_mapped=True),
     'words': Field('uint16', ('n',), (_check_words,)),
     'vocabulary': Field('uint8', ('W', 'd')),
     'codebook': Field('int16', ('c', 256, 's'), is_optional=True),  # if they are compressed
@@ -269,7 +270,7 @@ _SCHEMA = Schema('file of keyframes', {
     'deviation_per_metre': Field('float64', ('K',), is_optional=True),
     'source_rows': Field('int64', ('K',), is_optional=True),  # missing if there is one source
     # both missing unless images were requested
-    'images': Field('uint8', ('b',), is_optional=True),
+    'images': Field('uint8', ('b',), is_optional=True, is_mapped=True),
     'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
     # missing if there is a single camera; the header contains the cameras
     'camera_rows': Field('int64', ('K',), is_optional=True),

@@ -148,8 +148,8 @@ def build_layer(frames: Frames, landmark_map: LandmarkMap, options: LayerOptions
         np.clip(np.round(pixels * layer.PIXEL_SCALE), 0, 65535).astype(np.uint16),
         np.concatenate([points for _, points, _ in chosen]).astype(np.float32),
         descriptors, np.zeros(len(descriptors), np.uint16), descriptors[:1],
-        layer.FROM_DEPTH if any(np.isfinite(keyframe.depths).any() for keyframe in seen)
-        else layer.TRIANGULATED,
+        np.array([layer.FROM_DEPTH if np.isfinite(keyframe.depths).any() else layer.TRIANGULATED
+                  for keyframe, _, _ in chosen]),
         camera_rows=None if len(different) == 1 else np.array(
             [different.index(own) for own in cameras]), kind=kind,
         sources=(layer.Source(frames.source.name, date),)))

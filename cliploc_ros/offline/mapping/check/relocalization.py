@@ -66,7 +66,7 @@ class RecordedKeyframes(NamedTuple):
     def elsewhere(self, pose: NDArray[np.float64]) -> KeyframeLocalizer | None:
         """Return the keyframes of other views than that of a pose; None if there are none."""
         is_other = ~SAME_BOXES.agreeing(self.layer.map_from_camera, pose[None])[:, 0]
-        return KeyframeLocalizer(self.layer.select(is_other)) if is_other.any() else None
+        return KeyframeLocalizer(self.layer.view(is_other)) if is_other.any() else None
 
     def with_image(self, query: PosedQuery) -> PosedQuery:
         """Return the query of a recorded frame with its image, unless it is missing."""
@@ -198,7 +198,7 @@ def try_recording(landmark_map: LandmarkMap, detections: PosedDetections,
         if keyframes is not None and fold.training[taken_at].any():
             # with all landmarks, since those of places that look alike refuse keyframes, too
             of_both = Localizer(make_relocalizer(whole, options), KeyframeLocalizer(
-                keyframes.layer.select(fold.training[taken_at])))
+                keyframes.layer.view(fold.training[taken_at])))
         for frame in sorted(chosen.intersection(fold.frames.tolist())):
             tell((len(trials) + 1) / len(chosen))
             seen = shown[slice(*detections.frame_offsets[frame:frame + 2])]
