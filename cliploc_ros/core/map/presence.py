@@ -24,11 +24,9 @@ from cliploc_ros.core.map.visibility import SIDES, Expected
 Values = float | NDArray[Any]
 #: Share of the objects that are usually still in their place. Chosen.
 STAYS = 0.9
-# A usual share counts as this number of looks at most: an object may be hard to see from one side.
-_MOST_WORTH = 4.0
-# Median of the square of a standard normal variable; least worth of a usual share [looks], and
-# least number of places and of looks at each to estimate the worth. Chosen.
-_MEDIAN_SQUARE, _LEAST_WORTH, _FEW_PLACES, _FEW_LOOKS = 0.455, 0.5, 5, 3
+#: A usual share counts as this number of looks, as an object may be hard to see from one side.
+#: Chosen.
+WORTH = 4.0
 # The watch: prior of the share of looks that find a present landmark: mean over all landmarks,
 # weight of this mean in looks, and weight of the overall share (or of the map's seen_ratio) in
 # looks where a single landmark is judged. Chosen.
@@ -55,31 +53,6 @@ def log_evidence(found: Values, missed: Values, seen: Values, misses: Values) ->
     return betaln(found + seen, missed + misses) - betaln(found, missed)
 
 
-def log_odds_there(stays: float, there: Values, away: Values) -> Values:
-    """Return the log odds that an object is in its place.
-
-    `stays` is its prior probability; `there` and `away` are the log evidence of the looks if the
-    object is in its place, and if it is gone.
-    """
-    return log(stays / (1.0 - stays)) + there - away
-
-
-def worth_of(seen: NDArray[Any], expected: NDArray[Any], shares: NDArray[np.float64]) -> float:
-    """Return the number of looks that the usual shares (L,) count as, see probability_there.
-
-    They count as fewer looks if the places scatter about them.
-    """
-    rows = (seen > 0) & (expected >= _FEW_LOOKS)
-    if np.count_nonzero(rows) < _FEW_PLACES:
-        return _MOST_WORTH
-    # a beta variable of mean r and n looks has the variance r (1 - r) / (n + 1); the median
-    # excludes objects that are gone, which are not scatter
-    usual = shares[rows]
-    scatter = np.median(np.square(seen[rows] / expected[rows] - usual)
-                        / (usual * (1.0 - usual))) / _MEDIAN_SQUARE
-    return float(np.clip(1.0 / max(float(scatter), 1e-3) - 1.0, _LEAST_WORTH, _MOST_WORTH))
-
-
 def probability_there(seen: NDArray[Any], expected: NDArray[Any], shares: Values, worth: float,
                       chance: float) -> NDArray[np.float64]:
     """Return for each place (L,) the probability that its object is there.
@@ -96,8 +69,8 @@ def probability_there(seen: NDArray[Any], expected: NDArray[Any], shares: Values
         Share of the looks that find an object that is gone.
     """
     there, away = (log_evidence(looks * share, looks * (1.0 - share), seen, expected - seen)
-                   for looks, share in ((worth, shares), (_MOST_WORTH, chance)))
-    return np.asarray(expit(log_odds_there(STAYS, there, away)))
+                   for looks, share in ((worth, shares), (WORTH, chance)))
+    return np.asarray(expit(log(STAYS / (1.0 - STAYS)) + there - away))
 
 
 class _Record(NamedTuple):
@@ -120,7 +93,8 @@ class _Record(NamedTuple):
         missed = _OF_SHARE * (1.0 - share) + self.missed
         misses = min(self.misses, max(0.0, found / _BY_CHANCE - found - missed))
         there = log_evidence(found, missed, 0.0, misses)
-        return float(expit(-log_odds_there(1.0 - _GONE, there, misses * log(1.0 - _BY_CHANCE))))
+        away = misses * log(1.0 - _BY_CHANCE)
+        return float(expit(log(_GONE / (1.0 - _GONE)) + away - there))
 
 
 class Missing:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.map.landmark_details import LandmarkDetails
-from cliploc_ros.core.map.presence import STAYS, probability_there, worth_of
+from cliploc_ros.core.map.presence import STAYS, WORTH, probability_there
 from cliploc_ros.offline.mapping.association import associate
 from cliploc_ros.offline.mapping.building import LeftOut, NothingFoundError, build_map, rounded
 from cliploc_ros.offline.mapping.doubles import Relation, close_pairs, relation
@@ -187,9 +187,8 @@ def _probability_there(known: alignment.OldMap, sight: Sight) -> NDArray[np.floa
         expected = float((given[told] * sight.expected[told]).sum())
         factor = np.clip(sight.seen[told].sum() / max(expected, 1e-9), *_FACTOR_RANGE)
         ratios = np.where(np.isnan(given), ratios, factor * ratios)
-    ratios = np.clip(ratios, *_RATIO_RANGE)
-    return probability_there(sight.seen, sight.expected, ratios, worth_of(
-        sight.seen, sight.expected, ratios), _CHANCE_RATIO)
+    return probability_there(sight.seen, sight.expected, np.clip(ratios, *_RATIO_RANGE), WORTH,
+                             _CHANCE_RATIO)
 
 
 def _look(views: Views, known: alignment.OldMap, finds: Finds, is_gone: NDArray[np.bool_]

@@ -155,11 +155,9 @@ def update_map(old: LandmarkMap, detections: PosedDetections,
                    for min_iou in (ASSOCIATION_IOU, MIN_MEDIAN_IOU))
     _check_belongs(judged, count, well / max(1, loose))
     unlike = identity.why_not_comparable(embeddings, detections)
-    looks = None
-    if unlike:
-        notes.append(f'image embeddings are not compared: {unlike}')
-    elif embeddings is not None:
-        looks = identity.compare_looks(embeddings, old.landmark_ids, detections, judged)
+    notes += [f'image embeddings are not compared: {unlike}'] * bool(unlike)
+    looks = None if unlike or embeddings is None else identity.compare_looks(
+        embeddings, old.landmark_ids, detections, judged)
     fates = identity.decide_fates(known, judged, looks, count)
     updated = _renew(known, aligned.views, judged, fates, detections.class_names)
     # the row in the new map of each object, and of none
@@ -243,26 +241,25 @@ def _renew(known: alignment.OldMap, views: Views, judged: judging.Judgement,
     rows_of[-1] = -1
     fits = gather_evidence(views, known.landmarks, rows_of[judged.shown]).median_iou
 
-    def place(row: int, number: int, weight: float) -> None:
-        centers[row] += weight * (judged.landmarks.centers[number] - centers[row])
-        semi_axes[row], quats[row] = new_axes[number], new_quats[number]
-    for row in fates.confirmed:
-        number, own = fates.objects[row], _looked_for(
-            details[row], judged.sight, fates.objects[row])
+    weights = dict.fromkeys(fates.moved.tolist(), 1.0)  # of new centres
+    for row in fates.moved:
+        details[row] = _in_new_place(details[row], judged.sight, evidence, fates.objects[row])
+    for row in fates.confirmed.tolist():
+        number, is_nudged = fates.objects[row], fits[row] < MIN_MEDIAN_IOU
+        own = _looked_for(details[row], judged.sight, number)
+        sigma, old_sigma = float(judged.refits.sigmas[number]), known.sigmas[row]
+        # a fit to other sides of the object differs, too, but then the old ellipsoid fits
+        if own.position_sigma is not None and np.isfinite(sigma) and (
+                is_nudged or sigma < old_sigma):
+            weights[row] = 1.0 if is_nudged else float(old_sigma**2 / (old_sigma**2 + sigma**2))
+            own = replace(own, position_sigma=float(np.sqrt(weights[row])) * sigma)
         details[row] = replace(
             own, baseline_deg=max(own.baseline_deg or 0.0, float(evidence.baseline_deg[number])),
             last_seen=max(own.last_seen or 0.0, float(evidence.last_seen[number])))
-        sigma, old_sigma = float(judged.refits.sigmas[number]), known.sigmas[row]
-        # a fit to other sides of the object differs, too, but then the old ellipsoid fits
-        is_nudged = fits[row] < MIN_MEDIAN_IOU
-        if own.position_sigma is not None and np.isfinite(sigma) and (
-                is_nudged or sigma < old_sigma):
-            weight = 1.0 if is_nudged else float(old_sigma**2 / (old_sigma**2 + sigma**2))
-            place(row, number, weight)
-            details[row] = replace(details[row], position_sigma=np.sqrt(weight) * sigma)
-    for row in fates.moved:
-        place(row, fates.objects[row], 1.0)
-        details[row] = _in_new_place(details[row], judged.sight, evidence, fates.objects[row])
+    for row, weight in weights.items():
+        number = fates.objects[row]
+        centers[row] += weight * (judged.landmarks.centers[number] - centers[row])
+        semi_axes[row], quats[row] = new_axes[number], new_quats[number]
     for row in fates.not_observed[judged.is_doubtful[fates.not_observed]].tolist():
         details[row] = _looked_for(details[row], judged.sight, row)
     names = tuple(class_names[number] for number in judged.landmarks.classes[fates.new])
