@@ -78,7 +78,7 @@ class UpdatedLayer(NamedTuple):
 _MISSED, _ELSEWHERE, _UNSEEN = -1, -2, -3
 
 
-class _Looks(NamedTuple):
+class _Searches(NamedTuple):
     """Looks for points of old keyframes in keyframes of a recording."""
 
     points: NDArray[np.int64]  #: (l,): row of the old point
@@ -94,7 +94,7 @@ class _Looks(NamedTuple):
         return np.asarray(likely < _GONE_BELOW)[places]
 
 
-_NO_LOOKS = _Looks(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
+_NO_LOOKS = _Searches(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
 
 
 def check_belongs(updated: UpdatedLayer) -> None:
@@ -129,7 +129,7 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
     for center, basis in zip(gone.centers, gone.bases, strict=True):
         is_gone |= normalized_lengths(points - center, (basis @ basis.T)[None]) < 1.0
     is_found, is_matched = looks.partners >= 0, looks.partners != _MISSED
-    matched = _Looks(looks.points[is_matched], looks.partners[is_matched])
+    matched = _Searches(looks.points[is_matched], looks.partners[is_matched])
     for seen, places in product((looks, matched), (owners, cubes, cubes * count + owners)):
         is_gone |= seen.are_gone(places)
     expected, found = (np.bincount(owners[rows], minlength=count) for rows in (
@@ -156,7 +156,7 @@ def update_layer(old: KeyframeLayer, new: KeyframeLayer | None, gone: Landmarks)
         removed > 0, is_gone) if is_gone.any() else None, tuple(fates))
 
 
-def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Looks:
+def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Searches:
     """Look for the points of old keyframes in the nearest views of a recording."""
     seen = [new.points[new.rows(view)].astype(np.float64) for view in range(len(new))]
     bearings = [points[:, :2] / points[:, 2:] for points in seen]
@@ -176,5 +176,5 @@ def _look_for(old: KeyframeLayer, new: KeyframeLayer) -> _Looks:
             partners = np.where(in_view, _MISSED, _UNSEEN)
             partners[pairs[:, 0]] = np.where(is_found, new.offsets[view] + pairs[:, 1], _ELSEWHERE)
             looked = np.nonzero(partners != _UNSEEN)[0]
-            looks.append(_Looks(start + looked, partners[looked]))
-    return _Looks(*map(np.concatenate, zip(*looks, strict=True)))
+            looks.append(_Searches(start + looked, partners[looked]))
+    return _Searches(*map(np.concatenate, zip(*looks, strict=True)))
