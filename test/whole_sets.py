@@ -10,7 +10,7 @@ from scene import CAMERA, ROOM, embeddings_of
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.offline.datasets.map_recording import MapRecording
 from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
-from cliploc_ros.offline.mapping.update.keyframes import UpdatedLayer
+from cliploc_ros.offline.recording.updating import UpdatedLayer
 
 
 def made_map(number):

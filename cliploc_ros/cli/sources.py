@@ -29,8 +29,8 @@ from cliploc_ros.offline.datasets.parsing import naming
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections, join_detections
-from cliploc_ros.offline.mapping.recordings import Placing, add_layer
 from cliploc_ros.offline.recording import recorder
+from cliploc_ros.offline.recording.joining import Placing, add_layer
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.units import NS_PER_S
 
@@ -200,7 +200,7 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
     if options.add is not None:
         if (recording := load_recording(options.add)) is None:
             raise OptionsError(f'--add {options.add}: its recording is missing: give all again')
-        layer = read_layer(options.add, LandmarkMap.from_file(options.add), None)
+        layer = read_layer([options.add], LandmarkMap.from_file(options.add), None)
     else:
         first, *recordings = recordings
         detections, file, images = read_source(first)

@@ -196,7 +196,7 @@ def test_tum_rgbd(tmp_path):
     (tmp_path / 'camera.json').write_text(
         '{"width": 640, "height": 480, "fx": 1000, "fy": 1000, "cx": 640, "cy": 480}')
     assert rgbd_frames(tmp_path, FolderOptions('fr3')).notes[1:] == (
-        '1 of 2 images have no depth image',)
+        '1 of 2 images have no depth image taken with them',)
     note, = rgbd_frames(tmp_path, NO_OPTIONS).notes[2:]
     assert '1280x960 px' in note
     millimetres = FolderOptions('fr3', depth=DepthFormat(unit_m=1e-3))

@@ -34,12 +34,12 @@ from cliploc_ros.offline.mapping.labelling import embed_landmarks, embed_phrases
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-from cliploc_ros.offline.mapping.recordings import join_layers
 from cliploc_ros.offline.mapping.systematic import MountCorrection
-from cliploc_ros.offline.mapping.update.keyframes import UpdatedLayer, check_belongs, update_layer
 from cliploc_ros.offline.mapping.update.updating import UpdatedMap, UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
+from cliploc_ros.offline.recording.joining import join_layers
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
+from cliploc_ros.offline.recording.updating import UpdatedLayer, check_belongs, update_layer
 from cliploc_ros.offline.vocabulary.vocabulary import load_vocabulary, shipped_phrases
 
 # A scale by objects of known size: greatest number of trial maps, and the relative change of the

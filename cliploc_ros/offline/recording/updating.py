@@ -21,7 +21,7 @@ from cliploc_ros.core.keyframes.localization import ENOUGH_INLIERS, keyframes_ne
 from cliploc_ros.core.map.presence import probability_there
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import Landmarks
-from cliploc_ros.offline.mapping.recordings import join_layers
+from cliploc_ros.offline.recording.joining import join_layers
 
 # A keyframe is looked for in this number of nearest views, up to this distance of views: 1.2 m or
 # 24 degrees. A feature is at the projection of a point up to this angle: 8 px at f = 525 px.

@@ -50,7 +50,7 @@ class Placing(NamedTuple):
     shift: NDArray[np.float64] = np.zeros(3)  #: (3,) [m]
 
 
-class Sight(NamedTuple):
+class SeenKeyframe(NamedTuple):
     """A keyframe of a recording that the layer of a map recognizes, with m points of the layer."""
 
     keyframe: int
@@ -80,7 +80,7 @@ class Sight(NamedTuple):
         return bool(np.median(np.linalg.norm(self.errors(map_from_recording), axis=1)) < _AGREE)
 
 
-def recognize(new: KeyframeLayer, layer: KeyframeLayer) -> list[Sight]:
+def recognize(new: KeyframeLayer, layer: KeyframeLayer) -> list[SeenKeyframe]:
     """Localize the keyframes of a recording in the layer of a map; return the recognized ones."""
     localizer, sights = KeyframeLocalizer(layer), []
     for keyframe, pose in enumerate(new.map_from_camera):
@@ -92,12 +92,12 @@ def recognize(new: KeyframeLayer, layer: KeyframeLayer) -> list[Sight]:
             found = localizer.localize_features(features, camera, fast=found)
         for place in (one for one in found.places[:1] if one.inliers >= _LEAST_POINTS):
             own = new.points[rows][cKDTree(pixels).query(place.pixels)[1]]
-            sights.append(Sight(keyframe, pose, place.map_from_camera, place.points,
+            sights.append(SeenKeyframe(keyframe, pose, place.map_from_camera, place.points,
                                 own.astype(float), place.inliers, np.array(place.keyframes)))
     return sights
 
 
-def find_placing(sights: Sequence[Sight], is_scaled: bool = False) -> tuple[Placing, int]:
+def find_placing(sights: Sequence[SeenKeyframe], is_scaled: bool = False) -> tuple[Placing, int]:
     """Place a recording in a map; return the number of keyframes that agree, too.
 
     Each recognized keyframe proposes a placing. The one that most agree with is refined by robust
@@ -125,7 +125,7 @@ def find_placing(sights: Sequence[Sight], is_scaled: bool = False) -> tuple[Plac
     return found, agreeing
 
 
-def _refined(sights: list[Sight], start: Any, is_scaled: bool) -> NDArray[np.float64]:
+def _refined(sights: list[SeenKeyframe], start: Any, is_scaled: bool) -> NDArray[np.float64]:
     """Refine a placing (4, 4) by robust least squares."""
     def moved(step: NDArray[np.float64]) -> NDArray[np.float64]:
         turn = Rotation.from_rotvec(step[:3]).as_matrix() * np.exp(step[6:].sum())

@@ -10,8 +10,8 @@ from scene import CAMERA, ROOM, make_layer, rigid
 
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.mapping.landmarks import Landmarks
-from cliploc_ros.offline.mapping.recordings import join_layers
-from cliploc_ros.offline.mapping.update.keyframes import check_belongs, update_layer
+from cliploc_ros.offline.recording.joining import join_layers
+from cliploc_ros.offline.recording.updating import check_belongs, update_layer
 
 WALL = 600
 #: Points of a wall 3 m in front of the cameras, and their looks.

@@ -18,7 +18,7 @@ from cliploc_ros.errors import DatasetError, MappingError
 from cliploc_ros.offline.datasets.map_recording import load_recording
 from cliploc_ros.offline.datasets.observations import load_observations, save_observations
 from cliploc_ros.offline.mapping.posed_detections import join_detections
-from cliploc_ros.offline.mapping.recordings import add_layer, find_placing, recognize
+from cliploc_ros.offline.recording.joining import add_layer, find_placing, recognize
 from cliploc_ros.offline.recording.layer_words import with_words
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
