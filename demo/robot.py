@@ -128,23 +128,30 @@ class Robot(Node):
         # the request and larger than Fast DDS's shared memory.
         shown_at = start + _HEAD_START_S - _FRAME_PERIOD_S
 
-        def answered() -> bool:
+        def show(is_wanted: bool) -> None:
             nonlocal shown_at
-            # Only the relocalizer subscribes to camera_info, and only until it has its frame.
-            if (all(publisher.get_subscription_count() > 0 for name, publisher
-                    in self._topics.items() if name.endswith('/camera_info'))
-                    and time.monotonic() - shown_at >= _FRAME_PERIOD_S):
+            if is_wanted and time.monotonic() - shown_at >= _FRAME_PERIOD_S:
                 self._publish(frame)
                 shown_at = time.monotonic()
+
+        def answered() -> bool:
+            # Only the relocalizer subscribes to camera_info, and only until it has its frame.
+            show(all(publisher.get_subscription_count() > 0 for name, publisher
+                     in self._topics.items() if name.endswith('/camera_info')))
             return bool(future.done())
+
+        def is_complete() -> bool:
+            # A request may do without a camera whose image was lost; its detections are drawn.
+            show(any(stamp not in heard for heard in self._detections.values()))
+            return stamp in self._hypotheses and all(
+                stamp in heard for heard in self._detections.values())
 
         self._wait(answered)
         answer_s, (answer,) = time.monotonic() - start, future.result().status
         fields = {field.key: field.value for field in answer.values}
         if fields['verdict'] not in ('accepted', 'refused'):
             raise DemoError(f'the relocalizer neither accepted nor refused: {answer.message}')
-        self._wait(lambda: stamp in self._hypotheses
-                   and all(stamp in heard for heard in self._detections.values()))
+        self._wait(is_complete)
         return WakeUp(stamp, fields['verdict'] == 'accepted', answer.message, fields,
                       self._hypotheses[stamp],
                       {camera: heard[stamp] for camera, heard in self._detections.items()},
