@@ -109,14 +109,19 @@ def read_source(options: argparse.Namespace
     _mounts(options)
     check_folder_options(options)
     find_topics(options, options.bag)
-    if options.observations is not None:
-        return load_observations(options.observations), options.observations, None
-    of_cameras = read_cameras(options)
-    images = of_cameras[''] if '' in of_cameras else frames.join_frames(of_cameras)
-    print(''.join(f'{note}\n' for note in images.notes), end='', flush=True)
-    recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))
-    file = options.record_to or recorder.observation_file(images, recording)
-    return recorder.record_once(images, recording, file, _odometry(options)), file, images
+    file, images = options.observations, None
+    if file is None:
+        of_cameras = read_cameras(options)
+        images = of_cameras[''] if '' in of_cameras else frames.join_frames(of_cameras)
+        print(''.join(f'{note}\n' for note in images.notes), end='', flush=True)
+        recording = recording_options(options, recorder.KeyframeOptions(*options.keyframes))
+        file = options.record_to or recorder.observation_file(images, recording)
+        found = recorder.record_once(images, recording, file, _odometry(options))
+    else:
+        found = load_observations(file)
+    if found.without_pose:
+        print(f'no pose: {found.without_pose} of {found.images} images', flush=True)
+    return found, file, images
 
 
 def recording_options(options: argparse.Namespace, keyframes: recorder.KeyframeOptions,
@@ -181,7 +186,8 @@ def each_recording(options: argparse.Namespace) -> list[argparse.Namespace]:
     kinds = ('bag', *FOLDERS, 'observations')
     found = [argparse.Namespace(**vars(options) | dict.fromkeys(kinds) | {name: path})
              for name in kinds for path in getattr(options, name) or ()]
-    for own in found[options.add is None:]:  # placed in a map, so that any unit will do
+    # further recordings are placed in the map, so that any unit will do
+    for own in found[0 if options.add else 1:]:
         vars(own).update(level=False, known_distance=None, record_to=None, object_size=())
     if not found:
         raise OptionsError('give a recording: --bag, --folder, --observations or another')
@@ -204,8 +210,6 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
     else:
         first, *recordings = recordings
         detections, file, images = read_source(first)
-        if without := detections.without_pose:
-            print(f'no pose: {without} of {detections.images} images', flush=True)
         detections, scale, rotation = place(detections, first, bool(images and images.of_tf))
         recording, layer = recording_of(first, file, scale, rotation), None
         images = images and frames.move_frames(images, scale, rotation)

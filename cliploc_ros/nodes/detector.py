@@ -139,12 +139,11 @@ class _Camera:
         """Report a missing publisher, missing images, and rates."""
         own, topic = Health(), qos.resolved(self._node, self._topic)
         silent_s = time.monotonic() - self._heard_at
-        if self._node.count_publishers(topic) == 0:
+        is_silent = self.subscription is not None and silent_s > stale_after_s
+        if is_silent or self._node.count_publishers(topic) == 0:
             own.warn(qos.why_silent(self._node, 'image', topic, self._type))
-            if self.subscription is not None and silent_s > stale_after_s:
-                self._node.get_logger().warning(own.message, once=True)
-        elif self.subscription is not None and silent_s > stale_after_s:
-            own.warn(f'no image on {topic} for {silent_s:.1f} s')
+        if is_silent:
+            self._node.get_logger().warning(own.message, once=True)
         own.values |= {f'{name} rate [Hz]': f'{rate:.1f}'
                        for name, rate in self._rates.update(self._counts).items()}
         own.values['listened to'] = self.subscription is not None

@@ -68,7 +68,7 @@ def test_a_detector_warns_of_silence_and_of_bad_images(start, tester, status):
         assert detected
         assert {'images dropped', 'queue age [s]', 'waiting last [ms]', 'memory [MiB]'} <= set(
             values)
-        status.wait(WARN, 'no image on /image for')
+        status.wait(WARN, 'no image on /image from its')
         bad = make_frame()[0]
         bad.encoding = 'yuv422'
         status.wait(WARN, "encoding 'yuv422' is not one of", (bad,))

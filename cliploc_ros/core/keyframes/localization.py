@@ -30,7 +30,7 @@ from cliploc_ros.errors import MapError
 # that look alike are found), and keyframes near each pose that objects propose.
 _SIMILAR, _ELSEWHERE, PROPOSED = 5, 2, 3
 #: With fewer agreeing points, more keyframes are matched: this many near the pose, and as many of
-# the next similar keyframes.
+#: the next similar keyframes.
 ENOUGH_INLIERS, _MORE = 100, 5
 # An image's words may resemble those of the wrong keyframes. If none of the above shows the place,
 # the strongest 600 features are matched with the next 25 keyframes. A chance pose has up to 8

@@ -100,9 +100,9 @@ def recognize(new: KeyframeLayer, layer: KeyframeLayer) -> list[SeenKeyframe]:
 def find_placing(sights: Sequence[SeenKeyframe], is_scaled: bool = False) -> tuple[Placing, int]:
     """Place a recording in a map; return the number of keyframes that agree, too.
 
-    Each recognized keyframe proposes a placing. The one that most agree with is refined by robust
-    least squares over all their points. If the unit of the recording is unknown, `is_scaled`, its
-    scale is found, too.
+    Each recognized keyframe proposes a placing. The proposal with the most agreeing keyframes is
+    refined by robust least squares on their points. With `is_scaled`, for a recording of unknown
+    unit, the scale is estimated, too.
 
     MappingError: too few keyframes agree about the placing, or two placings fit.
     """
