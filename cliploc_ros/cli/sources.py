@@ -227,7 +227,8 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
                     not images.is_metric, options.same_frame, options.keyframes_per_cell)
                 print(f'{source_of(own)}: {note}', flush=True)
             elif not options.same_frame:
-                raise MappingError('lacks keyframes that place it in the map: give `same_frame`')
+                raise MappingError('no keyframes place it in the map: give `same_frame` if its '
+                                   'poses are in the frame of the map')
         end_s = max(part.stamps_s[-1] for part in parts)
         stamps_s = seen.stamps_s + max(0.0, end_s + _APART_S - seen.stamps_s[0])
         parts.append(replace(seen.moved(*placing), stamps_s=stamps_s, stamps_ns=None))

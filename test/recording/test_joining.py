@@ -148,7 +148,7 @@ def test_observations_are_joined_and_added(run_here, halves, tmp_path):
     both, out = tmp_path / 'both.yaml', tmp_path / 'map.yaml'
     options = ['--observations', a, '--observations', b, '--no-check']
     done = run_here(build_map.main, *options, '--out', both)
-    assert done.returncode == 1 and 'b.npz: lacks keyframes' in done.stderr
+    assert done.returncode == 1 and 'b.npz: no keyframes place it' in done.stderr
     done = run_here(build_map.main, *options, '--same-frame', '--out', both)
     assert done.returncode == 0 and ' 162 frames' in done.stdout, done.stderr
     for more in (['--observations', a], ['--add', out, '--observations', b, '--same-frame']):

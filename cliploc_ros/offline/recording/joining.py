@@ -121,7 +121,8 @@ def find_placing(sights: Sequence[SeenKeyframe], is_scaled: bool = False) -> tup
                       sight.pose[None], *found)[0])), default=0)
     if agreeing < max(_LEAST_AGREEING, _PER_RIVAL * rivals):
         raise MappingError(f'its place in the map is unknown: {agreeing} of {len(sights)} '
-                           f'recognized keyframes agree about it, {rivals} about another place')
+                           f'recognized keyframes agree about it, {rivals} about another place; '
+                           'record views that the map has, too, or build a map of its own')
     return found, agreeing
 
 
