@@ -214,13 +214,14 @@ class CheckReport:
 
 def _errors(trials: Sequence[relocalization.Trial]) -> str:
     """Return the median and the greatest error of localized views; '' without such a view."""
-    errors = [(trial.error_m or 0.0, trial.stamp_s or 0.0) for trial in trials
+    begin_s = trials[0].stamp_s or 0.0 if trials else 0.0
+    errors = [(trial.error_m or 0.0, (trial.stamp_s or 0.0) - begin_s) for trial in trials
               if trial.verdict == 'accepted']
     if not errors:
         return ''
     worst_m, stamp_s = max(errors)
     return (f'; error {np.median([error_m for error_m, _ in errors]):.2f} m (median), '
-            f'{worst_m:.2f} m at most, at {stamp_s:.2f} s')
+            f'{worst_m:.2f} m at most, at {stamp_s:.0f} s')
 
 
 def find_measures(report: CheckReport, limits: Thresholds) -> list[Measure]:
