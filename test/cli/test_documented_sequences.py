@@ -68,7 +68,7 @@ def drive(request, tmp_path_factory):
         write_drive(folder / 'drive', ASSETS / 'mapping', 3)
         found, more = {'model': ASSETS / 'yolo.onnx'}, ['--no-clip', '--no-check']
     elif request.param == 'rendered':
-        write_drive(folder / 'drive', ASSETS / 'mapping', 1)
+        write_drive(folder / 'drive', ASSETS / 'mapping', 2)
         found, more = {'model': ASSETS / 'yolo.onnx', 'clip_pretrained': ASSETS / 'clip'}, []
     else:
         shared = request.getfixturevalue('shared_data')

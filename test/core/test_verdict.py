@@ -201,6 +201,7 @@ def test_the_share_within_a_distance_is_that_of_drawn_positions(deviations_m, rn
     assert shares_within(1.0, covariance[None]) == pytest.approx(share, abs=0.04)
 
 
+@pytest.mark.once
 @pytest.mark.parametrize('matching', ['hybrid', 'class'])
 def test_another_place_is_hardly_ever_accepted(matching, office_map, queries, thresholds):
     """Queries in the map with all objects exchanged: every pose is wrong."""

@@ -17,6 +17,7 @@ import pytest
 from scene import make_room
 from without_pytorch import Lazy, hide_pytorch
 
+from cliploc_ros.cli import evaluate
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models import protocols
 from cliploc_ros.models.files import is_hub_name
@@ -293,15 +294,20 @@ ONNX = (ASSETS / 'yolo.onnx', '', ASSETS / 'clip')
 WEIGHTS = (ASSETS / 'yolo.pt', ASSETS / 'clip.json', ASSETS / 'clip.safetensors')
 
 
-def localize(networks, cache, out, environment):
-    """Run evaluate on some images of the demo."""
+def localizing(networks, out):
+    """Return the arguments of evaluate for some images of the demo."""
     model, clip_model, pretrained = networks
     named = ['--clip-model', clip_model] if clip_model else []
+    return ['--tum', ASSETS / 'sequence', '--map', ASSETS / 'map.yaml', '--every', '10',
+            '--methods', 'auto', '--trials', '1', '--sweep', '--no-figures', '--workers', '1',
+            '--model', model, *named, '--clip-pretrained', pretrained, '--out', out]
+
+
+def localize_hidden(networks, cache, out, hidden):
+    """Run evaluate in a process without PyTorch, and without the outputs of earlier runs."""
     return subprocess.run(
-        [sys.executable, '-m', 'cliploc_ros.cli.evaluate', '--tum', ASSETS / 'sequence', '--map',
-         ASSETS / 'map.yaml', '--every', '10', '--methods', 'auto', '--trials', '1', '--sweep',
-         '--no-figures', '--workers', '1', '--model', model, *named, '--clip-pretrained',
-         pretrained, '--out', out], env=environment | {'XDG_CACHE_HOME': str(cache)},
+        [sys.executable, '-m', 'cliploc_ros.cli.evaluate', *localizing(networks, out)],
+        env=hidden | {'XDG_CACHE_HOME': str(cache), 'CLIPLOC_RECORDINGS': str(out)},
         capture_output=True, text=True, timeout=300, check=False)
 
 
@@ -314,20 +320,22 @@ def hidden(tmp_path):
 @pytest.mark.parametrize(('networks', 'named'), [
     (WEIGHTS, '--no-clip'), ((WEIGHTS[0], *ONNX[1:]), 'yolo.pt')])
 def test_without_pytorch_weights_are_refused_with_what_to_do(networks, named, hidden, tmp_path):
-    done = localize(networks, tmp_path / 'empty', tmp_path / 'out', hidden)
+    done = localize_hidden(networks, tmp_path / 'empty', tmp_path / 'out', hidden)
     assert done.returncode == 1 and 'Traceback' not in done.stderr
     assert 'is not installed' in done.stderr and 'export_network' in done.stderr
     assert 'script/setup models' in done.stderr and named in done.stderr
 
 
-def test_weights_are_exported_once_and_then_need_no_pytorch(hidden, tmp_path):
-    found = []
-    for networks, environment in ((ONNX, hidden), (WEIGHTS, dict(os.environ)), (WEIGHTS, hidden)):
-        out = tmp_path / str(len(found))
-        done = localize(networks, tmp_path / 'cache', out, environment)
+def test_weights_are_exported_once_and_then_need_no_pytorch(hidden, tmp_path, run_here,
+                                                            monkeypatch):
+    cache, outs = tmp_path / 'cache', [tmp_path / name for name in ('onnx', 'exported', 'again')]
+    monkeypatch.setenv('XDG_CACHE_HOME', str(cache))
+    for done in (*(run_here(evaluate.main, *localizing(networks, out))
+                   for networks, out in zip((ONNX, WEIGHTS), outs, strict=False)),
+                 localize_hidden(WEIGHTS, cache, outs[2], hidden)):
         assert done.returncode == 0, done.stderr
-        found.append([(row['accepted'], row['error_m'])
-                      for row in json.loads((out / 'results.json').read_text())])
+    found = [[(row['accepted'], row['error_m'])
+              for row in json.loads((out / 'results.json').read_text())] for out in outs]
     onnx, exported, again = found
     assert exported == again
     assert [accepted for accepted, _ in onnx] == [accepted for accepted, _ in exported]
