@@ -4,6 +4,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,7 +12,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from capture_folders import copy_walk
 from scene import CAMERA
 
 from cliploc_ros.core.observation import Detections, Observation
@@ -119,7 +119,7 @@ def test_the_table_counts_each_request_once(capsys):
 def outcomes(tmp_path_factory):
     """Run the study on the demo's room and images without poses; return the outcomes."""
     folder = tmp_path_factory.mktemp('rooms')
-    copy_walk(ASSETS / 'sequence', folder / 'demo', 2)
+    shutil.copytree(ASSETS / 'mapping', folder / 'demo')
     (folder / 'elsewhere' / 'images').mkdir(parents=True)
     rng = np.random.default_rng(0)
     for number in range(3):
