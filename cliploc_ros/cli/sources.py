@@ -24,7 +24,7 @@ from cliploc_ros.offline.datasets import bag_frames, bag_poses, frames
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
 from cliploc_ros.offline.datasets.images import Images, open_images
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
-from cliploc_ros.offline.datasets.observations import load_observations, save_observations
+from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.parsing import naming
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
@@ -217,9 +217,10 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
             return detections, recording, images, None
         if images is not None and wanted is not None:
             layer = build_layer(images, LandmarkMap.empty(options.frame_id), wanted)
-    parts = [recording.load() if options.add else detections]
+    parts, others = [recording.load() if options.add else detections], [*recording.others]
+    cameras = recording.cameras or parts[0].camera_names
     for own in recordings:
-        (seen, _, images), placing = read_source(own), Placing()
+        (seen, file, images), placing = read_source(own), Placing()
         with naming(source_of(own), MappingError):
             if layer is not None and images is not None and wanted is not None:
                 layer, placing, note = add_layer(
@@ -230,13 +231,13 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
                 raise MappingError('no keyframes place it in the map: give `same_frame` if its '
                                    'poses are in the frame of the map')
         end_s = max(part.stamps_s[-1] for part in parts)
-        stamps_s = seen.stamps_s + max(0.0, end_s + _APART_S - seen.stamps_s[0])
-        parts.append(replace(seen.moved(*placing), stamps_s=stamps_s, stamps_ns=None))
-    joined = join_detections(parts)
-    file = options.out.with_suffix(f'.{len(joined)}.npz')
-    # its poses are those of the first recording
-    save_observations(file, joined.moved(1.0 / recording.scale, np.array(recording.rotation).T))
-    return joined, replace(recording, observations=file), None, layer
+        later_s = max(0.0, float(end_s + _APART_S - seen.stamps_s[0]))
+        parts.append(replace(seen.moved(*placing), stamps_s=seen.stamps_s + later_s,
+                             stamps_ns=None))
+        others.append(replace(recording_of(own, file, placing.scale, placing.rotation),
+                              later_s=later_s, cameras=seen.camera_names))
+    return (join_detections(parts), replace(recording, cameras=cameras, others=tuple(others)),
+            None, layer)
 
 
 def source_of(options: argparse.Namespace) -> Path:

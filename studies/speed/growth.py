@@ -6,8 +6,8 @@ A layer is built from the images of the folders, except every 12th, which is ask
 extended by **synthetic keyframes**: points of two real keyframes, with their descriptors mirrored
 and disturbed, far away from the rooms. They look like images of other rooms, and match no query.
 Each layer is loaded and asked in a process of its own. A robot's request also has objects: the map
-has one **simulated** landmark for four keyframes, in front of these. Its time contains the features
-of the image, and no detector and CLIP.
+has one **simulated** landmark for four keyframes, in front of these. Its time contains features of
+the image, and no detector and CLIP.
 """
 
 import os

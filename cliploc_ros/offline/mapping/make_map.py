@@ -29,6 +29,7 @@ from cliploc_ros.models.protocols import ClipOptions
 from cliploc_ros.models.xfeat import feature_kinds
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.map_recording import MapRecording, recording_path, save_recording
+from cliploc_ros.offline.datasets.observations import save_observations
 from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map
 from cliploc_ros.offline.mapping.labelling import embed_landmarks, embed_phrases, label_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of
@@ -296,10 +297,12 @@ def _label_new(updated: UpdatedMap, detections: PosedDetections, labeller: Label
 
 
 def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording: MapRecording,
-                   updated: Path | None = None) -> list[str]:
+                   updated: Path | None = None, together: PosedDetections | None = None
+                   ) -> list[str]:
     """Write a map and the files next to it as one set; return lines about its keyframes.
 
-    The keyframes of a map that is replaced are removed if the new one has none.
+    The keyframes of a map that is replaced are removed if the new one has none. The detections of
+    several recordings `together`, with poses in the map, get a file next to it.
 
     CliplocError: a file cannot be written, or another program changed the map while it was
     updated; nothing was changed.
@@ -307,7 +310,13 @@ def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording
     is_in_place = updated is not None and path.resolve() == updated.resolve()
     if is_in_place and LandmarkMap.from_file(path).map_set != made.updated:
         raise MapError(f'{path}: another program changed it during this update; update again')
-    besides: dict[Path, WriteOfSet | None] = {
+    besides: dict[Path, WriteOfSet | None] = {}
+    if together is not None:
+        recording = replace(recording, observations=path.with_suffix('.recordings.npz'))
+        # with the poses of the first recording
+        found = together.moved(1.0 / recording.scale, np.array(recording.rotation).T)
+        besides[recording.observations] = lambda place, _: save_observations(place, found)
+    besides |= {
         recording_path(path): partial(save_recording, path, recording),
         removed_path(path): partial(
             write_landmarks, landmark_map=made.removed) if made.removed else None}
