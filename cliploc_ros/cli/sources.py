@@ -206,6 +206,9 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
     if options.add is not None:
         if (recording := load_recording(options.add)) is None:
             raise OptionsError(f'--add {options.add}: its recording is missing: give all again')
+        if recording.is_update:
+            raise OptionsError(f'--add {options.add}: only boxes of its last update are known: '
+                               'build it of all recordings, and update it afterwards')
         layer = read_layer([options.add], LandmarkMap.from_file(options.add), None)
     else:
         first, *recordings = recordings
@@ -214,7 +217,8 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
         recording, layer = recording_of(first, file, scale, rotation), None
         images = images and frames.move_frames(images, scale, rotation)
         if not recordings:
-            return detections, recording, images, None
+            return (detections, replace(recording, is_update=options.update is not None), images,
+                    None)
         if images is not None and wanted is not None:
             layer = build_layer(images, LandmarkMap.empty(options.frame_id), wanted)
     parts, others = [recording.load() if options.add else detections], [*recording.others]

@@ -51,6 +51,7 @@ class MapRecording:
     cameras: tuple[str, ...] = ()
     later_s: float = 0.0
     others: tuple['MapRecording', ...] = ()
+    is_update: bool = False  #: Whether the map was updated with it, and has older landmarks, too
 
     @property
     def is_moved(self) -> bool:

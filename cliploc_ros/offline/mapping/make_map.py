@@ -21,7 +21,7 @@ from cliploc_ros.core.keyframes.layer import (
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import load_removed, removed_path, write_landmarks, write_map
-from cliploc_ros.core.map.parameter_file import MapSet
+from cliploc_ros.core.map.parameter_file import read_text
 from cliploc_ros.errors import MapError, MappingError, ModelError, counted
 from cliploc_ros.files.storage import WriteOfSet
 from cliploc_ros.models.onnx_clip import ClipWeights, names_onnx, resolve_clip_weights
@@ -60,7 +60,7 @@ class MadeMap:
     note: str = ''  #: The reason why the requested layer is missing
     removed: LandmarkMap | None = None  #: Landmarks that updates removed from the map
     keyframes: UpdatedLayer | None = None  #: What an update made of the keyframes
-    updated: MapSet | None = None  #: The map that was updated
+    updated: str = ''  #: Text of the map that was updated: the studio may change it meanwhile
 
 
 @dataclass(frozen=True)
@@ -254,6 +254,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
         The map is invalid, the recording does not belong to it, or the text tower cannot be
         loaded.
     """
+    text = read_text(path)  # before the map
     old, place, kinds = LandmarkMap.from_file(path), layer_path(path), feature_kinds()
     old_layer = load_layer_of_map(place, old, kinds) if place.exists() else None
     if layer is not None and old_layer is not None:
@@ -268,7 +269,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
                 new, map_from_camera=found.map_from_given @ new.map_from_camera))
     else:
         made, gone = make_map(detections, labeller, options, frames, layer), Landmarks.none()
-    made = replace(made, updated=old.map_set)
+    made = replace(made, updated=text)
     if old_layer is None:
         return made
     keyframes = update_layer(old_layer, made.layer, gone)
@@ -308,7 +309,7 @@ def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording
     updated; nothing was changed.
     """
     is_in_place = updated is not None and path.resolve() == updated.resolve()
-    if is_in_place and LandmarkMap.from_file(path).map_set != made.updated:
+    if is_in_place and read_text(path) != made.updated:
         raise MapError(f'{path}: another program changed it during this update; update again')
     besides: dict[Path, WriteOfSet | None] = {}
     if together is not None:
