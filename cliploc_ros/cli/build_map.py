@@ -176,8 +176,7 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str,
         if options.mount is not None:
             mount = mount_from_numbers(options.mount) @ mount
         numbers = [*mount[:3, 3], *quaternion_from_transform(mount)]
-        lines.append('corrected mount: --mount ' + ' '.join(
-            f'{number:.5f}' for number in numbers))
+        lines.append('corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers))
     is_poor = isinstance(made.report, MappingReport) and made.report.landmarks > 0 and (
         made.report.explained_of_classes < LEAST_EXPLAINED)
     path = options.out.with_stem(f'{options.out.stem}.refused') if is_poor else options.out

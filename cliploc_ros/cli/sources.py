@@ -17,12 +17,12 @@ from cliploc_ros.core.geometry.depth import DepthCamera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import DatasetError, MappingError, OptionsError
+from cliploc_ros.errors import CliplocError, DatasetError, MappingError, OptionsError
 from cliploc_ros.models import protocols
 from cliploc_ros.models.files import digest_file
 from cliploc_ros.offline.datasets import bag_frames, bag_poses, frames
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
-from cliploc_ros.offline.datasets.images import Images, open_images
+from cliploc_ros.offline.datasets.images import Images, images_of_recording, open_images
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
 from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.parsing import naming
@@ -87,19 +87,36 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
         print(f'{bag}: {" and ".join(getattr(options, name) for name in open_topics)}', flush=True)
 
 
-def images_at(options: argparse.Namespace, path: Path, cameras: Sequence[str]) -> Images:
-    """Open the images of cameras in a folder or bag, with the topics of the command line.
+def recorded(options: argparse.Namespace, built_from: MapRecording | None
+             ) -> tuple[PosedDetections | None, Images | None]:
+    """Return the boxes and images that the command line names, by default those of a map.
 
-    DatasetError: the path is neither, or a topic that the command line does not name is ambiguous.
+    CliplocError: they cannot be used. Images of the map that cannot be read are left out.
     """
-    is_bag = path.exists() and find_layout(path) is None
-    find_topics(options, path if is_bag and [*cameras] == [''] else None)
-    return open_images(path, bag_frames.BagTopics(
-        options.image, options.camera_info, options.rectified), cameras)
+    detections, images = None, None
+    if options.observations is not None:
+        detections = load_observations(options.observations)
+    elif built_from is not None:
+        detections = built_from.load()
+    known = [''] if detections is None else list(detections.camera_names)
+    cameras = known if options.cameras == [''] else list(dict.fromkeys(options.cameras))
+    if unknown := [name for name in cameras if name not in known]:
+        raise OptionsError(f"--cameras: the observations have no camera '{unknown[0]}'; they have "
+                           f'{", ".join(filter(None, known)) or "one without a name"}')
+    if (path := options.images) is not None:
+        is_bag = path.exists() and find_layout(path) is None
+        find_topics(options, path if is_bag and cameras == [''] else None)
+        images = open_images(path, bag_frames.BagTopics(
+            options.image, options.camera_info, options.rectified), cameras)
+    elif built_from is not None and detections is not None:
+        try:
+            images = images_of_recording(built_from, cameras)
+        except CliplocError as error:
+            print(f'without images: {error}', flush=True)
+    return detections, images
 
 
-def read_source(options: argparse.Namespace
-                ) -> tuple[PosedDetections, Path, frames.Frames | None]:
+def read_source(options: argparse.Namespace) -> tuple[PosedDetections, Path, frames.Frames | None]:
     """Return the observations of a source, their file, and its images if there are any.
 
     CliplocError: the source, the networks or the options cannot be used.

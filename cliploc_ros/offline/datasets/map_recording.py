@@ -95,15 +95,16 @@ def load_recording(map_file: Path) -> MapRecording | None:
 
     Missing images are None. DatasetError: the file is damaged.
     """
-    path = recording_path(map_file)
-    if not path.is_file():
-        return None
+    path, of_map = recording_path(map_file), ''
     try:
-        values = storage.parse_json(storage.read_file(path))
-        digest = str(values.pop('set', ''))
-        if digest and map_file.exists():
+        if map_file.exists():
             with storage.open_file(map_file) as file:
-                check_set(digest, set_of(file.read(_HEAD).decode(errors='replace')).digest)
+                of_map = set_of(file.read(_HEAD).decode(errors='replace')).digest
+            storage.finish_set(map_file, of_map)
+        if not path.is_file():
+            return None
+        values = storage.parse_json(storage.read_file(path))
+        check_set(str(values.pop('set', '')), of_map)
         for part in (*values.get('others', ()), values):
             for name in (name for name in _PATHS if part.get(name) is not None):
                 place = map_file.resolve().parent / part[name]
