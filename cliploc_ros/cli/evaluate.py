@@ -266,8 +266,9 @@ def _notes(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
         images = source_of(options).resolve()
         notes += [f'note: {file} was built from these images ({images}): results are optimistic'
                   for file in options.map
-                  if (recording := load_recording(file)) is not None
-                  and recording.source is not None and recording.source.resolve() == images]
+                  if (recording := load_recording(file)) is not None and images in [
+                      part.source.resolve() for part in (recording, *recording.others)
+                      if part.source is not None]]
     return notes
 
 
