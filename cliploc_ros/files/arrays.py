@@ -12,6 +12,7 @@ import os
 import weakref
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -112,10 +113,11 @@ class StoredArray:
             return self[first:int(np.max(rows, initial=first)) + 1][rows - first]
         first, last, step = rows.indices(len(self))
         size = self.dtype.itemsize * math.prod(self.shape[1:])
-        content = os.pread(self._file, size * max(0, last - first), self._start + size * first)
-        if self._written() != self._state:
-            raise self._overwritten.with_traceback(None)
-        return np.frombuffer(content, self.dtype).reshape(-1, *self.shape[1:])[::step]
+        with suppress(OSError):  # of a network file system
+            content = os.pread(self._file, size * max(0, last - first), self._start + size * first)
+            if self._written() == self._state:
+                return np.frombuffer(content, self.dtype).reshape(-1, *self.shape[1:])[::step]
+        raise self._overwritten.with_traceback(None)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> NDArray[Any]:
         """Read all rows."""
