@@ -159,8 +159,7 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
     search_ms, left = 0.0, np.empty(0, dtype=np.int64)
     if crops is not None:
         compared = crops.known
-        observation = replace(observation, similarities=crops.compare(compared),
-                              compared=compared)
+        observation = replace(observation, similarities=crops.compare(compared), compared=compared)
         left = informative_first(relocalizer.landmark_map, observation)
         left = left[~np.isin(left, compared)]
     while True:
@@ -173,8 +172,7 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
             return frame, relocalizer.look_again(found, [*earlier, frame], looks, recognizer,
                                                  cameras)
         compared, left = np.append(compared, left[:count]), left[count:]
-        observation = replace(observation, similarities=crops.compare(compared),
-                              compared=compared)
+        observation = replace(observation, similarities=crops.compare(compared), compared=compared)
 
 
 class KeptInstant(NamedTuple):
@@ -283,8 +281,7 @@ class Localizer:
             return None
         features = ImageFeatures(lambda: query.images[-1], query.newest.camera,
                                  self._keyframes.layer.kind)
-        return ImageRecognizer(self._keyframes, features, deadline, begin_stage,
-                               query.is_thorough)
+        return ImageRecognizer(self._keyframes, features, deadline, begin_stage, query.is_thorough)
 
     def with_free_crops(self, query: Query, row: int, source: CropSource | None,
                         begin_stage: Callable[[str], None] = lambda stage: None) -> Observation:
@@ -381,8 +378,7 @@ class Localizer:
                 self._instants, self._looks, self._filter = [], Looks(), None
             self._run, self._stamp_ns = query.run, newest.stamp_ns
             looks = self._looks
-            earlier, anchor = instants_to_fuse(self._instants, newest, query.limit,
-                                               query.length_s)
+            earlier, anchor = instants_to_fuse(self._instants, newest, query.limit, query.length_s)
             while earlier and sum(len(instant.searched) for instant in earlier) + len(beside) \
                     >= MAX_FRAMES:
                 del earlier[0]

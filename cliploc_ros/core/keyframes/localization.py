@@ -403,8 +403,7 @@ class KeyframeLocalizer:
         turns = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1) @ pose[:3, :3])
         angle = shares @ turns.magnitude()
         position = _KEYFRAME_M**2 + grown_m ** 2
-        rotation = _KEYFRAME_RAD**2 + (PER_RADIAN * angle) ** 2
-        return np.diag(np.repeat([position, rotation], 3))
+        return np.diag(np.repeat([position, _KEYFRAME_RAD**2 + (PER_RADIAN * angle) ** 2], 3))
 
 
 def _places(first: _Place | None, matched: _Matched, look: _Look
