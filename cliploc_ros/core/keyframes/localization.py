@@ -58,10 +58,11 @@ _MOST_RANKED = 500
 NEAR_M, NEAR_DEG = SAME_SIGHT
 # Number of three-point samples: for the first place, and for each rival.
 _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
-# A part of a place was elsewhere if the median of its points has moved by this [m]. Errors of maps
-# move a part by up to .2 m. Features within this angle (20 px at f = 525 px) of an agreeing one do
-# not count: the bonsai's room has a texture that repeats every .3 m. See studies/README.md.
-_MOVED_M, _BESIDE = (0.3, 3.0), 20.0 / 525.0
+# A part of a place was elsewhere if a pose within this tolerance of its own, which other features
+# agree with, moves the median of their points by this [m]; errors of maps move it by up to .2 m.
+# Features within this angle of agreeing ones (20 px at f = 525 px) do not count: a texture of the
+# bonsai's room repeats every .3 m. Measured on four rooms, see studies/README.md.
+_MOVED, _LEAST_MOVE_M, _BESIDE = SAME_SIGHT._replace(distance_m=4.0), 0.3, 20.0 / 525.0
 # Before the search for a rival, all points within this multiple of the tolerance are removed.
 _RIVAL_TOLERANCE = 3.0
 #: No constraint on the camera.
@@ -403,9 +404,8 @@ class KeyframeLocalizer:
             poses[:, :3, 3] - pose[:3, 3], axis=1))
         turns = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1) @ pose[:3, :3])
         angle = shares @ turns.magnitude()
-        position = _KEYFRAME_M**2 + grown_m ** 2
-        rotation = _KEYFRAME_RAD**2 + (PER_RADIAN * angle) ** 2
-        return np.diag(np.repeat([position, rotation], 3))
+        return np.diag(np.repeat([_KEYFRAME_M**2 + grown_m**2,
+                                  _KEYFRAME_RAD**2 + (PER_RADIAN * angle)**2], 3))
 
 
 def _places(first: _Place | None, matched: _Matched, look: _Look
@@ -441,7 +441,8 @@ def _was_elsewhere(part: _Place, place: _Place) -> bool:
     """Check whether the points of another pose have moved, if a place is right."""
     move = place.map_from_camera @ invert_transform(part.map_from_camera) - np.eye(4)
     moves_m = np.linalg.norm(part.inliers.points @ move[:3, :3].T + move[:3, 3], axis=1)
-    return bool(_MOVED_M[0] < np.median(moves_m) < _MOVED_M[1])
+    return bool(_MOVED.agree(part.map_from_camera, place.map_from_camera)
+                and np.median(moves_m) > _LEAST_MOVE_M)
 
 
 def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
