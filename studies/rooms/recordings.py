@@ -116,7 +116,7 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, elsewhere: int
                  'second, dark': (dim, rows[~is_first & is_asked])}
         others = [other for other in rooms().values() if other.name != name]
         for which, made in make_maps(room, dim, first, second):
-            keyframes = made.layer and KeyframeLocalizer(made.layer)
+            keyframes = None if made.layer is None else KeyframeLocalizer(made.layer)
             own = partial(outcome_of, known=NOTHING, landmark_map=made.landmark_map,
                           keyframes=keyframes)
             for part, (seen, some) in asked.items():

@@ -224,10 +224,10 @@ class KeyframeLocalizer:
             return Recognition(is_thorough=is_thorough)
         descriptors = kind.units(features.descriptors)
         look = _Look(features, bearings[known], camera, constraint, kind.least_inliers)
-        found = self._search_fast(descriptors, look, guesses, deadline) if fast is None else (
+        searched = self._search_fast(descriptors, look, guesses, deadline) if fast is None else (
             self._search_thoroughly(descriptors, look, guesses, [
                 place.map_from_camera for place in fast.places], deadline))
-        places, outside_m = _places(*found, look)
+        places, outside_m = _places(*searched, look)
         if is_thorough:
             places[:1] = [self._guided(place, look, descriptors) for place in places[:1]]
         if time.monotonic() > deadline:
