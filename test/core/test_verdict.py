@@ -71,7 +71,7 @@ WEAK = {
     'near': ({'near': 0.5, 'deviation_m': 1.23}, RefusalKind.UNCERTAIN_POSITION),
     'genuine': ({'signs': SMALL, 'recognized': RECOGNIZED}, RefusalKind.CHANGED),
     'parted': ({'recognized': RECOGNIZED._replace(parted=0.3)}, RefusalKind.CHANGED),
-    'hardly parted': ({'recognized': RECOGNIZED._replace(parted=0.1)}, None),
+    'hardly parted': ({'recognized': RECOGNIZED._replace(parted=0.05)}, None),
     'mirror': ({'not_mirrored': 0.5}, RefusalKind.AMBIGUOUS),
     'keyframes': ({'uncontradicted': 0.1, 'rival': Rival(0.01, (9.0, 9.0, 9.0))},
                   RefusalKind.CONTRADICTION),
