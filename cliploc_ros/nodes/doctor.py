@@ -153,7 +153,7 @@ class Doctor(RelocalizerNode):
             report.judge('localizer', running.missing() if parameters.base_frame else
                          'base_frame is empty: initialpose would carry the pose of the camera: '
                          "set it to AMCL's base_frame_id", 'it subscribes to initialpose, and '
-                         f'shows its pose {running.where()}')
+                         f'publishes {running.pose_topic or "no pose except in tf"}')
         if localizer is None or not has_frame:
             return report.add('pose', State.NOT_CHECKED, 'it needs a map and a frame')
         answer = self._requests.answer()

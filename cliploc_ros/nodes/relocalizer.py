@@ -77,7 +77,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                     *(topic for source in sources for topic in source.topics.values()),
                     *_OTHER_TOPICS, parameters.localizer_pose) if name not in ('', AUTO))
         self._handoff = HandOff(self, self._robot.odometry, self._robot.transforms)
-        self._handoff.localizer.on_shown(self._robot.prior.follow)
+        self._handoff.localizer.listeners.append(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))
         self._requests = Requests(self, self._frames, self._robot, self._jumps, self._pipeline,
                                   self._cases, self._handoff if delivers else None)

@@ -183,7 +183,9 @@ class HandOff:
         if not times:
             return 'too little time is left for the localizer to take the pose: retry'
         if shown is None:
-            return f'{why}{self.localizer.silence(times)}'
+            source = self.localizer.pose_topic or 'tf from the map'
+            return (f'{why}no message on {source} since initialpose was published {times} times: '
+                    f'{self.localizer.silence()}')
         given = self._carried(given, shown.header.stamp)
         return f'{why}{self.localizer.pose_topic or "tf"} {difference(given, shown)}'
 

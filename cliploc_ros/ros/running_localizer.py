@@ -10,7 +10,7 @@ pose that the localizer shows afterwards proves that it took the given pose.
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -18,19 +18,16 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from numpy.typing import NDArray
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node, NodeNameNonExistentError
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from cliploc_ros.core.geometry.transforms import TAKEN, pose_error
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import pose_with_covariance_msg
-from cliploc_ros.ros.inputs.coordinate_frames import (
-    CoordinateFrames,
-    NoTransformError,
-    matrix_from_msg,
-)
+from cliploc_ros.ros.conversions import matrix_from_msg, pose_with_covariance_msg
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.parameters import AUTO, RelocalizerParameters
 
 _TYPE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+# Localizers broadcast their former transform until the next scan, which comes within this time.
+_SCAN_S = 0.5
 
 
 class RunningLocalizer:
@@ -47,13 +44,16 @@ class RunningLocalizer:
         self.changed = threading.Condition()
         #: Full name of the topic of its pose; empty: unknown, or the pose is in tf
         self.pose_topic = ''
-        self.shown_at = -math.inf  #: When its last pose was received (monotonic clock) [s]
-        self._parameters: RelocalizerParameters | None = None  # None while closed
-        # The last given pose, and what the localizer has shown since.
+        self.shown_at = -math.inf  #: When its topic was last heard (monotonic clock) [s]
+        #: Called with each pose on its topic; must not block
+        self.listeners: list[Callable[[PoseWithCovarianceStamped], None]] = []
+        self._name, self._parameters = '', RelocalizerParameters()  # no name while closed
+        # The last given pose and when it was given, what the localizer has shown since, and
+        # whether its transforms count.
         self._given: PoseWithCovarianceStamped | None = None
         self._shown: PoseWithCovarianceStamped | None = None
         self._transform: TransformStamped | None = None
-        self._listeners: list[Callable[[PoseWithCovarianceStamped], None]] = []
+        self._given_at, self._is_in_tf = -math.inf, False
         self._finding = threading.Lock()
         self._subscription: qos.AdaptiveSubscription | None = None
         self._publisher = node.create_publisher(
@@ -61,20 +61,15 @@ class RunningLocalizer:
             event_callbacks=PublisherEventCallbacks(matched=lambda _: self.wake()))
         transforms.listeners.append(self._hear_transform)
 
-    def on_shown(self, listener: Callable[[PoseWithCovarianceStamped], None]) -> None:
-        """Register a non-blocking function that is called with each pose of the localizer."""
-        self._listeners.append(listener)
-
     def open(self, parameters: RelocalizerParameters) -> None:
         """Subscribe to the pose of the localizer, as soon as it is found."""
-        self._parameters = parameters
+        self._name, self._parameters = parameters.localizer_pose, parameters
         self.find()
 
     def close(self) -> None:
         """Unsubscribe, and forget the localizer."""
-        with self._finding:
-            self._parameters = self._given = None
-            self._listen('')
+        self._name, self._given = '', None
+        self.find()
 
     def wake(self) -> None:
         """Notify those who wait for a change."""
@@ -91,27 +86,33 @@ class RunningLocalizer:
     def find(self) -> str:
         """Find the localizer's pose, and listen to it; return what is wrong, empty if nothing."""
         with self._finding:
-            parameters = self._parameters
-            if parameters is None or not parameters.localizer_pose:
-                return ''
-            if parameters.localizer_pose != AUTO:
-                topic = str(self._node.resolve_topic_name(parameters.localizer_pose))
-            else:
-                topic, problem = self._discover()
-                if problem:
-                    return problem
-            self._listen(topic)
-            return not_one_publisher(topic, self._node.get_publishers_info_by_topic(topic)) \
-                if topic else self._open_tf(parameters)
+            takers = self._nodes('subscriptions', self._publisher.topic_name)
+            topics = self._topics(takers)
+            found = sorted((topic, name) for topic in topics
+                           for name in self._nodes('publishers', topic))
+            in_tf = [('tf', name) for name in sorted(takers & self._nodes(
+                'publishers', self._node.resolve_topic_name('/tf')))
+                if self._name == AUTO and not found]
+            if len(several := found or in_tf) > 1:
+                return (f'several localizers: {", ".join(f"{b} on {a}" for a, b in several)}; '
+                        'stop all but one')
+            self._listen(found[0][0] if found else ''.join(topics))
+            if in_tf or found or not self._name:
+                return self._open_tf() if in_tf else ''
+            return (f'nobody publishes {", ".join(topics)}' if topics else
+                    f'no subscriber of {self._publisher.topic_name} shows a pose') + (
+                ': start the localizer (AMCL); if it has just started, retry; or set '
+                'localizer_pose to the topic of its pose')
 
     def give(self, pose: PoseWithCovarianceStamped) -> None:
         """Publish a pose on `initialpose`, and forget what the localizer has shown before."""
         with self.changed:
-            is_silent = self._given is not None and self.shown() is None
+            was_silent = self._given is not None and self.shown() is None
+            self._is_in_tf = self._name == AUTO and (not self.pose_topic or was_silent)
             self._given, self._shown, self._transform = pose, None, None
-        parameters = self._parameters
-        if is_silent and parameters is not None and parameters.localizer_pose == AUTO:
-            self._open_tf(parameters)
+            self._given_at = time.monotonic()
+        if self._is_in_tf:
+            self._open_tf()
         self._publisher.publish(pose)
 
     def shown(self) -> PoseWithCovarianceStamped | None:
@@ -120,52 +121,42 @@ class RunningLocalizer:
         A transform is extended by odometry at the stamp of the given pose: there it may be
         compared although the robot has driven off.
         """
-        given, transform, parameters = self._given, self._transform, self._parameters
-        if self._shown is not None or transform is None or given is None or parameters is None:
+        given, transform = self._given, self._transform
+        if self._shown is not None or transform is None or given is None:
             return self._shown
         with suppress(NoTransformError):
-            return pose_with_covariance_msg(
-                given.header, matrix_from_msg(transform.transform) @ self._transforms.lookup(
-                    transform.child_frame_id, parameters.base_frame, given.header.stamp, 0.0),
-                np.zeros((6, 6)))
+            odom_from_base = self._transforms.lookup(
+                transform.child_frame_id, self._parameters.base_frame, given.header.stamp, 0.0)
+            return pose_with_covariance_msg(given.header, matrix_from_msg(
+                transform.transform) @ odom_from_base, np.zeros((6, 6)))
         return None
 
-    def silence(self, times: int) -> str:
-        """Return what to do about a localizer that shows no pose after `times` given ones."""
-        source = f'message on {self.pose_topic}' if self.pose_topic else 'transform from the map'
-        return (f'no {source} since initialpose was published {times} times: '
-                f'{silence_of_localizer(self._node)}')
+    def silence(self) -> str:
+        """Return what to do about a localizer that shows no pose."""
+        topic = self._node.resolve_topic_name('map')
+        no_map = '' if self._node.count_publishers(topic) else (
+            f'nobody publishes {topic}, without which AMCL has no pose: start its map server; ')
+        return f'{no_map}check that the localizer is active and receives scans'
 
-    def where(self) -> str:
-        """Return where the localizer shows its pose, for a message."""
-        return f'on {self.pose_topic}' if self.pose_topic else 'in tf, or it is not checked'
+    def _nodes(self, kind: str, topic: str) -> set[str]:
+        """Return its publishers or subscriptions; after a restart, one is listed twice."""
+        return {f'{one.node_namespace.rstrip("/")}/{one.node_name}' for one in getattr(
+            self._node, f'get_{kind}_info_by_topic')(topic)}
 
-    def _discover(self) -> tuple[str, str]:
-        """Return the topic of its pose, empty if it is in tf alone; and what is wrong."""
-        node, given_on = self._node, self._publisher.topic_name
-        inputs = given_on, node.resolve_topic_name('~/prior')
-        takers = node.get_subscriptions_info_by_topic(given_on)
-        shown = list[tuple[str, str]]()
-        for name, space in sorted({(one.node_name, one.node_namespace) for one in takers}):
+    def _topics(self, takers: set[str]) -> set[str]:
+        """Return the topics with poses of these nodes, or the topic that a parameter names."""
+        if self._name != AUTO:
+            return {self._node.resolve_topic_name(self._name)} if self._name else set()
+        found = set[str]()
+        for taker in takers:
+            space, _, name = taker.rpartition('/')
             with suppress(NodeNameNonExistentError):  # it has ended, or is not fully discovered
-                shown += [(f'{space.rstrip("/")}/{name}', topic) for topic, types in
-                          node.get_publisher_names_and_types_by_node(name, space)
-                          if _TYPE in types and topic not in inputs]
-        if len(shown) > 1:
-            return '', (f'several localizers: {", ".join(" shows ".join(one) for one in shown)}; '
-                        'stop all but one, or set localizer_pose to its topic')
-        if shown:
-            return shown[0][1], ''
-        in_tf = _names(takers) & _names(node.get_publishers_info_by_topic(
-            node.resolve_topic_name('/tf')))
-        if len(in_tf) == 1:
-            return '', ''
-        names = ', '.join(sorted(in_tf or _names(takers)))
-        return '', (f'several localizers, {names}: stop all but one' if in_tf else
-                    f'no node that subscribes to {given_on} shows a pose ({names}): start the '
-                    'localizer (AMCL); if it has just started, retry; or set localizer_pose')
+                found |= {topic for topic, types in
+                          self._node.get_publisher_names_and_types_by_node(name, space or '/')
+                          if _TYPE in types}
+        return found - {self._publisher.topic_name, self._node.resolve_topic_name('~/prior')}
 
-    def _listen(self, topic: str) -> None:
+    def _listen(self, topic: str = '') -> None:
         """Listen to this topic in place of the former one."""
         if topic == self.pose_topic:
             return
@@ -176,55 +167,33 @@ class RunningLocalizer:
             self._node, PoseWithCovarianceStamped, topic, self._hear, qos.POSE) if topic else None
         self.pose_topic = topic
 
-    def _open_tf(self, parameters: RelocalizerParameters) -> str:
+    def _open_tf(self) -> str:
         """Listen to transforms; return why they cannot show the localizer's pose, else ''."""
-        remedy = 'set localizer_pose to the topic of its pose'
-        if parameters.publish_tf or not parameters.base_frame:
-            return (f'the localizer shows its pose in tf alone: {remedy}, or '
-                    f'{"publish_tf: false" if parameters.publish_tf else "set base_frame"}')
+        why, remedy = 'the localizer shows its pose in tf alone', 'set localizer_pose to its topic'
+        if self._parameters.publish_tf or not self._parameters.base_frame:
+            return f'{why}: set base_frame, and publish_tf: false; or {remedy}'
         try:
-            self._transforms.open('the localizer shows its pose in tf alone', remedy=remedy)
+            self._transforms.open(why, remedy=remedy)
         except NoTransformError as error:
             return str(error)
         return ''
 
     def _hear(self, shown: PoseWithCovarianceStamped) -> None:
+        if self._name == AUTO and shown == self._given:
+            return  # a relay, as from initialpose to set_pose, is no localizer
         with self.changed:
-            parameters = self._parameters
-            if parameters is not None and parameters.localizer_pose == AUTO \
-                    and shown == self._given:
-                return  # a relay, as from initialpose to set_pose, is no localizer
             self._shown, self.shown_at = shown, time.monotonic()
             self.changed.notify_all()
-        for listener in self._listeners:
+        for listener in self.listeners:
             listener(shown)
 
     def _hear_transform(self, transform: TransformStamped, is_static: bool) -> None:
-        given, parameters = self._given, self._parameters
-        if is_static or given is None or parameters is None or parameters.publish_tf \
-                or parameters.localizer_pose != AUTO or not _same_frame(transform, given):
-            return
-        with self.changed:
-            self._transform = transform
-            self.changed.notify_all()
-
-
-def not_one_publisher(topic: str, publishers: Sequence[TopicEndpointInfo]) -> str:
-    """Return why the topic of the localizer's pose has no single source; empty if it has one."""
-    names = _names(publishers)
-    if len(names) > 1:
-        return f'{len(names)} nodes publish {topic}: {", ".join(sorted(names))}; stop all but one'
-    return '' if names else (
-        f'nobody publishes {topic}: start the localizer (AMCL); if it has just started, retry; or '
-        'set localizer_pose to the topic of its pose')
-
-
-def silence_of_localizer(node: Node) -> str:
-    """Return what to do about a localizer that publishes no pose."""
-    topic = node.resolve_topic_name('map')
-    no_map = '' if node.count_publishers(topic) else (
-        f'nobody publishes {topic}, without which AMCL has no pose: start its map server; ')
-    return f'{no_map}check that the localizer is active and receives scans'
+        if self._is_in_tf and not is_static and not self._parameters.publish_tf and (
+                self._given is not None and _same_frame(transform, self._given)
+                and time.monotonic() > self._given_at + _SCAN_S):
+            with self.changed:
+                self._transform = transform
+                self.changed.notify_all()
 
 
 def difference(given: PoseWithCovarianceStamped, shown: PoseWithCovarianceStamped) -> str:
@@ -242,11 +211,6 @@ def difference(given: PoseWithCovarianceStamped, shown: PoseWithCovarianceStampe
     distance_m, angle_deg = pose_error(_planar(given), _planar(shown))
     return (f'differs from it by {distance_m:.2f} m and {angle_deg:.0f} degrees (limits '
             f'{near.distance_m:.2f} and {near.angle_deg:.0f})')
-
-
-def _names(endpoints: Sequence[TopicEndpointInfo]) -> set[str]:
-    """Return the nodes; a localizer that was killed and started again may be listed twice."""
-    return {f'{one.node_namespace.rstrip("/")}/{one.node_name}' for one in endpoints}
 
 
 def _same_frame(one: PoseWithCovarianceStamped | TransformStamped,

@@ -41,7 +41,7 @@ from cliploc_ros.ros.node.diagnostics import Health, join_names
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
 from cliploc_ros.ros.request import Pipeline, Requests
-from cliploc_ros.ros.running_localizer import RunningLocalizer, silence_of_localizer
+from cliploc_ros.ros.running_localizer import RunningLocalizer
 from cliploc_ros.units import NS_PER_S
 
 # Least time between two checks [s], and greatest share of a core that they may use.
@@ -112,7 +112,7 @@ class Watcher:
         self._image_stamp, self._had_pose = Time(), False
         self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if self.is_on:
-            handoff.localizer.on_shown(self._pose.hear)
+            handoff.localizer.listeners.append(self._pose.hear)
             pipeline.on_map = lambda: self._drop('a map was loaded')
             robot.odometry.on_restart(lambda _: self._drop('odom restarted'))
             self._localized = node.create_publisher(Bool, '~/localized', qos.LATCHED)
@@ -463,5 +463,5 @@ class LocalizerPose:
         if place.way_m - anchor.way_m > _SILENT_WAY_M:
             raise NoLocalizerPoseError(
                 f'no message on {topic} for {place.way_m - anchor.way_m:.1f} m of driving: '
-                f'{silence_of_localizer(self._node)}')
+                f'{self._localizer.silence()}')
         return frame_id, anchor.map_from_odom @ place.odom_from_frame

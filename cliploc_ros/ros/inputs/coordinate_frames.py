@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Transform, TransformStamped
+from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -15,7 +15,7 @@ from rclpy.time import Time as RclTime
 
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.conversions import matrix_from_msg, stamp_ns
 from cliploc_ros.ros.inputs.stamps import StampOrder
 
 
@@ -104,12 +104,6 @@ class CoordinateFrames:
         except Exception as error:  # tf2 raises a different type for each cause
             raise NoTransformError(f'{missing}: {error}; publish it, or {remedy}') from error
         return matrix_from_msg(found)
-
-
-def matrix_from_msg(msg: Transform) -> NDArray[np.float64]:
-    """Return a transform (4, 4)."""
-    t, q = msg.translation, msg.rotation
-    return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
 
 
 def _make_buffer(node: Node, frames: CoordinateFrames) -> Any:
