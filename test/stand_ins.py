@@ -1,16 +1,20 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Localizers as their sources describe them: names, topics, quality of service, rates, habits.
+"""Localizers and Nav2 as their sources describe them: names, topics, QoS, rates, habits.
 
-nav2_amcl 1.3.13, beluga_amcl 2.1.1, slam_toolbox 2.8.3 (localization), robot_localization 3.8
-(EKF in the map), mola_bridge_ros2 2.x. They adopt a pose with the next scan.
+nav2_amcl and map_server 1.3.13, beluga_amcl 2.1.1, slam_toolbox (ROS 2, localization),
+robot_localization (ROS 2, EKF in the map), mola_bridge_ros2 (2025).
 """
 
+import threading
+from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import NamedTuple
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -93,6 +97,55 @@ class Buffer:
         placed = TransformStamped()
         placed.transform.translation.x = ODOM_X_M * (target == 'odom')
         return placed
+
+
+class Nav2:
+    """map_server and the costmaps. `order` has what they and the localizer got.
+
+    `broken` names the part that fails: load_map ends with a `result`, or a part does not answer.
+    """
+
+    def __init__(self, node):
+        types, group = import_module('nav2_msgs.srv'), ReentrantCallbackGroup()
+        self._node, self.order, self.broken, self.ended = node, [], '', threading.Event()
+        self._grids = node.create_publisher(OccupancyGrid, 'map', LATCHED)
+        self._load_map = node.create_service(types.LoadMap, 'map_server/load_map', self._load)
+        for name in ('global', 'local'):
+            def clear(_, response, name=name):
+                self._work(name)
+                return response
+            node.create_service(types.ClearEntireCostmap, callback=clear, callback_group=group,
+                                srv_name=f'{name}_costmap/clear_entirely_{name}_costmap')
+        node.create_subscription(
+            PoseWithCovarianceStamped, 'initialpose',
+            lambda pose: self.order.append(f'pose in {pose.header.frame_id}'), 10)
+
+    def _work(self, name):
+        self.order.append(name)
+        if name in self.broken:
+            self.ended.wait()
+
+    def _load(self, request, response):
+        self._work(Path(request.map_url).stem)
+        response.result = int(self.broken == 'result')
+        if not response.result:
+            response.map = self.make_grid()
+            if self.broken != 'grid':
+                self._grids.publish(response.map)
+        return response
+
+    def make_grid(self):
+        grid = OccupancyGrid(data=[0, 100, -1])
+        grid.info.map_load_time = self._node.get_clock().now().to_msg()
+        grid.header.frame_id = 'map'
+        return grid
+
+    def load_another(self):
+        """Publish another grid, as if another program had called load_map."""
+        self._grids.publish(self.make_grid())
+
+    def kill_map_server(self):
+        self._node.destroy_service(self._load_map)
 
 
 def _tf_type():

@@ -149,7 +149,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         """Report the inputs and the last verdict."""
         parameters = self.settings.values
         missing = [line for source in self._frames.sources.values() for line in source.missing()]
-        if parameters.require_localizer and (no_localizer := self._handoff.localizer.missing()):
+        if (no_localizer := self._handoff.localizer.missing()) and parameters.require_localizer:
             missing.append(no_localizer)
         self._frames.examine(health, parameters.stale_after_s)
         self._robot.examine(health)

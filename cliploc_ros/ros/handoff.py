@@ -5,6 +5,7 @@
 import math
 import threading
 import time
+from collections.abc import Mapping
 from copy import deepcopy
 
 import numpy as np
@@ -16,13 +17,13 @@ from rclpy.time import Time
 from std_srvs.srv import Empty
 
 from cliploc_ros.core.geometry.transforms import SAME_SPOT, invert_transform
-from cliploc_ros.errors import CliplocError
+from cliploc_ros.errors import CliplocError, HandOffError, NoLocalizerError
 from cliploc_ros.ros.conversions import pose_from_msg, pose_to_msg, stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.odometry import MOMENT_PATIENCE_S, OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.parameters import RelocalizerParameters
-from cliploc_ros.ros.running_localizer import RunningLocalizer, difference
+from cliploc_ros.ros.receivers import Floors, RunningLocalizer, difference
 
 # Least variances of x, y, z [m^2] and of the rotations [rad^2]: a centimetre and a sixth of a
 # degree. AMCL draws its particles from x, y and yaw; with zero variance they would coincide.
@@ -42,14 +43,9 @@ _LEAST_S = 0.5
 # publish at 5 Hz or more.
 _UPDATE_PERIOD_S = 0.2
 _UPDATE_PATIENCE_S = 2.0
-
-
-class HandOffError(CliplocError):
-    """The pose was not delivered to the localizer; the message says why."""
-
-
-class NoLocalizerError(HandOffError):
-    """There is no localizer, or it does not take poses. Another frame would not help."""
+# With several floors, the greatest age of an image: a lift takes longer to close its doors, ride,
+# and open them. Chosen.
+_LIFT_S = 5.0
 
 
 class HandOff:
@@ -64,6 +60,8 @@ class HandOff:
         self.localizer = RunningLocalizer(node, transforms)
         self._base_frame = ''
         self._stopped = threading.Event()
+        #: The grid of Nav2
+        self.floors = Floors(node, self._stopped)
         self._updater = node.create_client(Empty, 'request_nomotion_update',
                                            callback_group=ReentrantCallbackGroup())
 
@@ -83,7 +81,8 @@ class HandOff:
         self.localizer.wake()
 
     def hand_over(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
-                  deadline: float, received_at: float, jumps: TimeJumps) -> None:
+                  deadline: float, received_at: float, jumps: TimeJumps,
+                  grids: Mapping[str, str]) -> None:
         """Publish a pose on `initialpose` until the localizer takes it, and let it converge.
 
         The localizer has taken the pose when it publishes a pose that agrees, after odometry has
@@ -100,13 +99,16 @@ class HandOff:
             nothing needs to be waited for, the pose is published even after the deadline.
         jumps : TimeJumps
             Time jumps of the node's clock.
+        grids : mapping
+            File of Nav2's grid of each map, which is loaded first; empty: one floor.
 
         Raises
         ------
         HandOffError
             The robot moves or may be moving, or it has moved since the image.
         NoLocalizerError
-            There is no localizer, it does not take the pose, or it died afterwards.
+            There is no localizer, it does not take the pose, or it died afterwards; or the grid
+            was not loaded. The former grid is requested again.
         TimeJumpError
             Time has jumped back since the image.
         """
@@ -124,24 +126,33 @@ class HandOff:
             with self.localizer.changed:
                 self.localizer.changed.wait(min(_POLL_S, _left_s(until)))
         must_show = parameters.require_localizer and bool(parameters.localizer_pose)
-        given, times = pose, 0
-        while not times or (must_show and not self._is_shown(given, deadline)):
-            # first, because with any time left a robot that moves is told to stop
-            self.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s, deadline)
-            if must_show and _left_s(deadline) < _LEAST_S:
+        given, times, before = pose, 0, self.floors.loaded
+        try:
+            while not times or (must_show and not self._is_shown(given, deadline)):
+                # first, because with any time left a robot that moves is told to stop
+                self.check_rest(parameters.max_speed_m_s, parameters.max_turn_rad_s, deadline)
+                if must_show and _left_s(deadline) < _LEAST_S:
+                    raise NoLocalizerError(self._not_taken(given, times))
+                self._check_place(pose.header.stamp, deadline,
+                                  received_at if grids and not times else math.inf)
+                jumps.check(pose.header.stamp, received_at)
+                if self._stopped.is_set():
+                    raise HandOffError('the node was deactivated during the hand-over')
+                if grids and pose.header.frame_id not in self.floors.loaded.values():
+                    self.floors.enter(pose.header.frame_id, grids, deadline)
+                    continue  # the robot may have moved meanwhile
+                given, times = usable_pose(pose, self._node.get_clock().now()), times + 1
+                given.header.frame_id = next(
+                    iter(self.floors.loaded if grids else ()), pose.header.frame_id)
+                self.localizer.give(given)
+            silent = self._settle(parameters.nomotion_updates, deadline)
+            if must_show and (gone := silent or self.localizer.missing()):
+                raise NoLocalizerError('the localizer took the pose, but has ended or hangs: '
+                                       f'{gone}; see its log, then retry')
+            if must_show and not self._is_taken(given, _CARRY_S):
                 raise NoLocalizerError(self._not_taken(given, times))
-            self._check_place(pose.header.stamp, deadline)
-            jumps.check(pose.header.stamp, received_at)
-            if self._stopped.is_set():
-                raise HandOffError('the node was deactivated during the hand-over')
-            given, times = usable_pose(pose, self._node.get_clock().now()), times + 1
-            self.localizer.give(given)
-        silent = self._settle(parameters.nomotion_updates, deadline)
-        if must_show and (gone := silent or self.localizer.missing()):
-            raise NoLocalizerError('the localizer took the pose, but has ended or hangs: '
-                                   f'{gone}; see its log, then retry')
-        if must_show and not self._is_taken(given, _CARRY_S):
-            raise NoLocalizerError(self._not_taken(given, times))
+        except CliplocError as error:
+            raise type(error)(f'{error}{self.floors.restore(before, grids)}') from error
         if silent:
             self._node.get_logger().warning(
                 f'{silent}: the localizer has the pose, but may not converge while the robot is '
@@ -219,12 +230,16 @@ class HandOff:
             raise HandOffError(f'the robot moves at {speed_m_s:.2f} m/s and {turn_rad_s:.2f} '
                                f'rad/s (limits {max_speed_m_s:g} and {max_turn_rad_s:g}): stop it')
 
-    def _check_place(self, stamp: Stamp, deadline: float) -> None:
+    def _check_place(self, stamp: Stamp, deadline: float, received_at: float) -> None:
         """Raise HandOffError unless the robot is still where its image was taken.
 
-        AMCL would correct the pose by tf, but robot_localization's set_pose does not.
+        AMCL would correct the pose by tf, but robot_localization's set_pose does not. No odometry
+        shows a lift.
         """
         is_published = self._odometry.is_published
+        if (age_s := time.monotonic() - received_at) > _LIFT_S:
+            raise HandOffError(f'the image is {age_s:.1f} s old, and a lift may have moved the '
+                               f'robot since (limit {_LIFT_S:g}): retry')
         moved = self._odometry.moved_since(
             stamp, min(_ODOM_PATIENCE_S, _left_s(deadline)) if is_published else 0.0)
         if moved is None and is_published:

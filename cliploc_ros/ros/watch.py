@@ -25,13 +25,12 @@ from std_msgs.msg import Bool, Header, String
 
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import SAME_SPOT, invert_transform, is_rigid
-from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.watch.watch import WatchReport, WatchState
-from cliploc_ros.errors import CliplocError, StoppedError, TimeUpError
+from cliploc_ros.errors import CliplocError, HandOffError, StoppedError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer
 from cliploc_ros.ros.conversions import pose_from_msg, stamp_ns
-from cliploc_ros.ros.handoff import HandOff, HandOffError
+from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
@@ -40,8 +39,8 @@ from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps, stamp_proble
 from cliploc_ros.ros.node.diagnostics import Health, join_names
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.receivers import RunningLocalizer
 from cliploc_ros.ros.request import Pipeline, Requests
-from cliploc_ros.ros.running_localizer import RunningLocalizer
 from cliploc_ros.units import NS_PER_S
 
 # Least time between two checks [s], and greatest share of a core that they may use.
@@ -232,8 +231,10 @@ class Watcher:
                              fuse_frames=MAX_FRAMES)
         state = self._robot.at(image, parameters, depth_frame=frame.depth_frame,
                                info=frame.camera_info)
-        pose = self._pose.at(image, state, parameters, [
-            part.landmark_map.frame_id for part in parts_of(localizer.landmark_map)])
+        floors = self._handoff.floors.loaded
+        frame_id, map_from_camera = self._pose.at(
+            image, state, parameters, [*floors, *localizer.frame_ids])
+        pose = floors.get(frame_id, frame_id), map_from_camera
         self._had_pose = True
 
         def score() -> WatchReport | None:

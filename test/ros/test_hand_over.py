@@ -26,7 +26,7 @@ from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.parameters import RelocalizerParameters
-from cliploc_ros.ros.running_localizer import difference
+from cliploc_ros.ros.receivers import difference
 
 PARAMETERS = RelocalizerParameters(base_frame='base_link', localizer_pose='')
 
@@ -78,11 +78,12 @@ class Robot:
         self.parameters = replace(PARAMETERS, localizer_pose=localizer_pose)
         self.handoff.open(self.parameters)
 
-    def hand_over(self, timeout_s=10.0, **changes):
+    def hand_over(self, timeout_s=10.0, floor='map', grids=(), age_s=0.0, **changes):
         """Hand a pose over; return the elapsed time [s]."""
-        start = time.monotonic()
-        self.handoff.hand_over(make_pose(), replace(self.parameters, **changes), start + timeout_s,
-                               start, self.jumps)
+        start, pose = time.monotonic(), make_pose()
+        pose.header.frame_id = floor
+        self.handoff.hand_over(pose, replace(self.parameters, **changes), start + timeout_s,
+                               start - age_s, self.jumps, grids)
         return time.monotonic() - start
 
     def jump(self):

@@ -1,25 +1,32 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The localizer that takes poses from `initialpose`: AMCL, slam_toolbox, or any other.
+"""What a pose is handed over to: the running localizer, and Nav2's grid of the pose's floor.
 
 `initialpose` is volatile: the publisher may have discovered a subscription that has not yet
 discovered the publisher. DDS also reports a localizer that was killed or hangs as alive. Only the
 pose that the localizer shows afterwards proves that it took the given pose.
 """
 
+import importlib
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node, NodeNameNonExistentError
+from rclpy.task import Future
 
-from cliploc_ros.core.geometry.transforms import TAKEN, pose_error
+from cliploc_ros.core.geometry.transforms import TAKEN, pose_error, transform_from_pose
+from cliploc_ros.errors import NoLocalizerError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import matrix_from_msg, pose_with_covariance_msg
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
@@ -28,6 +35,10 @@ from cliploc_ros.ros.parameters import AUTO, RelocalizerParameters
 _TYPE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 # Localizers broadcast their former transform until the next scan, which comes within this time.
 _SCAN_S = 0.5
+_POLL_S = 0.02
+_SERVICES = (('LoadMap', 'map_server/load_map'), *(
+    ('ClearEntireCostmap', f'{name}_costmap/clear_entirely_{name}_costmap')
+    for name in ('global', 'local')))
 
 
 class RunningLocalizer:
@@ -85,24 +96,17 @@ class RunningLocalizer:
 
     def find(self) -> str:
         """Find the localizer's pose, and listen to it; return what is wrong, empty if nothing."""
+        tf = str(self._node.resolve_topic_name('/tf'))
         with self._finding:
-            takers = self._nodes('subscriptions', self._publisher.topic_name)
-            topics = self._topics(takers)
-            found = sorted((topic, name) for topic in topics
-                           for name in self._nodes('publishers', topic))
-            in_tf = [('tf', name) for name in sorted(takers & self._nodes(
-                'publishers', self._node.resolve_topic_name('/tf')))
-                if self._name == AUTO and not found]
-            if len(several := found or in_tf) > 1:
-                return (f'several localizers: {", ".join(f"{b} on {a}" for a, b in several)}; '
+            found = sorted(self._found(tf))
+            if len(found) > 1:
+                return (f'several localizers: {", ".join(f"{b} on {a}" for a, b in found)}; '
                         'stop all but one')
-            self._listen(found[0][0] if found else ''.join(topics))
-            if in_tf or found or not self._name:
-                return self._open_tf() if in_tf else ''
-            return (f'nobody publishes {", ".join(topics)}' if topics else
-                    f'no subscriber of {self._publisher.topic_name} shows a pose') + (
-                ': start the localizer (AMCL); if it has just started, retry; or set '
-                'localizer_pose to the topic of its pose')
+            topic = found[0][0] if found else ''
+            self._listen('' if topic == tf else topic)
+            return self._open_tf() if topic == tf else '' if found or not self._name else (
+                f"nobody publishes the localizer's pose (localizer_pose: {self._name}): start the "
+                'localizer (AMCL); if it has just started, retry; or set localizer_pose')
 
     def give(self, pose: PoseWithCovarianceStamped) -> None:
         """Publish a pose on `initialpose`, and forget what the localizer has shown before."""
@@ -143,18 +147,19 @@ class RunningLocalizer:
         return {f'{one.node_namespace.rstrip("/")}/{one.node_name}' for one in getattr(
             self._node, f'get_{kind}_info_by_topic')(topic)}
 
-    def _topics(self, takers: set[str]) -> set[str]:
-        """Return the topics with poses of these nodes, or the topic that a parameter names."""
-        if self._name != AUTO:
-            return {self._node.resolve_topic_name(self._name)} if self._name else set()
-        found = set[str]()
-        for taker in takers:
-            space, _, name = taker.rpartition('/')
+    def _found(self, tf: str) -> set[tuple[str, str]]:
+        """Return all topics that show its pose, each with a publisher."""
+        node, given_on = self._node, self._publisher.topic_name
+        takers = self._nodes('subscriptions', given_on) if self._name == AUTO else set()
+        topics = {str(node.resolve_topic_name(self._name))} if self._name not in ('', AUTO) else \
+            set[str]()
+        for space, _, name in (taker.rpartition('/') for taker in takers):
             with suppress(NodeNameNonExistentError):  # it has ended, or is not fully discovered
-                found |= {topic for topic, types in
-                          self._node.get_publisher_names_and_types_by_node(name, space or '/')
-                          if _TYPE in types}
-        return found - {self._publisher.topic_name, self._node.resolve_topic_name('~/prior')}
+                topics |= {topic for topic, types in node.get_publisher_names_and_types_by_node(
+                    name, space or '/') if _TYPE in types}
+        topics -= {given_on, node.resolve_topic_name('~/prior')}
+        return {(topic, one) for topic in topics for one in self._nodes('publishers', topic)
+                } or {(tf, one) for one in takers & self._nodes('publishers', tf)}
 
     def _listen(self, topic: str = '') -> None:
         """Listen to this topic in place of the former one."""
@@ -169,11 +174,9 @@ class RunningLocalizer:
 
     def _open_tf(self) -> str:
         """Listen to transforms; return why they cannot show the localizer's pose, else ''."""
-        why, remedy = 'the localizer shows its pose in tf alone', 'set localizer_pose to its topic'
-        if self._parameters.publish_tf or not self._parameters.base_frame:
-            return f'{why}: set base_frame, and publish_tf: false; or {remedy}'
         try:
-            self._transforms.open(why, remedy=remedy)
+            self._transforms.open('the localizer shows its pose in tf alone',
+                                  remedy='set localizer_pose to the topic of its pose')
         except NoTransformError as error:
             return str(error)
         return ''
@@ -194,6 +197,102 @@ class RunningLocalizer:
             with self.changed:
                 self._transform = transform
                 self.changed.notify_all()
+
+
+class Floors:
+    """Loads the grid of the map that an accepted pose is in, and clears both costmaps.
+
+    Only the message on `map` proves which grid is loaded, because other programs may load others:
+    unless it equals the grid in the last answer of map_server, the loaded floor is unknown.
+    `stopped` ends a wait.
+    """
+
+    def __init__(self, node: Node, stopped: threading.Event) -> None:
+        self._node, self._stopped = node, stopped
+        self._clients: list[Any] = []
+        self._grid = OccupancyGrid()
+        self._answer: tuple[str, OccupancyGrid | None] = '', None  # the floor and its grid
+
+    @property
+    def loaded(self) -> dict[str, str]:
+        """Return {coordinate frame of the grid: frame_id of its map}; empty if unknown."""
+        floor, grid = self._answer
+        return {self._grid.header.frame_id: floor} if grid == self._grid else {}
+
+    def enter(self, floor: str, grids: Mapping[str, str], deadline: float) -> None:
+        """Load the grid of a floor, and clear both costmaps.
+
+        Parameters
+        ----------
+        floor : str
+            frame_id of the map.
+        grids : mapping
+            File of the grid of each floor.
+        deadline : float
+            When to return at the latest (monotonic clock) [s].
+
+        Raises
+        ------
+        NoLocalizerError
+            A step failed, or time was up; the message names the step.
+        """
+        if floor not in grids:
+            raise NoLocalizerError(f"the map '{floor}' has no nav2_map: name its grid there")
+        load, *clears = self._clients = self._clients or self._open()
+        self._wait(load.service_is_ready, deadline,
+                   f'nobody serves {load.service_name}: activate map_server')
+        answer = self._request(floor, grids)
+        self._wait(answer.done, deadline, f'{load.service_name} does not answer')
+        result = answer.result().result
+        self._wait(lambda: bool(self.loaded), -math.inf if result else deadline,
+                   f'{load.service_name}: result {result}, and no such grid on map: correct '
+                   f'{grids[floor]}, or activate map_server')
+        for clear in clears:
+            if clear.service_is_ready():  # otherwise there is nothing to clear
+                self._wait(clear.call_async(clear.srv_type.Request()).done, deadline,
+                           f'{clear.service_name} does not answer')
+
+    def restore(self, before: Mapping[str, str], grids: Mapping[str, str]) -> str:
+        """Request the grid that was loaded before, without a wait; return words about it."""
+        if self.loaded == before:
+            return ''
+        self._answer = '', None
+        for floor in before.values():
+            self._request(floor, grids)
+            return f"; the grid of '{floor}' is requested again"
+        return '; which grid was loaded before is unknown'
+
+    def _open(self) -> list[Any]:
+        try:
+            types = importlib.import_module('nav2_msgs.srv')
+        except ImportError as error:
+            raise NoLocalizerError('nav2_map needs nav2_msgs: sudo apt install '
+                                   'ros-jazzy-nav2-msgs') from error
+        group = ReentrantCallbackGroup()
+        self._node.create_subscription(OccupancyGrid, 'map', self._hear, qos.LATCHED)
+        return [self._node.create_client(getattr(types, kind), name, callback_group=group)
+                for kind, name in _SERVICES]
+
+    def _hear(self, grid: OccupancyGrid) -> None:
+        self._grid = grid
+
+    def _request(self, floor: str, grids: Mapping[str, str]) -> Future:
+        self._answer = '', None
+        load = self._clients[0]
+        future = load.call_async(load.srv_type.Request(map_url=grids[floor]))
+        future.add_done_callback(partial(self._keep, floor))
+        return future
+
+    def _keep(self, floor: str, future: Future) -> None:
+        """Keep the answer, also a late one: map_server answers in the order of the requests."""
+        answer = future.result()
+        if answer is not None and not answer.result:
+            self._answer = floor, answer.map
+
+    def _wait(self, condition: Callable[[], bool], until: float, problem: str) -> None:
+        while not condition():
+            if self._stopped.wait(_POLL_S) or time.monotonic() > until:
+                raise NoLocalizerError(problem)
 
 
 def difference(given: PoseWithCovarianceStamped, shown: PoseWithCovarianceStamped) -> str:
@@ -222,7 +321,5 @@ def _planar(msg: PoseWithCovarianceStamped) -> NDArray[np.float64]:
     """Return the part of a pose that AMCL uses, x, y and yaw, as a transform (4, 4)."""
     p, q = msg.pose.pose.position, msg.pose.pose.orientation
     yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-    planar = np.eye(4)
-    planar[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    planar[:2, 3] = p.x, p.y
-    return planar
+    return transform_from_pose(np.array([p.x, p.y, 0.0]), np.array(
+        [0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0)]))
