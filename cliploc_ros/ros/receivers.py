@@ -13,17 +13,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node, NodeNameNonExistentError
-from rclpy.task import Future
 
 from cliploc_ros.core.geometry.transforms import TAKEN, pose_error, transform_from_pose
 from cliploc_ros.errors import NoLocalizerError
@@ -51,7 +47,7 @@ class RunningLocalizer:
 
     def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
         self._node, self._transforms = node, transforms
-        #: Notified when the localizer appears or shows a pose
+        #: Notified when the localizer shows a pose
         self.changed = threading.Condition()
         #: Full name of the topic of its pose; empty: unknown, or the pose is in tf
         self.pose_topic = ''
@@ -68,8 +64,7 @@ class RunningLocalizer:
         self._finding = threading.Lock()
         self._subscription: qos.AdaptiveSubscription | None = None
         self._publisher = node.create_publisher(
-            PoseWithCovarianceStamped, 'initialpose', qos.POSE,
-            event_callbacks=PublisherEventCallbacks(matched=lambda _: self.wake()))
+            PoseWithCovarianceStamped, 'initialpose', qos.POSE)
         transforms.listeners.append(self._hear_transform)
 
     def open(self, parameters: RelocalizerParameters) -> None:
@@ -268,24 +263,21 @@ class Floors:
         except ImportError as error:
             raise NoLocalizerError('nav2_map needs nav2_msgs: sudo apt install '
                                    'ros-jazzy-nav2-msgs') from error
-        group = ReentrantCallbackGroup()
         self._node.create_subscription(OccupancyGrid, 'map', self._hear, qos.LATCHED)
-        return [self._node.create_client(getattr(types, kind), name, callback_group=group)
-                for kind, name in _SERVICES]
+        return [self._node.create_client(getattr(types, kind), name) for kind, name in _SERVICES]
 
     def _hear(self, grid: OccupancyGrid) -> None:
         self._grid = grid
 
-    def _request(self, floor: str, grids: Mapping[str, str]) -> Future:
+    def _request(self, floor: str, grids: Mapping[str, str]) -> Any:
         self._answer = '', None
         load = self._clients[0]
         future = load.call_async(load.srv_type.Request(map_url=grids[floor]))
-        future.add_done_callback(partial(self._keep, floor))
+        future.add_done_callback(lambda done: self._keep(floor, done.result()))
         return future
 
-    def _keep(self, floor: str, future: Future) -> None:
+    def _keep(self, floor: str, answer: Any) -> None:
         """Keep the answer, also a late one: map_server answers in the order of the requests."""
-        answer = future.result()
         if answer is not None and not answer.result:
             self._answer = floor, answer.map
 
