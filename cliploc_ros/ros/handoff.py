@@ -78,7 +78,8 @@ class HandOff:
     def stop(self) -> None:
         """Abort the current hand-over."""
         self._stopped.set()
-        self.localizer.wake()
+        with self.localizer.changed:
+            self.localizer.changed.notify_all()
 
     def hand_over(self, pose: PoseWithCovarianceStamped, parameters: RelocalizerParameters,
                   deadline: float, received_at: float, jumps: TimeJumps,
@@ -123,10 +124,9 @@ class HandOff:
                 and not self._stopped.is_set():
             if not _left_s(until):
                 raise NoLocalizerError(missing)
-            with self.localizer.changed:
-                self.localizer.changed.wait(min(_POLL_S, _left_s(until)))
+            self._stopped.wait(min(_POLL_S, _left_s(until)))
         must_show = parameters.require_localizer and bool(parameters.localizer_pose)
-        given, times, before = pose, 0, self.floors.loaded
+        given, times, floor, before = pose, 0, pose.header.frame_id, self.floors.loaded
         try:
             while not times or (must_show and not self._is_shown(given, deadline)):
                 # first, because with any time left a robot that moves is told to stop
@@ -138,12 +138,11 @@ class HandOff:
                 jumps.check(pose.header.stamp, received_at)
                 if self._stopped.is_set():
                     raise HandOffError('the node was deactivated during the hand-over')
-                if grids and pose.header.frame_id not in self.floors.loaded.values():
-                    self.floors.enter(pose.header.frame_id, grids, deadline)
+                if grids and floor not in self.floors.loaded.values():
+                    self.floors.enter(floor, grids, deadline)
                     continue  # the robot may have moved meanwhile
                 given, times = usable_pose(pose, self._node.get_clock().now()), times + 1
-                given.header.frame_id = next(
-                    iter(self.floors.loaded if grids else ()), pose.header.frame_id)
+                given.header.frame_id = next(iter(self.floors.loaded if grids else ()), floor)
                 self.localizer.give(given)
             silent = self._settle(parameters.nomotion_updates, deadline)
             if must_show and (gone := silent or self.localizer.missing()):
@@ -238,8 +237,8 @@ class HandOff:
         """
         is_published = self._odometry.is_published
         if (age_s := time.monotonic() - received_at) > _LIFT_S:
-            raise HandOffError(f'the image is {age_s:.1f} s old, and a lift may have moved the '
-                               f'robot since (limit {_LIFT_S:g}): retry')
+            raise HandOffError(
+                f'the image is {age_s:.1f} s old, as by a lift (limit {_LIFT_S:g}): retry')
         moved = self._odometry.moved_since(
             stamp, min(_ODOM_PATIENCE_S, _left_s(deadline)) if is_published else 0.0)
         if moved is None and is_published:

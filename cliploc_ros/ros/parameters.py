@@ -220,9 +220,8 @@ class RelocalizerParameters(CommonParameters):
         'A request succeeds only if a localizer such as AMCL takes its pose; false: no localizer '
         'is needed.')
     localizer_pose: str = parameter(AUTO,
-        "Topic of the localizer's pose, which must agree with initialpose; 'auto': the pose of "
-        'the node that subscribes to initialpose, by its topic or tf; empty: any subscriber of '
-        'initialpose suffices.', read_only=True)
+        "Topic of the localizer's pose, which must agree with initialpose; 'auto': found, or in "
+        'tf; empty: any subscriber of initialpose suffices.', read_only=True)
     publish_tf: bool = parameter(False,
         'Broadcast map -> odom_frame (REP 105) after an accepted pose. It pauses while another '
         'node broadcasts it.', read_only=True)

@@ -28,7 +28,6 @@ from cliploc_ros.ros.conversions import matrix_from_msg, pose_with_covariance_ms
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.parameters import AUTO, RelocalizerParameters
 
-_TYPE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 # Localizers broadcast their former transform until the next scan, which comes within this time.
 _SCAN_S = 0.5
 _POLL_S = 0.02
@@ -48,10 +47,10 @@ class RunningLocalizer:
     def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
         self._node, self._transforms = node, transforms
         #: Notified when the localizer shows a pose
-        self.changed = threading.Condition()
-        #: Full name of the topic of its pose; empty: unknown, or the pose is in tf
-        self.pose_topic = ''
-        self.shown_at = -math.inf  #: When its topic was last heard (monotonic clock) [s]
+        self.changed, self._finding = threading.Condition(), threading.Lock()
+        #: Full name of the topic of its pose, empty if it is unknown or in tf alone; and when it
+        #: was last heard (monotonic clock) [s]
+        self.pose_topic, self.shown_at = '', -math.inf
         #: Called with each pose on its topic; must not block
         self.listeners: list[Callable[[PoseWithCovarianceStamped], None]] = []
         self._name, self._parameters = '', RelocalizerParameters()  # no name while closed
@@ -61,7 +60,6 @@ class RunningLocalizer:
         self._shown: PoseWithCovarianceStamped | None = None
         self._transform: TransformStamped | None = None
         self._given_at, self._is_in_tf = -math.inf, False
-        self._finding = threading.Lock()
         self._subscription: qos.AdaptiveSubscription | None = None
         self._publisher = node.create_publisher(
             PoseWithCovarianceStamped, 'initialpose', qos.POSE)
@@ -76,11 +74,6 @@ class RunningLocalizer:
         """Unsubscribe, and forget the localizer."""
         self._name, self._given = '', None
         self.find()
-
-    def wake(self) -> None:
-        """Notify those who wait for a change."""
-        with self.changed:
-            self.changed.notify_all()
 
     def missing(self) -> str:
         """Return why there is no localizer, and what to do; empty if there is one."""
@@ -97,9 +90,16 @@ class RunningLocalizer:
             if len(found) > 1:
                 return (f'several localizers: {", ".join(f"{b} on {a}" for a, b in found)}; '
                         'stop all but one')
-            topic = found[0][0] if found else ''
-            self._listen('' if topic == tf else topic)
-            return self._open_tf() if topic == tf else '' if found or not self._name else (
+            topic = next((topic for topic, _ in found if topic != tf), '')
+            if topic != self.pose_topic:
+                if self._subscription is not None:
+                    self._subscription.destroy()
+                # Volatile, so that no earlier pose of the localizer is delivered.
+                self._subscription = qos.AdaptiveSubscription(
+                    self._node, PoseWithCovarianceStamped, topic, self._hear, qos.POSE
+                    ) if topic else None
+                self.pose_topic = topic
+            return self._open_tf() if found and not topic else '' if topic or not self._name else (
                 f"nobody publishes the localizer's pose (localizer_pose: {self._name}): start the "
                 'localizer (AMCL); if it has just started, retry; or set localizer_pose')
 
@@ -146,26 +146,14 @@ class RunningLocalizer:
         """Return all topics that show its pose, each with a publisher."""
         node, given_on = self._node, self._publisher.topic_name
         takers = self._nodes('subscriptions', given_on) if self._name == AUTO else set()
-        topics = {str(node.resolve_topic_name(self._name))} if self._name not in ('', AUTO) else \
-            set[str]()
+        topics = {str(node.resolve_topic_name(name)) for name in {self._name} - {'', AUTO}}
         for space, _, name in (taker.rpartition('/') for taker in takers):
             with suppress(NodeNameNonExistentError):  # it has ended, or is not fully discovered
                 topics |= {topic for topic, types in node.get_publisher_names_and_types_by_node(
-                    name, space or '/') if _TYPE in types}
+                    name, space or '/') if 'geometry_msgs/msg/PoseWithCovarianceStamped' in types}
         topics -= {given_on, node.resolve_topic_name('~/prior')}
         return {(topic, one) for topic in topics for one in self._nodes('publishers', topic)
                 } or {(tf, one) for one in takers & self._nodes('publishers', tf)}
-
-    def _listen(self, topic: str = '') -> None:
-        """Listen to this topic in place of the former one."""
-        if topic == self.pose_topic:
-            return
-        if self._subscription is not None:
-            self._subscription.destroy()
-        # Volatile, so that no earlier pose of the localizer is delivered.
-        self._subscription = qos.AdaptiveSubscription(
-            self._node, PoseWithCovarianceStamped, topic, self._hear, qos.POSE) if topic else None
-        self.pose_topic = topic
 
     def _open_tf(self) -> str:
         """Listen to transforms; return why they cannot show the localizer's pose, else ''."""
@@ -249,13 +237,12 @@ class Floors:
 
     def restore(self, before: Mapping[str, str], grids: Mapping[str, str]) -> str:
         """Request the grid that was loaded before, without a wait; return words about it."""
-        if self.loaded == before:
-            return ''
-        self._answer = '', None
-        for floor in before.values():
-            self._request(floor, grids)
-            return f"; the grid of '{floor}' is requested again"
-        return '; which grid was loaded before is unknown'
+        if self.loaded != before:
+            self._answer = '', None  # unknown
+            for floor in before.values():
+                self._request(floor, grids)
+                return f"; the grid of '{floor}' is requested again"
+        return ''
 
     def _open(self) -> list[Any]:
         try:

@@ -232,9 +232,7 @@ class Watcher:
         state = self._robot.at(image, parameters, depth_frame=frame.depth_frame,
                                info=frame.camera_info)
         floors = self._handoff.floors.loaded
-        frame_id, map_from_camera = self._pose.at(
-            image, state, parameters, [*floors, *localizer.frame_ids])
-        pose = floors.get(frame_id, frame_id), map_from_camera
+        where, pose = self._pose.at(image, state, parameters, [*floors, *localizer.frame_ids])
         self._had_pose = True
 
         def score() -> WatchReport | None:
@@ -244,7 +242,7 @@ class Watcher:
                 return None
             begun_s = time.thread_time()
             try:
-                return localizer.look(frame, parameters, state, *pose)
+                return localizer.look(frame, parameters, state, floors.get(where, where), pose)
             finally:
                 self._cost_s = time.thread_time() - begun_s
         report = self._node.worker.run(score, begun_at + _STALE_S)

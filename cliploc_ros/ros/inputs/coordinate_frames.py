@@ -171,15 +171,13 @@ class MapToOdom:
     """
 
     def __init__(self, node: Node, transforms: CoordinateFrames) -> None:
-        self._node = node
-        self._transforms = transforms
+        self._node, self._transforms = node, transforms
         self._broadcaster: Any = None
         self._timer: Timer | None = None
         # Set in the worker's thread, reset in the threads that receive /clock and odometry.
         self._lock = threading.Lock()
         self._transform: TransformStamped | None = None
-        self._jumped_at = -math.inf
-        self._began_ns = 0
+        self._jumped_at, self._began_ns = -math.inf, 0
         # Stamps of the newest own broadcasts [ns], and of each coordinate frame the parent in the
         # newest transform of another node, and until when it counts (monotonic clock) [s].
         self._sent: deque[int] = deque(maxlen=100)
@@ -271,7 +269,6 @@ def transform_msg(header: Header, child_frame: str, parent_from_child: NDArray[n
     pose = pose_to_msg(parent_from_child)
     msg = TransformStamped(header=Header(stamp=header.stamp, frame_id=header.frame_id),
                            child_frame_id=child_frame)
-    translation = msg.transform.translation
-    translation.x, translation.y, translation.z = pose.position.x, pose.position.y, pose.position.z
-    msg.transform.rotation = pose.orientation
+    p, t = pose.position, msg.transform.translation
+    t.x, t.y, t.z, msg.transform.rotation = p.x, p.y, p.z, pose.orientation
     return msg
