@@ -6,94 +6,86 @@ nav2_amcl and map_server 1.3.13, beluga_amcl 2.1.1, slam_toolbox (ROS 2, localiz
 robot_localization (ROS 2, EKF in the map), mola_bridge_ros2 (2025).
 """
 
+import math
 import threading
+import time
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import Empty
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-SCAN_S = 0.1
-# Where odometry places the robot.
+# Odometry places the robot at this x.
 ODOM_X_M = 3.0
-
-
-class Kind(NamedTuple):
-    """What a localizer does on the graph."""
-
-    node: str
-    takes: str = 'initialpose'
-    depth: int = 10  #: of the subscription
-    shows: str = ''  #: topic of its PoseWithCovarianceStamped
-    profile: QoSProfile | int = 10  #: of that topic
-    odometry: str = ''  #: topic of its Odometry
-    child: str = 'odom'  #: frame that it places in the map by tf; '': no transform
-    repeats: bool = True  #: whether it broadcasts before it has a pose
-
-
+# Name of the node, topic and depth of the subscription, topic of the pose with its QoS, topic of
+# odometry, and the frame that it places in the map.
 KINDS = {
-    'amcl': Kind('amcl', shows='amcl_pose', profile=LATCHED, repeats=False),
-    'beluga_amcl': Kind('amcl', shows='pose', repeats=False),
-    'slam_toolbox': Kind('slam_toolbox', depth=1, shows='pose'),
-    'robot_localization': Kind('ekf_filter_node_map', 'set_pose', 1,
-                               odometry='odometry/filtered'),
-    'mola': Kind('mola_bridge_ros2', odometry='lidar_odometry/pose'),
-    'mola without odometry': Kind('mola_bridge_ros2', odometry='lidar_odometry/pose',
-                                  child='base_link')}
+    'amcl': ('amcl', 'initialpose', 10, 'amcl_pose', LATCHED, '', 'odom'),
+    'beluga_amcl': ('amcl', 'initialpose', 10, 'pose', 10, '', 'odom'),
+    'slam_toolbox': ('slam_toolbox', 'initialpose', 1, 'pose', 10, '', 'odom'),
+    'robot_localization': ('ekf_filter_node_map', 'set_pose', 1, '', 10, 'odometry/filtered',
+                           'odom'),
+    'mola': ('mola_bridge_ros2', 'initialpose', 10, '', 10, 'lidar_odometry/pose', 'base_link'),
+    'ros2 topic echo': ('echo', 'initialpose', 10, '', 10, '', '')}
 
 
-class StandIn:
-    """One of these localizers, as a node. Its transforms also go to `tell`.
+class Localizer:
+    """One of these localizers. It adopts a pose with its next scan, `off_m` away; NaN: no scans.
 
-    Without tf2_msgs, `/tf` has another type: only its place on the graph counts.
+    Its transforms go to `tell`. `/tf` has another type, because tf2_msgs may not be installed:
+    only its publisher counts.
     """
 
-    def __init__(self, make_node, kind, tell):
-        self.kind, self._tell = kind, tell
-        self.node = make_node(kind.node, cli_args=[
-            '--ros-args', '-r', f'{kind.takes}:=initialpose'])
-        #: Whether scans arrive, how far it is from the given pose, and all given poses.
-        self.has_scans, self.off_m, self.given = True, 0.0, []
-        self._is_new, self._x_m = False, 0.0
-        self.node.create_subscription(PoseWithCovarianceStamped, kind.takes, self._take,
-                                      kind.depth)
-        self._pose = kind.shows and self.node.create_publisher(
-            PoseWithCovarianceStamped, kind.shows, kind.profile)
-        self._odometry = kind.odometry and self.node.create_publisher(
-            Odometry, kind.odometry, 10)
-        self._tf = self.node.create_publisher(_tf_type(), '/tf', 100)
-        self.node.create_timer(SCAN_S, self._scan)
+    def __init__(self, make_node, name, tell=lambda *_: None):
+        node, takes, depth, shows, profile, odometry, self._child = KINDS[name]
+        self.node = make_node(node, cli_args=['--ros-args', '-r', f'{takes}:=initialpose'])
+        self._tell, self._x_m, self._is_new, self.off_m = tell, 0.0, False, 0.0
+        self.poses, self.updates, self.may_answer = [], [], threading.Event()
+        self.may_answer.set()
+        self.node.create_subscription(PoseWithCovarianceStamped, takes, self._take, depth)
+        self._pose = shows and self.node.create_publisher(
+            PoseWithCovarianceStamped, shows, profile)
+        if odometry:
+            self.node.create_publisher(Odometry, odometry, 10)
+        if self._child:
+            self.node.create_publisher(TransformStamped, '/tf', 100)
+        if node == 'amcl':
+            self.node.create_service(Empty, 'request_nomotion_update', self._update,
+                                     callback_group=ReentrantCallbackGroup())
+        self.node.create_timer(0.1, self._scan)
 
     def _take(self, pose):
-        self.given.append(pose)
+        self.poses.append(pose)
         self._is_new = True
 
+    def _update(self, _, response):
+        self.updates.append(time.monotonic())
+        self.may_answer.wait()
+        return response
+
     def _scan(self):
-        if not self.has_scans:
+        if not math.isfinite(self.off_m):
             return
         if self._is_new:
-            self._x_m = self.given[-1].pose.pose.position.x + self.off_m
-        if self._is_new and self._pose:
-            shown = PoseWithCovarianceStamped(header=self.given[-1].header)
-            shown.pose.pose.position.x = self._x_m
+            self._is_new, self._x_m = False, self.poses[-1].pose.pose.position.x + self.off_m
+            self.show(self._x_m, self.poses[-1].header.stamp)
+        placed = TransformStamped(child_frame_id=self._child)
+        placed.header.frame_id = 'map'
+        placed.transform.translation.x = self._x_m - ODOM_X_M * (self._child == 'odom')
+        self._tell(placed, False)
+
+    def show(self, x_m, stamp):
+        shown = PoseWithCovarianceStamped()
+        shown.header.frame_id, shown.header.stamp, shown.pose.pose.position.x = 'map', stamp, x_m
+        if self._pose:
             self._pose.publish(shown)
-        if self.given or self.kind.repeats:
-            placed = TransformStamped(child_frame_id=self.kind.child)
-            placed.header.frame_id = 'map'
-            placed.transform.translation.x = self._x_m - ODOM_X_M * (self.kind.child == 'odom')
-            self._tell(placed, False)
-        self._is_new = False
 
-
-class Buffer:
-    """Replaces tf2's buffer: odometry places the robot, who has been at rest since the start."""
-
-    def lookup_transform(self, target, source, stamp, timeout):
+    def lookup_transform(self, target, *_):
+        """Replace tf2's buffer: odometry places a robot that has been at rest."""
         placed = TransformStamped()
         placed.transform.translation.x = ODOM_X_M * (target == 'odom')
         return placed
@@ -102,54 +94,34 @@ class Buffer:
 class Nav2:
     """map_server and the costmaps. `order` has what they and the localizer got.
 
-    `broken` names the part that fails: load_map ends with a `result`, or a part does not answer.
+    `broken` names the part that does not answer; the grid that is not published; or a bad result.
     """
 
     def __init__(self, node):
-        types, group = import_module('nav2_msgs.srv'), ReentrantCallbackGroup()
+        types = import_module('nav2_msgs.srv')
         self._node, self.order, self.broken, self.ended = node, [], '', threading.Event()
-        self._grids = node.create_publisher(OccupancyGrid, 'map', LATCHED)
-        self._load_map = node.create_service(types.LoadMap, 'map_server/load_map', self._load)
+        self.grids = node.create_publisher(OccupancyGrid, 'map', LATCHED)
+        self.load_map = node.create_service(types.LoadMap, 'map_server/load_map', self._load)
         for name in ('global', 'local'):
             def clear(_, response, name=name):
                 self._work(name)
                 return response
-            node.create_service(types.ClearEntireCostmap, callback=clear, callback_group=group,
-                                srv_name=f'{name}_costmap/clear_entirely_{name}_costmap')
+            node.create_service(types.ClearEntireCostmap,
+                                f'{name}_costmap/clear_entirely_{name}_costmap', clear)
         node.create_subscription(
             PoseWithCovarianceStamped, 'initialpose',
             lambda pose: self.order.append(f'pose in {pose.header.frame_id}'), 10)
 
     def _work(self, name):
         self.order.append(name)
-        if name in self.broken:
+        if name == self.broken:
             self.ended.wait()
 
     def _load(self, request, response):
         self._work(Path(request.map_url).stem)
         response.result = int(self.broken == 'result')
-        if not response.result:
-            response.map = self.make_grid()
-            if self.broken != 'grid':
-                self._grids.publish(response.map)
+        response.map.header.frame_id = 'map'
+        response.map.info.map_load_time = self._node.get_clock().now().to_msg()
+        if self.broken not in ('result', 'grid'):
+            self.grids.publish(response.map)
         return response
-
-    def make_grid(self):
-        grid = OccupancyGrid(data=[0, 100, -1])
-        grid.info.map_load_time = self._node.get_clock().now().to_msg()
-        grid.header.frame_id = 'map'
-        return grid
-
-    def load_another(self):
-        """Publish another grid, as if another program had called load_map."""
-        self._grids.publish(self.make_grid())
-
-    def kill_map_server(self):
-        self._node.destroy_service(self._load_map)
-
-
-def _tf_type():
-    if not find_spec('tf2_msgs'):
-        return TransformStamped
-    from tf2_msgs.msg import TFMessage
-    return TFMessage

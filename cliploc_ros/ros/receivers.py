@@ -21,7 +21,7 @@ from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
 from rclpy.node import Node, NodeNameNonExistentError
 
-from cliploc_ros.core.geometry.transforms import TAKEN, pose_error, transform_from_pose
+from cliploc_ros.core.geometry.transforms import TAKEN, pose_error
 from cliploc_ros.errors import NoLocalizerError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import matrix_from_msg, pose_with_covariance_msg
@@ -300,5 +300,5 @@ def _planar(msg: PoseWithCovarianceStamped) -> NDArray[np.float64]:
     """Return the part of a pose that AMCL uses, x, y and yaw, as a transform (4, 4)."""
     p, q = msg.pose.pose.position, msg.pose.pose.orientation
     yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-    return transform_from_pose(np.array([p.x, p.y, 0.0]), np.array(
-        [0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0)]))
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s, 0, p.x], [s, c, 0, p.y], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)
