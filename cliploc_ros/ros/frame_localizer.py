@@ -102,6 +102,7 @@ class FrameLocalizer:
         #: The map, or all maps joined, and the coordinate frames of the maps
         self.landmark_map = landmark_map
         self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
+        self.grids: dict[str, str] = {}  #: File of Nav2's grid of each of these frames
         self.observer = observer
         self.instants = Instants(landmark_map, options.matching != 'clip')
         self._options, self.watch = options, Watch(relocalizer)
@@ -352,7 +353,11 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
         else:
             observer = Observer(*load_encoder_for_map(*asked))
             observer.measure()
-    return FrameLocalizer(landmark_map, observer, relocalizer, options, map_hash, keyframes)
+    localizer = FrameLocalizer(landmark_map, observer, relocalizer, options, map_hash, keyframes)
+    localizer.grids = {part.frame_id: str(Path(file).absolute().parent / part.nav2_map)
+                       for (part, *_), file in zip(parts_of(landmark_map), files, strict=False)
+                       if part.nav2_map}
+    return localizer
 
 
 def layer_paths(parameters: RelocalizerParameters) -> list[Path]:

@@ -18,13 +18,13 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.geometry.transforms import move_covariance
-from cliploc_ros.errors import CliplocError, TimeUpError
+from cliploc_ros.errors import CliplocError, HandOffError, NoLocalizerError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict, answer_to
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
-from cliploc_ros.ros.handoff import HandOff, HandOffError, MapToOdom, NoLocalizerError
-from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
+from cliploc_ros.ros.handoff import HandOff
+from cliploc_ros.ros.inputs.coordinate_frames import MapToOdom, NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
@@ -269,7 +269,8 @@ class Requests:
             return answer, True
         try:
             self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
-                                    answer.received_at, self._jumps)
+                                    answer.received_at, self._jumps,
+                                    getattr(self._pipeline.localizer, 'grids', {}))
         except HandOffError as error:
             return answer.withheld(str(error)), not isinstance(error, NoLocalizerError)
         return answer, False
