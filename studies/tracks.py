@@ -148,11 +148,11 @@ def _room(task: Task) -> tuple[Relocalizer, KeyframeLocalizer | None, list[Posed
     queries = []
     for number, raw in enumerate(asked):
         image, camera = raw.color()
-        truth = raw.map_from_camera.copy()
+        truth = np.array(raw.map_from_camera)
         # the poses of 7-Scenes are rotations to four digits only
         truth[:3, :3] = Rotation.from_matrix(truth[:3, :3]).as_matrix()
-        queries.append(PosedQuery(number, Observation(
-            camera, nothing, np.empty((0, 0), np.float32)), truth, image=partial(np.asarray, image)))
+        frame = Observation(camera, nothing, np.empty((0, 0), np.float32))
+        queries.append(PosedQuery(number, frame, truth, image=partial(np.asarray, image)))
     return Relocalizer(empty, RelocalizerOptions(matching='class')), KeyframeLocalizer(layer), \
         queries
 
