@@ -149,10 +149,11 @@ class Doctor(RelocalizerNode):
                              f'{len(keyframes.localizer.layer if keyframes else ())} of {file}')
         has_frame = self._check_inputs(parameters, patience_s, report)
         if parameters.require_localizer:
-            report.judge('localizer', self._handoff.missing() if parameters.base_frame else
+            running = self._handoff.localizer
+            report.judge('localizer', running.missing() if parameters.base_frame else
                          'base_frame is empty: initialpose would carry the pose of the camera: '
                          "set it to AMCL's base_frame_id", 'it subscribes to initialpose, and '
-                         f'publishes {parameters.localizer_pose or "nothing that is checked"}')
+                         f'publishes {running.pose_topic or "no pose except in tf"}')
         if localizer is None or not has_frame:
             return report.add('pose', State.NOT_CHECKED, 'it needs a map and a frame')
         answer = self._requests.answer()

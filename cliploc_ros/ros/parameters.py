@@ -19,6 +19,8 @@ from cliploc_ros.models.protocols import PROFILE_NAMES
 from cliploc_ros.ros.conversions import DETECTION_TYPES
 from cliploc_ros.ros.node.parameters import Parameters, parameter
 
+#: Value of localizer_pose that looks for the localizer
+AUTO = 'auto'
 _FILE, _PACKAGE = 'file://', 'package://'
 # Share of timeout_s that algorithms other than auto may search.
 _SEARCH_SHARE = 0.5
@@ -217,9 +219,10 @@ class RelocalizerParameters(CommonParameters):
     require_localizer: bool = parameter(True,
         'A request succeeds only if a localizer such as AMCL takes its pose; false: no localizer '
         'is needed.')
-    localizer_pose: str = parameter('amcl_pose',
-        "Topic of the localizer's pose, which must agree with initialpose; empty: any subscriber "
-        'of initialpose suffices.', read_only=True)
+    localizer_pose: str = parameter(AUTO,
+        "Topic of the localizer's pose, which must agree with initialpose; 'auto': the pose of "
+        'the node that subscribes to initialpose, by its topic or tf; empty: any subscriber of '
+        'initialpose suffices.', read_only=True)
     publish_tf: bool = parameter(False,
         'Broadcast map -> odom_frame (REP 105) after an accepted pose. It pauses while another '
         'node broadcasts it.', read_only=True)

@@ -26,8 +26,9 @@ from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.running_localizer import difference
 
-PARAMETERS = RelocalizerParameters(base_frame='base_link')
+PARAMETERS = RelocalizerParameters(base_frame='base_link', localizer_pose='')
 
 # Times of odometry since the image [s].
 ONE_HZ, TEN_HZ = (0.0, 1.0, 2.0), tuple(tick / 10 for tick in range(10))
@@ -71,11 +72,16 @@ class Robot:
         self.odometry = OdometrySource(self.node)
         self.handoff = handoff.HandOff(self.node, self.odometry, CoordinateFrames(self.node))
         self.jumps = TimeJumps(self.node, self.odometry.forget)
+        self.parameters = PARAMETERS
+
+    def open(self, localizer_pose):
+        self.parameters = replace(PARAMETERS, localizer_pose=localizer_pose)
+        self.handoff.open(self.parameters)
 
     def hand_over(self, timeout_s=10.0, **changes):
         """Hand a pose over; return the elapsed time [s]."""
         start = time.monotonic()
-        self.handoff.hand_over(make_pose(), replace(PARAMETERS, **changes), start + timeout_s,
+        self.handoff.hand_over(make_pose(), replace(self.parameters, **changes), start + timeout_s,
                                start, self.jumps)
         return time.monotonic() - start
 
@@ -86,7 +92,7 @@ class Robot:
 
     def meet(self):
         """Wait until the relocalizer has discovered the localizer."""
-        self.wait(lambda: self.handoff._publisher.get_subscription_count(), 'the subscriber')
+        self.wait(self.handoff.localizer._publisher.get_subscription_count, 'the subscriber')
 
 
 def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
@@ -110,7 +116,7 @@ def stand(robot, wheels, places, twist_m_s=0.0, rad_per_m=0.0, body=''):
 @pytest.fixture
 def robot(context, make_node, wait):
     robot = Robot(make_node, wait)
-    executor = MultiThreadedExecutor(4, context=context)
+    executor = robot.executor = MultiThreadedExecutor(4, context=context)
     for node in (robot.node, robot.localizer.node):
         executor.add_node(node)
 
@@ -138,7 +144,7 @@ def wheels(robot, make_node):
 
 def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
     """Who hears the pose but shows none, such as ros2 topic echo, is no localizer."""
-    robot.handoff.open('amcl_pose')
+    robot.open('amcl_pose')
     with pytest.raises(handoff.NoLocalizerError, match=r'/initialpose.*retry'):
         robot.hand_over(1.5)
     robot.localizer.subscribe()
@@ -149,7 +155,7 @@ def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
     assert 0.5 < time.monotonic() - start < 3.0
     assert not robot.localizer.poses
     robot.handoff.close()
-    robot.handoff.open('')
+    robot.open('')
     robot.hand_over()
     robot.wait(lambda: robot.localizer.poses, 'the pose')
     assert len(robot.localizer.poses) == 1, 'the withheld pose is not delivered late'
@@ -204,8 +210,9 @@ def showing(served):
         if math.isfinite(localizer.off_m):
             shows.publish(pose)
     node.create_subscription(PoseWithCovarianceStamped, 'initialpose', show, 10)
-    served.handoff.open('amcl_pose')
-    served.wait(lambda: not served.handoff.missing() and shows.get_subscription_count(), 'both')
+    served.open('amcl_pose')
+    served.wait(lambda: not served.handoff.localizer.missing()
+                and shows.get_subscription_count(), 'both')
 
     def show_at(x_m, seconds):
         pose = make_pose()
@@ -229,8 +236,8 @@ def test_a_localizer_has_taken_the_pose_once_it_shows_it(showing, off_m, timeout
 
 def test_two_localizers_are_named(showing, make_node):
     make_node('slam').create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
-    showing.wait(showing.handoff.missing, 'the second localizer')
-    with pytest.raises(handoff.NoLocalizerError, match='2 nodes publish /amcl_pose: /amcl, /slam'):
+    showing.wait(showing.handoff.localizer.missing, 'the second localizer')
+    with pytest.raises(handoff.NoLocalizerError, match='/amcl on /amcl_pose, /slam on /amcl_pose'):
         showing.hand_over(1.0)
     assert not showing.localizer.poses
 
@@ -310,9 +317,9 @@ def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
     shown.header.frame_id, shown.pose.pose.position.x = frame, x_m
     shown.pose.pose.orientation.z = math.sin(math.radians(yaw_deg) / 2)
     shown.pose.pose.orientation.w = math.cos(math.radians(yaw_deg) / 2)
-    assert (not handoff.difference(given, shown)) == is_taken_over
+    assert (not difference(given, shown)) == is_taken_over
     shown.pose.pose.orientation.y = 1e200
-    assert handoff.difference(given, shown)
+    assert difference(given, shown)
 
 
 @pytest.mark.parametrize(('now_s', 'published_s'), [(200, 100), (50, 50), (0, 100)])

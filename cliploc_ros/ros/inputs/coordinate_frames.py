@@ -15,7 +15,7 @@ from rclpy.time import Time as RclTime
 
 from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.ros.conversions import stamp_ns
+from cliploc_ros.ros.conversions import matrix_from_msg, stamp_ns
 from cliploc_ros.ros.inputs.stamps import StampOrder
 
 
@@ -34,7 +34,7 @@ class CoordinateFrames:
         self._node = node
         self._buffer: Any = None
         #: Called with each transform that is received, and whether it is static
-        self.on_transform: Callable[[TransformStamped, bool], None] = lambda *_: None
+        self.listeners: list[Callable[[TransformStamped, bool], None]] = []
 
     def open(self, missing: str = 'no transforms', *, remedy: str) -> Any:
         """Subscribe to transforms, so that they are known when the first image arrives.
@@ -103,8 +103,7 @@ class CoordinateFrames:
                                             Duration(seconds=timeout_s)).transform
         except Exception as error:  # tf2 raises a different type for each cause
             raise NoTransformError(f'{missing}: {error}; publish it, or {remedy}') from error
-        t, q = found.translation, found.rotation
-        return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
+        return matrix_from_msg(found)
 
 
 def _make_buffer(node: Node, frames: CoordinateFrames) -> Any:
@@ -130,12 +129,14 @@ def _make_buffer(node: Node, frames: CoordinateFrames) -> Any:
             if self._stamps.goes_back(transform.child_frame_id, stamp_ns(transform.header.stamp)):
                 super().clear()
             super().set_transform(transform, authority)
-            frames.on_transform(transform, False)
+            for listener in frames.listeners:
+                listener(transform, False)
 
         def set_transform_static(self, transform: TransformStamped, authority: str) -> None:
             """Add a static transform."""
             super().set_transform_static(transform, authority)
-            frames.on_transform(transform, True)
+            for listener in frames.listeners:
+                listener(transform, True)
 
         def clear(self) -> None:
             """Forget all transforms except static ones."""
