@@ -258,9 +258,10 @@ def test_a_large_map_takes_confidence_and_a_known_vertical_gives_some():
 OWN = np.diag([0.04, 0.01, 0.02, 0.001, 0.002, 0.003])
 
 
-def answered(truth, error=np.zeros(6), odom=None, **kwargs):
+def answered(truth, error=0.0, odom=None, **kwargs):
     """Return an answer with an error (6,)."""
-    return Answered(truth if odom is None else odom, moved_pose(truth, error), OWN, **kwargs)
+    return Answered(truth if odom is None else odom, moved_pose(truth, np.zeros(6) + error), OWN,
+                    **kwargs)
 
 
 def test_a_robot_at_rest_becomes_as_certain_as_the_shared_errors_and_no_more():
@@ -274,7 +275,8 @@ def test_a_robot_at_rest_becomes_as_certain_as_the_shared_errors_and_no_more():
 
 
 def test_tracks_are_consistent_with_white_shared_and_odometry_errors():
-    rng, root, motion = np.random.default_rng(1), np.sqrt(OWN), scenes.rigid((0.2, 0.1, 0.0), degrees=6.0)
+    rng, root = np.random.default_rng(1), np.sqrt(OWN)
+    motion = scenes.rigid((0.2, 0.1, 0.0), degrees=6.0)
     kept = math.exp(-math.hypot(0.2, 0.1) / 2.0 - math.radians(6.0) / 0.8)
     squares = []
     for _ in range(60):
@@ -306,7 +308,8 @@ def test_a_contradiction_waits_for_the_next_answer():
     assert doubted.contradicting is not None
     np.testing.assert_array_equal(doubted.map_from_camera, track.map_from_camera)
     assert doubted.for_filter[0, 0] > 5.0 * OWN[0, 0], 'an outlier hardly moves a filter'
-    for refused in (Answered(odom, at(3.0), OWN, 0.8, False), Answered(odom, at(), OWN, 0.8, False)):
+    for x in (3.0, 0.0):
+        refused = Answered(odom, at(x), OWN, 0.8, False)
         assert follow(doubted, refused).contradicting is not None
     assert follow(doubted, Answered(odom, at(0.1), OWN)).contradicting is None
     elsewhere = follow(doubted, Answered(odom, at(-3.0), OWN))
