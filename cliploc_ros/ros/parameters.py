@@ -223,8 +223,8 @@ class RelocalizerParameters(CommonParameters):
         "Topic of the localizer's pose, which must agree with initialpose; 'auto': found, or in "
         'tf; empty: any subscriber of initialpose suffices.', read_only=True)
     publish_tf: bool = parameter(False,
-        'Broadcast map -> odom_frame (REP 105) after an accepted pose. It pauses while another '
-        'node broadcasts it.', read_only=True)
+        'Broadcast map -> odom_frame (REP 105) by all poses and odometry. It pauses while another '
+        'node broadcasts it, and while poses contradict each other.', read_only=True)
     odom_frame: str = parameter('odom', 'Coordinate frame of odometry, for publish_tf.')
     watch: str = parameter('none',
         "Check the localizer's pose continuously: map -> base_frame in tf2, or the topic "

@@ -142,16 +142,20 @@ class Pipeline:
         self._node.check_active()
         self._jumps.check(image.stamp, answer.received_at)
         assert header is not None
+        parameters, carried = self._node.settings.snapshot(), localized.carried
+        try:
+            if carried is not None:
+                self._map_to_odom.update(
+                    header, carried @ state.camera_from_base, replace(
+                        parameters, tf_timeout_s=min(parameters.tf_timeout_s, max(
+                            0.0, deadline - time.monotonic()))), answer.received_at)
+            elif pose is not None:
+                self._map_to_odom.pause()
+        except NoTransformError as error:
+            answer = answer.withheld(f'publish_tf: {error}') if pose is not None else answer
         if pose is not None:
             assert found.map_from_camera is not None and localized.for_filter is not None
-            parameters = self._node.settings.snapshot()
-            parameters = replace(parameters, tf_timeout_s=min(
-                parameters.tf_timeout_s, max(0.0, deadline - time.monotonic())))
             map_from_base = found.map_from_camera @ state.camera_from_base
-            try:
-                self._map_to_odom.update(header, map_from_base, parameters, answer.received_at)
-            except NoTransformError as error:
-                answer = answer.withheld(f'publish_tf: {error}')
             self._pose.publish(pose_with_covariance_msg(header, map_from_base, move_covariance(
                 localized.for_filter, map_from_base[:3, 3] - found.map_from_camera[:3, 3])))
             self._robot.prior.keep(pose, parameters, answer.map_hash)

@@ -139,6 +139,13 @@ def test_map_to_odom_pauses_while_another_node_broadcasts_it(make_node):
     frames.listeners[-1](moving(100.0, 0.0, 'map', '/odom'), False)
     map_to_odom._broadcast()
     assert len(sent) == 1
+    map_to_odom._others.clear()
+    with pytest.raises(NoTransformError, match='contradicts the earlier poses'):
+        map_to_odom.pause()
+    map_to_odom._broadcast()
+    assert len(sent) == 1, 'poses contradict each other'
+    frames_of_others = moving(100.0, 0.0, 'map', '/odom')
+    map_to_odom.hear(frames_of_others, False)
     with pytest.raises(NoTransformError, match=r"'map' -> 'odom'.*publish_tf"):
         map_to_odom.update(Header(frame_id='map'), np.eye(4), PARAMETERS, 0.0)
 

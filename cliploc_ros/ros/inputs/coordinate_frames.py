@@ -222,9 +222,20 @@ class MapToOdom:
             self._transform, self._jumped_at = None, time.monotonic()
             self._began_ns = began_ns
 
+    def pause(self) -> None:
+        """Drop the transform until the next update: answers contradict each other.
+
+        NoTransformError: it is not closed.
+        """
+        with self._lock:
+            self._transform = None
+        if self._timer is not None:
+            raise NoTransformError('this pose contradicts the earlier poses and odometry: map -> '
+                                   'odom pauses until another pose agrees with one of them')
+
     def update(self, header: Header, map_from_base: NDArray[np.float64],
                parameters: RelocalizerParameters, received_at: float) -> None:
-        """Update the transform from an accepted pose of the robot (4, 4); ignored while closed.
+        """Update the transform from a pose of the robot (4, 4); ignored while closed.
 
         The header has the stamp of the image and the coordinate frame of the map. `received_at`
         is when the image arrived (monotonic clock) [s].
