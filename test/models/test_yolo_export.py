@@ -303,39 +303,35 @@ def localizing(networks, out):
             '--model', model, *named, '--clip-pretrained', pretrained, '--out', out]
 
 
-def localize_hidden(networks, cache, out, hidden):
-    """Run evaluate in a process without PyTorch, and without the outputs of earlier runs."""
-    return subprocess.run(
-        [sys.executable, '-m', 'cliploc_ros.cli.evaluate', *localizing(networks, out)],
-        env=hidden | {'XDG_CACHE_HOME': str(cache), 'CLIPLOC_RECORDINGS': str(out)},
-        capture_output=True, text=True, timeout=300, check=False)
-
-
 @pytest.fixture
-def hidden(tmp_path):
-    (tmp_path / 'hidden').mkdir()
-    return hide_pytorch(tmp_path / 'hidden')
+def localize_hidden(tmp_path):
+    """Run evaluate in a process without PyTorch, and without the outputs of earlier runs."""
+    return lambda *given: subprocess.run(
+        [sys.executable, '-m', 'cliploc_ros.cli.evaluate', *localizing(*given)],
+        env=hide_pytorch(tmp_path) | {'XDG_CACHE_HOME': str(tmp_path / 'cache'),
+                                      'CLIPLOC_RECORDINGS': str(tmp_path)},
+        capture_output=True, text=True, timeout=300, check=False)
 
 
 @pytest.mark.parametrize(('networks', 'named'), [
     (WEIGHTS, '--no-clip'), ((WEIGHTS[0], *ONNX[1:]), 'yolo.pt')])
-def test_without_pytorch_weights_are_refused_with_what_to_do(networks, named, hidden, tmp_path):
-    done = localize_hidden(networks, tmp_path / 'empty', tmp_path / 'out', hidden)
+def test_without_pytorch_weights_are_refused_with_what_to_do(networks, named, localize_hidden,
+                                                             tmp_path):
+    done = localize_hidden(networks, tmp_path / 'out')
     assert done.returncode == 1 and 'Traceback' not in done.stderr
     assert 'is not installed' in done.stderr and 'export_network' in done.stderr
     assert 'script/setup models' in done.stderr and named in done.stderr
 
 
-def test_weights_are_exported_once_and_then_need_no_pytorch(hidden, tmp_path, run_here,
+def test_weights_are_exported_once_and_then_need_no_pytorch(localize_hidden, tmp_path, run_here,
                                                             monkeypatch):
-    cache, outs = tmp_path / 'cache', [tmp_path / name for name in ('onnx', 'exported', 'again')]
-    monkeypatch.setenv('XDG_CACHE_HOME', str(cache))
-    for done in (*(run_here(evaluate.main, *localizing(networks, out))
-                   for networks, out in zip((ONNX, WEIGHTS), outs, strict=False)),
-                 localize_hidden(WEIGHTS, cache, outs[2], hidden)):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    found, here = [], lambda *given: run_here(evaluate.main, *localizing(*given))
+    for networks, run in ((ONNX, here), (WEIGHTS, here), (WEIGHTS, localize_hidden)):
+        done = run(networks, tmp_path / 'out')
         assert done.returncode == 0, done.stderr
-    found = [[(row['accepted'], row['error_m'])
-              for row in json.loads((out / 'results.json').read_text())] for out in outs]
+        found.append([(row['accepted'], row['error_m'])
+                      for row in json.loads((tmp_path / 'out/results.json').read_text())])
     onnx, exported, again = found
     assert exported == again
     assert [accepted for accepted, _ in onnx] == [accepted for accepted, _ in exported]
