@@ -145,7 +145,7 @@ def run() -> int:
                         help='folder for the output of networks (%(default)s)')
     parser.add_argument('--workers', type=positive_int, default=1, metavar='N')
     options = parser.parse_args()
-    reading = RoomOptions(options.model, options.out)
+    reading = RoomOptions(options.model, options.out, scales={})
     rooms = [read_room(folder, reading) for folder in options.folders]
     names = [room.name for room in rooms if room.has_poses]
     found: list[Outcome] = run_all(partial(make_ask, options.folders, reading, options.elsewhere),
