@@ -81,11 +81,12 @@ def test_keyframes_of_all_floors_are_used_or_none(relocalizer, tester, floors, r
 
 
 @pytest.mark.needs('nav2_msgs')
-def test_nav2_follows_to_the_floor_and_not_during_a_ride(own_relocalizer, tester, floors):
+def test_nav2_follows_to_the_floor_and_not_during_a_ride(relocalizer, tester, floors, room_map):
     for number, (room, file) in enumerate(zip((ROOM, other_room()), floors, strict=True)):
         write_map(replace(room, frame_id=f'floor_{number}', nav2_map=f'grids/{number}.yaml'),
                   Path(file))
-    own_relocalizer(map_file="''", map_files=f'[{", ".join(floors)}]', timeout_s=5.0)
+    assert all(tester.set_parameter(*it).successful for it in {
+        'map_file': '', 'map_files': floors}.items()) and tester.trigger('reload_map').success
     nav2, cabin, expected = Nav2(tester), see_room(ROOM).select(np.array([0, 1])), []
     for number in (0, 1, 0):
         assert not tester.relocalize(make_frame(cabin)).success
@@ -94,6 +95,8 @@ def test_nav2_follows_to_the_floor_and_not_during_a_ride(own_relocalizer, tester
         assert answer.success and f' m in floor_{number}, ' in answer.message, answer.message
         expected += [str(number), 'global', 'local', 'pose in map']
     assert nav2.order == expected
+    assert all(tester.set_parameter(*it).successful for it in {
+        'map_files': [''], 'map_file': str(room_map)}.items())
 
 
 @pytest.fixture

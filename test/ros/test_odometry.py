@@ -19,6 +19,7 @@ from cliploc_ros.ros.conversions import pose_to_msg, pose_with_covariance_msg
 from cliploc_ros.ros.inputs import robot_state
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.receivers import RunningLocalizer
 from cliploc_ros.ros.watch import LaterError, LocalizerPose, NoLocalizerPoseError
 
 OPTICAL = [0.3, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]  # looks along the base's x axis
@@ -151,9 +152,10 @@ def amcl(make_node):
 
 @pytest.fixture
 def localizer(robot, amcl, wait):
-    found = LocalizerPose(robot._node, robot)
-    wait(lambda: robot._node.count_publishers('/amcl_pose'), 'the localizer')
-    return found
+    running = RunningLocalizer(robot._node, robot.transforms)
+    running.open(replace(PARAMETERS, localizer_pose='amcl_pose'))
+    wait(lambda: not running.find(), 'the localizer')
+    return LocalizerPose(robot._node, robot, running)
 
 
 def at(localizer, robot, seconds, frame_ids=('other', 'map')):
