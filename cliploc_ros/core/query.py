@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings, Similarities
 from cliploc_ros.core.observation import Detections, Observation, Region
@@ -52,6 +53,7 @@ class Query:
     #: Number of crops of the last frame in the first search, and the maximum number of crops added
     #: for each further search, 0 when time was up. Empty: as the options and the time allow.
     rooms: tuple[int, ...] = ()
+    grid: OccupancyGrid | None = None  #: The grid of the scan of the newest frame
 
     @property
     def newest(self) -> Observation:
