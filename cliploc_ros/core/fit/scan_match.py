@@ -13,6 +13,7 @@ not count, and those that correlate worst count as worse.
 """
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from operator import itemgetter
 from typing import NamedTuple
@@ -22,8 +23,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import moved_pose
-from cliploc_ros.core.fit.refinement import solve
-from cliploc_ros.core.geometry.grid import GAP_M, UNKNOWN, OccupancyGrid
+from cliploc_ros.core.geometry.grid import GAP_M, UNKNOWN, GridField, OccupancyGrid
 from cliploc_ros.core.geometry.transforms import invert_transform, move_covariance
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.joined_map import place_of
@@ -34,16 +34,12 @@ _TERMS = CALIBRATION.scan
 # Number of beams that are compared, the least number that hits something, and the step between
 # those that correlation uses, and those that are traced: neighbours meet the same walls.
 _BEAMS, _LEAST_BEAMS, _EVERY = 90, 10, 2
-# The window: cells of the coarse field and steps of the yaw each way. Penalty of a step, in
-# likelihood of a beam, against moves that the scan does not observe.
-_CELLS, _TURNS, _TURN, _STEP_COST = 2, 3, math.radians(3.0), 0.002
-# Number of the random poses that are moved by Gauss-Newton, and its number of steps.
-_REFINED, _STEPS = 250, 6
-# Ranks with log odds in calibration.yaml. The logarithm of the rank is interpolated.
-_RANKS = (1, 4, 20, 100, _REFINED)
-# Damping for each beam. The errors are squares of distances, so a step of Gauss-Newton ends
-# halfway to the wall: it is doubled. Information of the pose before it is moved, for each beam.
-_DAMPING, _DOUBLE, _WEAK = 0.3, 2.0, 0.04 * np.diag([1.0, 1.0, 4.0])
+# Windows: cells and steps of the yaw each way, and the step in the coarse and in the fine field
+# [rad]. Penalty of a step, in likelihood of a beam, against moves that the scan does not observe.
+_CELLS, _TURNS, _COARSE, _FINE, _STEP_COST = 2, 3, math.radians(3.0), math.radians(0.7), 0.002
+# Number of the random poses that are moved in the fine field. Ranks with log odds in
+# calibration.yaml; the logarithm of the rank is interpolated.
+_REFINED, _RANKS = 250, (1, 4, 20, 100, 250)
 # Random poses nearer than this to a pose [m] [rad] are at the same place. Scores that differ by
 # less are equal: poses along a corridor are no evidence for or against each other.
 _SAME_M, _SAME, _ALIKE = 0.5, math.radians(12.0), 0.05
@@ -55,6 +51,8 @@ _EXPLAINED, _LEAST_EXPLAINED = math.exp(-2.0), 0.5
 # A score is drawn to this value as if by a share of further beams, because nothing is known of
 # beams that end in unknown cells.
 _USUAL, _USUAL_SHARE = 0.3, 0.15
+# Steps of Gauss-Newton, and damping for each beam.
+_STEPS, _DAMPING = 12, np.diag([0.3, 0.3, 1.2])
 # Information of a scan, in units of the squared errors of a beam: with all beams on one wall, the
 # deviation is 4 cm. It is the mean at a distance from the pose [m], with yaw at a range [m].
 _WEIGHT, _ASIDE = 20.0, np.diag([0.1, 0.1, 0.05])
@@ -81,102 +79,49 @@ class ScanFit(NamedTuple):
 
 
 @compiled
-def correlate(poses, beams, field):
-    """Return each pose (n, 3) and the best one in the window (n, 2, 3), and its score (n,).
+def correlate(poses, beams, gaps, table, side_m, step):
+    """Return the best pose of the window around each pose (n, 3), and its score: (n, 4).
 
-    The beams (b, 3) are their ends in the coordinate frame of the laser [m], and whether they hit
-    something; the field is a GridField.
+    Parameters
+    ----------
+    beams : ndarray (b, 3)
+        Their ends in the coordinate frame of the laser [m], and whether they hit something.
+    gaps, table, side_m : ndarray (h, w), (256,), float
+        A field, see GridField.
+    step : float
+        Step of the yaw [rad].
     """
-    found, scores = np.empty((len(poses), 2, 3)), np.full(len(poses), -np.inf)
-    side, coarse, side_m = 2 * _CELLS + 1, field.coarse, field.coarse_m
-    sums = np.empty((side, side), dtype=np.int32)
+    found, side = np.empty((len(poses), 4)), 2 * _CELLS + 1
+    sums = np.empty((side, side))
     for row in range(len(poses)):
-        found[row] = poses[row]
+        found[row, 3] = -np.inf
         for turn in range(-_TURNS, _TURNS + 1):
-            yaw = poses[row, 2] + turn * _TURN
+            yaw = poses[row, 2] + turn * step
             cos, sin = math.cos(yaw) / side_m, math.sin(yaw) / side_m
             x, y = poses[row, 0] / side_m - _CELLS, poses[row, 1] / side_m - _CELLS
-            sums[:] = 0
+            sums[:] = 0.0
             for beam in range(0, len(beams), _EVERY):
                 column = math.floor(x + cos * beams[beam, 0] - sin * beams[beam, 1])
                 line = math.floor(y + sin * beams[beam, 0] + cos * beams[beam, 1])
-                if (beams[beam, 2] and 0 <= column <= coarse.shape[1] - side
-                        and 0 <= line <= coarse.shape[0] - side):
+                if (beams[beam, 2] and 0 <= column <= gaps.shape[1] - side
+                        and 0 <= line <= gaps.shape[0] - side):
                     for i in range(side):
                         for j in range(side):
-                            sums[i, j] += coarse[line + i, column + j]
+                            sums[i, j] += table[gaps[line + i, column + j]]
             for i in range(side):
                 for j in range(side):
                     steps = (i - _CELLS) ** 2 + (j - _CELLS) ** 2 + turn ** 2
-                    value = sums[i, j] - 255.0 * _STEP_COST * steps * len(beams) / _EVERY
-                    if value > scores[row]:
-                        scores[row], found[row, 1, 2] = value, yaw
-                        found[row, 1, 0] = poses[row, 0] + (j - _CELLS) * side_m
-                        found[row, 1, 1] = poses[row, 1] + (i - _CELLS) * side_m
-    return found, scores
+                    value = sums[i, j] - _STEP_COST * steps * len(beams) / _EVERY
+                    if value > found[row, 3]:
+                        found[row] = (poses[row, 0] + (j - _CELLS) * side_m,
+                                      poses[row, 1] + (i - _CELLS) * side_m, yaw, value)
+    return found
 
 
 @compiled
-def equations(pose, beams, field):
-    """Return the squared errors of the ends of beams, and the normal equations (3, 4).
-
-    The error of an end is 1 minus its likelihood.
-    """
-    cos, sin, cost = math.cos(pose[2]), math.sin(pose[2]), 0.0
-    sums, row, gaps, table = np.zeros((3, 4)), np.empty(4), field.gaps, field.table
-    for beam in range(len(beams)):
-        ahead = cos * beams[beam, 0] - sin * beams[beam, 1]
-        aside = sin * beams[beam, 0] + cos * beams[beam, 1]
-        u, v = (pose[0] + ahead) / field.side_m - 0.5, (pose[1] + aside) / field.side_m - 0.5
-        j, i = math.floor(u), math.floor(v)
-        if not beams[beam, 2]:
-            continue
-        cost += 1.0
-        if not (0 <= i < gaps.shape[0] - 1 and 0 <= j < gaps.shape[1] - 1):
-            continue
-        u, v = u - j, v - i
-        first, second = table[gaps[i, j]], table[gaps[i, j + 1]]
-        third, fourth = table[gaps[i + 1, j]], table[gaps[i + 1, j + 1]]
-        row[0] = ((1.0 - v) * (second - first) + v * (fourth - third)) / field.side_m
-        row[1] = ((1.0 - u) * (third - first) + u * (fourth - second)) / field.side_m
-        row[2] = row[1] * ahead - row[0] * aside
-        row[3] = 1.0 - ((1.0 - v) * ((1.0 - u) * first + u * second)
-                        + v * ((1.0 - u) * third + u * fourth))
-        cost += row[3] * row[3] - 1.0
-        for i in range(3):
-            for j in range(4):
-                sums[i, j] += row[i] * row[j]
-    return cost, sums
-
-
-@compiled
-def climb(start, center, prior, beams, field):
-    """Return the pose (3,) that minimizes the squared errors, and this minimum.
-
-    They include the square of the step from `center` (3,), with information `prior` (3, 3).
-    """
-    pose, best, least, step = start.copy(), start.copy(), np.inf, np.empty(3)
-    for _ in range(_STEPS + 1):
-        cost, sums = equations(pose, beams, field)
-        for i in range(3):
-            for j in range(3):
-                cost += (pose[i] - center[i]) * prior[i, j] * (pose[j] - center[j])
-                sums[i, 3] -= prior[i, j] * (pose[j] - center[j])
-                sums[i, j] += prior[i, j]
-            sums[i, i] += _DAMPING * len(beams) * (1.0 if i < 2 else 4.0)
-        if cost < least and solve(sums[:, :3], sums[:, 3], step):
-            least, best[:] = cost, pose
-            pose += _DOUBLE * step
-        else:  # too far
-            pose[:] = 0.5 * (pose + best)
-    return best, least
-
-
-@compiled
-def score(pose, beams, field):
+def score(pose, beams, gaps, table, side_m):
     """Return the score of a pose (3,), the share of explained beams, and that of known beams."""
     total, hits, explained, known, is_free = 0.0, 0, 0, 0, True
-    gaps, side_m = field.gaps, field.side_m
     for beam in range(len(beams)):
         angle = pose[2] + math.atan2(beams[beam, 1], beams[beam, 0])
         cos, sin = math.cos(angle), math.sin(angle)
@@ -199,7 +144,7 @@ def score(pose, beams, field):
             continue
         known += 1
         if beams[beam, 2]:
-            value = field.table[gaps[i, j]] if is_free else _THROUGH
+            value = table[gaps[i, j]] if is_free else _THROUGH
             hits, explained = hits + 1, explained + (value > _EXPLAINED)
         else:
             value = _FREE if is_free else _MISSED
@@ -208,32 +153,22 @@ def score(pose, beams, field):
     return (total + share * _USUAL) / (known + share), explained / max(1, hits), known / len(beams)
 
 
-@compiled
-def place(starts, beams, field, prior):
-    """Return the best pose of starts (n, s, 3), and its score: (n, 6), see climb and score."""
-    found = np.empty((len(starts), 6))
-    for row in range(len(starts)):
-        least = np.inf
-        for start in starts[row]:
-            pose, cost = climb(start, start, prior, beams, field)
-            if cost < least:
-                least, found[row, :3] = cost, pose
-        found[row, 3:] = score(found[row, :3], beams, field)
-    return found
-
-
-def _placed(poses: NDArray[np.float64], beams: NDArray[np.float64], grid: OccupancyGrid,
-            most: int | None = None) -> NDArray[np.float64]:
-    """Return the best `most` of poses (n, 3), moved to where a scan fits best, see place."""
-    starts, scores = correlate(poses, beams, grid.field)
-    best = np.argsort(-scores, kind='stable')[:most]
-    return np.asarray(place(starts[best], beams, grid.field, len(beams) * _WEAK))
+def _placed(poses: NDArray[np.float64], beams: NDArray[np.float64], field: GridField
+            ) -> NDArray[np.float64]:
+    """Return poses (n, 3) where a scan fits best, with their scores: the best of them (m, 6)."""
+    near = correlate(poses, beams, field.coarse, field.coarse_table, field.coarse_m, _COARSE)
+    best, fine = np.argsort(-near[:, 3], kind='stable')[:_REFINED], field[:3]
+    # a good pose may correlate worse
+    found = [correlate(np.ascontiguousarray(starts), beams, *fine, _FINE)
+             for starts in (poses[best], near[best, :3])]
+    moved = np.where(found[0][:, 3:] > found[1][:, 3:], *found)[:, :3]
+    return np.array([[*pose, *score(pose, beams, *fine)] for pose in moved])
 
 
 @lru_cache(maxsize=2)
 def _random(scan: Scan, grid: OccupancyGrid, is_flipped: bool) -> NDArray[np.float64]:
     """Return the best of the random poses of a grid, see _placed."""
-    return _placed(grid.field.poses, _beams(scan, is_flipped), grid, _REFINED)
+    return _placed(grid.field.poses, _beams(scan, is_flipped), grid.field)
 
 
 def _beams(scan: Scan, is_flipped: bool) -> NDArray[np.float64]:
@@ -267,7 +202,7 @@ class ScanMatcher:
             return None
         start, beams, is_flipped = at
         random, found = _random(self._scan, self._grid, is_flipped), _placed(
-            start[None], beams, self._grid)[0]
+            start[None], beams, self._grid.field)[0]
         offsets = random[:, :3] - found[:3]
         apart = np.abs((offsets[:, 2] + math.pi) % (2.0 * math.pi) - math.pi)
         others = random[(np.hypot(*offsets[:, :2].T) >= _SAME_M) | (apart >= _SAME), 3]
@@ -288,15 +223,17 @@ class ScanMatcher:
         if at is None or fit.odds < 0.0 or fit.explained < _LEAST_EXPLAINED:
             return pose, covariance, fit
         (start, beams, _), field, turn = at, self._grid.field, self._turn
+        hits = beams[beams[:, 2] > 0.0, :2]
         lever = pose[:3, :3] @ self._scan.camera_from_laser[:3, 3]
         of_laser, seen = move_covariance(covariance, lever), np.zeros((6, 6))
         planar = turn.T @ of_laser[_PLANAR] @ turn + np.diag(_LEAST_DEVIATIONS) ** 2
-        weight = _WEIGHT / beams[:, 2].sum()
-        best = min((climb(each, start, np.linalg.inv(planar) / weight, beams, field)
-                    for each in (start, start + turn.T @ fit.step)), key=itemgetter(1))[0]
-        seen[_PLANAR] = weight * turn @ sum(
-            equations(best + aside, beams, field)[1][:, :3] for aside in (*_ASIDE, *-_ASIDE)
-        ) @ turn.T
+        weight = _WEIGHT / len(hits)
+        best = min((found for each in (start, start + turn.T @ fit.step)
+                    for found in _climb(each, start, np.linalg.inv(planar) / weight, hits, field)),
+                   key=itemgetter(0))[1]
+        rows = np.concatenate([_errors(best + aside, hits, field)[:, :3]
+                               for aside in (*_ASIDE, *-_ASIDE)])
+        seen[_PLANAR] = weight * turn @ rows.T @ rows @ turn.T
         smaller = np.linalg.inv(np.linalg.inv(of_laser) + seen)
         x, y, yaw = (turn @ (best - start)).tolist()
         shifted = moved_pose(pose, np.array([x, y, 0.0, 0.0, 0.0, yaw]))  # about the camera
@@ -322,3 +259,37 @@ class ScanMatcher:
         spot = laser[:2, 3] + grid.field.margin_m
         return np.array([*spot, math.atan2(laser[1, 0], laser[0, 0])]), beams, is_flipped
 
+
+
+def _errors(pose: NDArray[np.float64], points: NDArray[np.float64], field: GridField
+            ) -> NDArray[np.float64]:
+    """Return 1 minus the likelihoods of the ends of beams (n, 2) at a pose (3,).
+
+    Returns rows (n, 4): the derivatives of the likelihood with the pose, and the error.
+    """
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    arms = points @ [[cos, sin], [-sin, cos]]
+    cells = (pose[:2] + arms) / field.side_m - 0.5
+    corner = np.clip(np.floor(cells).astype(int), 0, np.array(field.gaps.shape)[::-1] - 2)
+    (u, v), (j, i) = (cells - corner).T, corner.T
+    corners = field.table[field.gaps[np.array([i, i, i + 1, i + 1]), [j, j + 1, j, j + 1]]]
+    first, second, third, fourth = corners
+    dx = ((1.0 - v) * (second - first) + v * (fourth - third)) / field.side_m
+    dy = ((1.0 - u) * (third - first) + u * (fourth - second)) / field.side_m
+    likely = (1.0 - v) * ((1.0 - u) * first + u * second) + v * ((1.0 - u) * third + u * fourth)
+    return np.column_stack([dx, dy, dy * arms[:, 0] - dx * arms[:, 1], 1.0 - likely])
+
+
+def _climb(pose: NDArray[np.float64], center: NDArray[np.float64], prior: NDArray[np.float64],
+           points: NDArray[np.float64], field: GridField
+           ) -> Iterator[tuple[float, NDArray[np.float64]]]:
+    """Yield the squared errors of each step of Gauss-Newton, and its pose (3,).
+
+    The squared errors include that of the step from `center` (3,), with information `prior`.
+    """
+    for _ in range(_STEPS):
+        rows, away = _errors(pose, points, field), pose - center
+        yield float(rows[:, 3] @ rows[:, 3] + away @ prior @ away), pose
+        pose = pose + np.linalg.solve(
+            rows[:, :3].T @ rows[:, :3] + prior + len(rows) * _DAMPING,
+            rows[:, :3].T @ rows[:, 3] - prior @ away)

@@ -35,11 +35,12 @@ class GridField(NamedTuple):
     #: (h, w): distance of each cell from the nearest occupied cell [GAP_M]; UNKNOWN in unknown
     #: cells that are farther than three deviations from an occupied cell
     gaps: NDArray[np.uint8]
-    side_m: float  #: Side of a cell [m]
     table: NDArray[np.float64]  #: (256,): likelihood that a beam ends at each value of gaps
-    #: (H, W): likelihood that a beam ends in each cell of a coarse field, from 0 to 255
+    side_m: float  #: Side of a cell [m]
+    #: The same with larger cells, their least distance, and a likelihood with a larger deviation
     coarse: NDArray[np.uint8]
-    coarse_m: float  #: Side of its cells [m]
+    coarse_table: NDArray[np.float64]
+    coarse_m: float
     margin_m: float  #: The field begins with such a margin of unknown cells [m]
     poses: NDArray[np.float64]  #: (n, 3): x, y [m] and yaw [rad] of random poses in free space
 
@@ -64,11 +65,10 @@ class OccupancyGrid:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if self.cells.ndim != 2 or not self.cells.size or not 0.0 < self.resolution_m < np.inf:
-            raise OptionsError(f'grid: {self.cells.shape} cells of {self.resolution_m} m; expected'
-                               ' rows and columns of cells, and a resolution above 0')
-        if not is_rigid(self.frame_from_grid) or self.frame_from_grid[2, 2] < 0.999:
-            raise OptionsError('grid: its origin must be a finite pose with a vertical z axis')
+        if self.cells.ndim != 2 or not self.cells.size or not 0.0 < self.resolution_m < np.inf or (
+                not is_rigid(self.frame_from_grid) or self.frame_from_grid[2, 2] < 0.999):
+            raise OptionsError('grid: it needs cells, a resolution above 0, and an origin that is '
+                               'a finite pose with a vertical z axis')
 
     @cached_property
     def field(self) -> GridField:
@@ -88,8 +88,8 @@ class OccupancyGrid:
             spots = rng.choice(spots, _POSES)
         poses = side_m * np.column_stack([spots[:, ::-1] + rng.random(spots.shape),
                                           rng.uniform(-np.pi, np.pi, len(spots)) / side_m])
-        return GridField(gaps, side_m, _likelihoods(DEVIATION_M), (255.0 * _likelihoods(
-            COARSE_DEVIATION_M)).astype(np.uint8)[nearest], factor * side_m, margin * side_m, poses)
+        return GridField(gaps, _likelihoods(DEVIATION_M), side_m, np.ascontiguousarray(nearest),
+                         _likelihoods(COARSE_DEVIATION_M), factor * side_m, margin * side_m, poses)
 
 
 def _likelihoods(deviation_m: float) -> NDArray[np.float64]:
