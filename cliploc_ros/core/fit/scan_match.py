@@ -13,17 +13,18 @@ not count, and those that correlate worst count as worse.
 """
 
 import math
-from collections.abc import Iterator
 from functools import lru_cache
-from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.optimize import least_squares
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import moved_pose
-from cliploc_ros.core.geometry.grid import GAP_M, UNKNOWN, GridField, OccupancyGrid
+from cliploc_ros.core.geometry import grid as grids
+from cliploc_ros.core.geometry.grid import GridField, OccupancyGrid
 from cliploc_ros.core.geometry.transforms import invert_transform, move_covariance
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.joined_map import place_of
@@ -44,18 +45,17 @@ _REFINED, _RANKS = 250, (1, 4, 20, 100, 250)
 # less are equal: poses along a corridor are no evidence for or against each other.
 _SAME_M, _SAME, _ALIKE = 0.5, math.radians(12.0), 0.05
 # A beam passes through a wall if it ends farther behind it than this [m]. Score of a beam that
-# does, of one without an echo that does, and of one without an echo that meets no wall.
-_BEHIND_M, _THROUGH, _MISSED, _FREE = 0.3, -0.5, -0.25, 0.5
+# does, and of one without an echo that does not.
+_BEHIND_M, _THROUGH, _FREE = 0.3, -0.4, 0.5
 # A beam is explained within two deviations. A scan with fewer explained beams moves no pose.
 _EXPLAINED, _LEAST_EXPLAINED = math.exp(-2.0), 0.5
 # A score is drawn to this value as if by a share of further beams, because nothing is known of
 # beams that end in unknown cells.
 _USUAL, _USUAL_SHARE = 0.3, 0.15
-# Steps of Gauss-Newton, and damping for each beam.
-_STEPS, _DAMPING = 12, np.diag([0.3, 0.3, 1.2])
-# Information of a scan, in units of the squared errors of a beam: with all beams on one wall, the
-# deviation is 4 cm. It is the mean at a distance from the pose [m], with yaw at a range [m].
-_WEIGHT, _ASIDE = 20.0, np.diag([0.1, 0.1, 0.05])
+# Weight of 1 minus the mean likelihood of the beams: with all beams on one wall, the deviation
+# is 4 cm.
+_WEIGHT = 2.0 * (grids.DEVIATION_M / 0.04) ** 2
+_GAP_M, _UNKNOWN, _LIKELIHOODS = grids.GAP_M, grids.UNKNOWN, grids.LIKELIHOODS
 # Least deviations of a pose before it is moved [m] [rad], and the rows of x, y and yaw.
 _LEAST_DEVIATIONS, _PLANAR = (0.05, 0.05, math.radians(1.0)), np.ix_([0, 1, 5], [0, 1, 5])
 
@@ -64,7 +64,7 @@ class ScanFit(NamedTuple):
     """How well a scan fits the grid at a pose."""
 
     odds: float  #: Log odds that the pose is right, by its rank
-    explained: float  #: Share of the beams that end at walls, among those that should
+    explained: float  #: Share of the known beams that end at walls, or rightly have no echo
     rank: int  #: Rank of the pose, from 1, behind all random poses that fit as well
     better: int  #: The same behind those that fit clearly better
     of: int  #: Number of random poses
@@ -79,14 +79,14 @@ class ScanFit(NamedTuple):
 
 
 @compiled
-def correlate(poses, beams, gaps, table, side_m, step):
+def correlate(poses, beams, gaps, side_m, step):
     """Return the best pose of the window around each pose (n, 3), and its score: (n, 4).
 
     Parameters
     ----------
     beams : ndarray (b, 3)
         Their ends in the coordinate frame of the laser [m], and whether they hit something.
-    gaps, table, side_m : ndarray (h, w), (256,), float
+    gaps, side_m : ndarray (h, w), float
         A field, see GridField.
     step : float
         Step of the yaw [rad].
@@ -107,11 +107,11 @@ def correlate(poses, beams, gaps, table, side_m, step):
                         and 0 <= line <= gaps.shape[0] - side):
                     for i in range(side):
                         for j in range(side):
-                            sums[i, j] += table[gaps[line + i, column + j]]
+                            sums[i, j] += _LIKELIHOODS[gaps[line + i, column + j]]
             for i in range(side):
                 for j in range(side):
-                    steps = (i - _CELLS) ** 2 + (j - _CELLS) ** 2 + turn ** 2
-                    value = sums[i, j] - _STEP_COST * steps * len(beams) / _EVERY
+                    value = sums[i, j] - _STEP_COST * len(beams) / _EVERY * (
+                        (i - _CELLS) ** 2 + (j - _CELLS) ** 2 + turn ** 2)
                     if value > found[row, 3]:
                         found[row] = (poses[row, 0] + (j - _CELLS) * side_m,
                                       poses[row, 1] + (i - _CELLS) * side_m, yaw, value)
@@ -119,9 +119,9 @@ def correlate(poses, beams, gaps, table, side_m, step):
 
 
 @compiled
-def score(pose, beams, gaps, table, side_m):
+def score(pose, beams, gaps, side_m):
     """Return the score of a pose (3,), the share of explained beams, and that of known beams."""
-    total, hits, explained, known, is_free = 0.0, 0, 0, 0, True
+    total, explained, known, is_free = 0.0, 0, 0, True
     for beam in range(len(beams)):
         angle = pose[2] + math.atan2(beams[beam, 1], beams[beam, 0])
         cos, sin = math.cos(angle), math.sin(angle)
@@ -135,29 +135,26 @@ def score(pose, beams, gaps, table, side_m):
                     break
                 is_free = gaps[i, j] > 0
                 # unknown cells are at least three deviations from an occupied cell
-                gap = _BEHIND_M if gaps[i, j] == UNKNOWN else GAP_M * gaps[i, j]
+                gap = _BEHIND_M if gaps[i, j] == _UNKNOWN else _GAP_M * gaps[i, j]
                 gone += max(side_m, gap - side_m)
         j = math.floor((pose[0] + way_m * cos) / side_m)
         i = math.floor((pose[1] + way_m * sin) / side_m)
         is_inside = 0 <= i < gaps.shape[0] and 0 <= j < gaps.shape[1]
-        if is_free and not (is_inside and gaps[i, j] != UNKNOWN):
+        if is_free and not (is_inside and gaps[i, j] != _UNKNOWN):
             continue
         known += 1
-        if beams[beam, 2]:
-            value = table[gaps[i, j]] if is_free else _THROUGH
-            hits, explained = hits + 1, explained + (value > _EXPLAINED)
-        else:
-            value = _FREE if is_free else _MISSED
-        total += value
-    share = _USUAL_SHARE * len(beams)
-    return (total + share * _USUAL) / (known + share), explained / max(1, hits), known / len(beams)
+        reached = _LIKELIHOODS[gaps[i, j]] if beams[beam, 2] else _FREE
+        value = reached if is_free else _THROUGH
+        total, explained = total + value, explained + (value > _EXPLAINED)
+    more, count = _USUAL_SHARE * len(beams), len(beams)
+    return (total + more * _USUAL) / (known + more), explained / max(1, known), known / count
 
 
 def _placed(poses: NDArray[np.float64], beams: NDArray[np.float64], field: GridField
             ) -> NDArray[np.float64]:
     """Return poses (n, 3) where a scan fits best, with their scores: the best of them (m, 6)."""
-    near = correlate(poses, beams, field.coarse, field.coarse_table, field.coarse_m, _COARSE)
-    best, fine = np.argsort(-near[:, 3], kind='stable')[:_REFINED], field[:3]
+    near = correlate(poses, beams, field.coarse, field.coarse_m, _COARSE)
+    best, fine = np.argsort(-near[:, 3], kind='stable')[:_REFINED], field[:2]
     # a good pose may correlate worse
     found = [correlate(np.ascontiguousarray(starts), beams, *fine, _FINE)
              for starts in (poses[best], near[best, :3])]
@@ -206,7 +203,8 @@ class ScanMatcher:
         offsets = random[:, :3] - found[:3]
         apart = np.abs((offsets[:, 2] + math.pi) % (2.0 * math.pi) - math.pi)
         others = random[(np.hypot(*offsets[:, :2].T) >= _SAME_M) | (apart >= _SAME), 3]
-        better, rank = (1 + int((others > found[3] + margin).sum()) for margin in (_ALIKE, -_ALIKE))
+        better, rank = (1 + int((others > found[3] + margin).sum())
+                        for margin in (_ALIKE, -_ALIKE))
         against, by_rank = np.interp(np.log([better, rank]), np.log(_RANKS), [*_TERMS.values()])
         odds = found[5] * (max(0.0, by_rank) + min(0.0, against))
         return ScanFit(float(odds), float(found[4]), rank, better, len(self._grid.field.poses),
@@ -227,15 +225,20 @@ class ScanMatcher:
         lever = pose[:3, :3] @ self._scan.camera_from_laser[:3, 3]
         of_laser, seen = move_covariance(covariance, lever), np.zeros((6, 6))
         planar = turn.T @ of_laser[_PLANAR] @ turn + np.diag(_LEAST_DEVIATIONS) ** 2
-        weight = _WEIGHT / len(hits)
-        best = min((found for each in (start, start + turn.T @ fit.step)
-                    for found in _climb(each, start, np.linalg.inv(planar) / weight, hits, field)),
-                   key=itemgetter(0))[1]
-        rows = np.concatenate([_errors(best + aside, hits, field)[:, :3]
-                               for aside in (*_ASIDE, *-_ASIDE)])
-        seen[_PLANAR] = weight * turn @ rows.T @ rows @ turn.T
+        root, weight = np.linalg.cholesky(np.linalg.inv(planar)).T, _WEIGHT / len(hits)
+
+        def errors(its: NDArray[np.float64]) -> NDArray[np.float64]:
+            cos, sin = math.cos(its[2]), math.sin(its[2])
+            ends = its[:2] + hits @ [[cos, sin], [-sin, cos]]
+            gaps = map_coordinates(field.gaps, ends.T[::-1] / field.side_m - 0.5, float, 1,
+                                   'nearest') * (grids.GAP_M / grids.DEVIATION_M)
+            return np.append(np.sqrt(weight * (1.0 - np.exp(-0.5 * gaps ** 2))),
+                             root @ (its - start))
+        best = least_squares(errors, start + turn.T @ fit.step, diff_step=1e-4, max_nfev=12)
+        rows = turn @ best.jac[:len(hits)].T
+        seen[_PLANAR] = rows @ rows.T
         smaller = np.linalg.inv(np.linalg.inv(of_laser) + seen)
-        x, y, yaw = (turn @ (best - start)).tolist()
+        x, y, yaw = (turn @ (best.x - start)).tolist()
         shifted = moved_pose(pose, np.array([x, y, 0.0, 0.0, 0.0, yaw]))  # about the camera
         shifted[:2, 3] += (lever - shifted[:3, :3] @ self._scan.camera_from_laser[:3, 3])[:2]
         return shifted, move_covariance((smaller + smaller.T) / 2, -lever), fit._replace(
@@ -260,36 +263,3 @@ class ScanMatcher:
         return np.array([*spot, math.atan2(laser[1, 0], laser[0, 0])]), beams, is_flipped
 
 
-
-def _errors(pose: NDArray[np.float64], points: NDArray[np.float64], field: GridField
-            ) -> NDArray[np.float64]:
-    """Return 1 minus the likelihoods of the ends of beams (n, 2) at a pose (3,).
-
-    Returns rows (n, 4): the derivatives of the likelihood with the pose, and the error.
-    """
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    arms = points @ [[cos, sin], [-sin, cos]]
-    cells = (pose[:2] + arms) / field.side_m - 0.5
-    corner = np.clip(np.floor(cells).astype(int), 0, np.array(field.gaps.shape)[::-1] - 2)
-    (u, v), (j, i) = (cells - corner).T, corner.T
-    corners = field.table[field.gaps[np.array([i, i, i + 1, i + 1]), [j, j + 1, j, j + 1]]]
-    first, second, third, fourth = corners
-    dx = ((1.0 - v) * (second - first) + v * (fourth - third)) / field.side_m
-    dy = ((1.0 - u) * (third - first) + u * (fourth - second)) / field.side_m
-    likely = (1.0 - v) * ((1.0 - u) * first + u * second) + v * ((1.0 - u) * third + u * fourth)
-    return np.column_stack([dx, dy, dy * arms[:, 0] - dx * arms[:, 1], 1.0 - likely])
-
-
-def _climb(pose: NDArray[np.float64], center: NDArray[np.float64], prior: NDArray[np.float64],
-           points: NDArray[np.float64], field: GridField
-           ) -> Iterator[tuple[float, NDArray[np.float64]]]:
-    """Yield the squared errors of each step of Gauss-Newton, and its pose (3,).
-
-    The squared errors include that of the step from `center` (3,), with information `prior`.
-    """
-    for _ in range(_STEPS):
-        rows, away = _errors(pose, points, field), pose - center
-        yield float(rows[:, 3] @ rows[:, 3] + away @ prior @ away), pose
-        pose = pose + np.linalg.solve(
-            rows[:, :3].T @ rows[:, :3] + prior + len(rows) * _DAMPING,
-            rows[:, :3].T @ rows[:, 3] - prior @ away)
