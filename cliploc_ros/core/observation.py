@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.map.similarities import Similarities
 from cliploc_ros.errors import OptionsError
 
@@ -98,6 +99,29 @@ def tilt_deg(map_from_camera: NDArray[np.float64], up_in_camera: NDArray[np.floa
         np.clip(map_from_camera[2, :3] @ up_in_camera, -1.0, 1.0)))
 
 
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A scan of a laser, moved by odometry to the instant of the image.
+
+    Raises
+    ------
+    OptionsError
+        The numbers of angles and ranges differ, or the limit or the pose is invalid.
+    """
+
+    angles: NDArray[np.float64]  #: (n,): direction of each beam about z of the laser [rad]
+    #: (n,): range of each beam [m]; infinite if nothing is within `most_m`, NaN if it is invalid
+    ranges: NDArray[np.float64]
+    most_m: float  #: Greatest range that the laser measures [m]
+    camera_from_laser: NDArray[np.float64]  #: (4, 4): the laser when the image was taken
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.angles.shape != self.ranges.shape or not 0.0 < self.most_m < np.inf or (
+                not is_rigid(self.camera_from_laser)):
+            raise OptionsError('scan: angles, ranges, greatest range or pose are invalid')
+
+
 @dataclass(frozen=True)
 class Observation:
     """The detections of a frame, with its camera, time and other input."""
@@ -126,6 +150,7 @@ class Observation:
     #: (3,): the z axis of base_frame, a unit vector in the camera's optical coordinate frame; None
     #: without a base_frame
     base_up_in_camera: NDArray[np.float64] | None = None
+    scan: Scan | None = None  #: The scan of the robot's laser; None if unknown
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

@@ -6,11 +6,13 @@ A case is a recorded request: its queries, oldest first, and a report of its ans
 with the same map and options that answers these queries in order reproduces the answer bit by bit.
 """
 
+import base64
 import json
 import math
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,9 +23,10 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings, Similarities
-from cliploc_ros.core.observation import Detections, Observation, Region
+from cliploc_ros.core.observation import Detections, Observation, Region, Scan
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.files.arrays import Arrays, Field, Offsets, Schema
@@ -52,6 +55,7 @@ class Query:
     #: Number of crops of the last frame in the first search, and the maximum number of crops added
     #: for each further search, 0 when time was up. Empty: as the options and the time allow.
     rooms: tuple[int, ...] = ()
+    grid: OccupancyGrid | None = None  #: The grid of the scan of the newest frame
 
     @property
     def newest(self) -> Observation:
@@ -81,8 +85,8 @@ class Case:
             raise DatasetError(f'the options of this case are invalid: {error}') from error
 
 
-# Limit of the coordinates, pixels and times of a case.
-_MOST = 1e9
+# Limit of the coordinates, pixels and times of a case, and of the cells of a grid.
+_MOST, _MOST_CELLS = 1e9, 2**26
 
 CASE = Schema('case', {
     'about': Field('uint8', ('t',)),  # JSON: report and queries, without images and crops
@@ -108,6 +112,7 @@ def case_arrays(case: Case) -> Arrays:
            ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},
         'cameras': None if query.cameras is None else query.cameras.fields(),
         'has_images': bool(query.images),
+        'grid': None if query.grid is None else _packed(query.grid),
         'frames': [asdict(replace(frame, similarities=None)) | {'crops': (
             '' if frame.similarities is None else 'embeddings' if isinstance(
                 frame.similarities, CropSimilarities) else 'similarities')}
@@ -120,6 +125,23 @@ def case_arrays(case: Case) -> Arrays:
         'images': np.concatenate([np.empty(0, np.uint8), *images]),
         'crop_offsets': np.cumsum([0, *map(len, crops)]),
         'crops': np.concatenate(crops) if crops else np.empty((0, 0), np.float32)}
+
+
+def _packed(grid: OccupancyGrid) -> str:
+    """Return a grid as JSON, with its cells as a PNG."""
+    png = cv2.imencode('.png', grid.cells.view(np.uint8))[1]
+    return json.dumps([base64.b64encode(png).decode(), grid.resolution_m,
+                       grid.frame_from_grid.tolist(), grid.frame_id])
+
+
+@lru_cache(maxsize=1)
+def _unpacked(text: str) -> OccupancyGrid:
+    """Return the grid of _packed: one for all queries of a case; any error: it is damaged."""
+    packed, resolution_m, pose, frame_id = parse_json(text)
+    png = base64.b64decode(packed)
+    _expect(math.prod(struct.unpack('>II', png[16:24])) <= _MOST_CELLS, 'grid')
+    cells = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE).view(np.int8)
+    return OccupancyGrid(cells, float(resolution_m), _numbers(pose, 4, 4), frame_id)
 
 
 def read_case(path: Path) -> Case:
@@ -157,7 +179,8 @@ def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
     return Query(frames, decoded, None if run is None else _count(run),
                  1 + _count(about['limit'] - 1), float(_numbers(about['length_s'])),
                  bool(about['by_keyframes']), bool(about.get('is_thorough')),
-                 None if cameras is None else CameraCheck.of_fields(cameras), rooms)
+                 None if cameras is None else CameraCheck.of_fields(cameras), rooms,
+                 _unpacked(about['grid']) if about.get('grid') else None)
 
 
 def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) -> Observation:
@@ -194,10 +217,13 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
         known[name], *shape, nan=name == 'depths') for name, shape in (
             ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,)),
             ('base_up_in_camera', (3,))))
+    scan = known.get('scan') and Scan(**{
+        name: np.array(value, np.float64) if isinstance(value, list) else float(value)
+        for name, value in known['scan'].items()})
     return Observation(
         Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
         similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,
-        float(_numbers(known['odom_way_m'])), compared, depths, region, base_up)
+        float(_numbers(known['odom_way_m'])), compared, depths, region, base_up, scan)
 
 
 def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:

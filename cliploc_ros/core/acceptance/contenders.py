@@ -15,7 +15,9 @@ from cliploc_ros.core.acceptance import confidence
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Finalist, Match, instants_of, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.scan_match import ScanFit, ScanMatcher
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig
+from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -39,6 +41,7 @@ class Contender(NamedTuple):
     odds: float
     #: Log odds, at most 0, of the pose given the prior region; they are never sharpened
     prior: float = 0.0
+    scan: ScanFit | None = None  #: How well the scan fits the grid there; None if it says nothing
     #: The place that keyframes recognize, if they propose the pose
     recognized: RecognizedPlace | None = None
     #: Log odds of a pose that keyframes propose, without the evidence of objects for it
@@ -53,7 +56,12 @@ class Contender(NamedTuple):
     @property
     def rank(self) -> float:
         """Return the log odds by which the contenders are ranked."""
-        return self.odds + self.prior
+        return self.odds + self.prior + self.by_scan
+
+    @property
+    def by_scan(self) -> float:
+        """Return the log odds of the scan; 0 without it."""
+        return 0.0 if self.scan is None else self.scan.odds
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,8 @@ class JoinedFrames:
     frames: Sequence[SearchedFrame]
     rig: Rig  #: The rig of these frames
     cameras: NDArray[np.float64]  #: (F, 4, 4): camera_from_last of each frame
+    #: The scan at the last frame and its grid; None without them
+    scan: ScanMatcher | None = None
 
     @cached_property
     def compared(self) -> list[confidence.ComparedFrame]:
@@ -92,10 +102,10 @@ class JoinedFrames:
 
     def without_depth(self) -> 'JoinedFrames':
         """Return the joined frames without their depths."""
-        return join_frames(self.landmark_map, self.options, [frame._replace(
+        return replace(join_frames(self.landmark_map, self.options, [frame._replace(
             observation=replace(frame.observation, depths=None),
             scene=frame.scene._replace(depths=np.zeros_like(frame.scene.depths)))
-            for frame in self.frames])
+            for frame in self.frames]), scan=self.scan)
 
     def contenders(self, finalists: Sequence[Finalist], upright: Sequence[bool]
                    ) -> list[Contender]:
@@ -109,9 +119,10 @@ class JoinedFrames:
         region = self.frames[-1].observation.region
         priors = np.zeros(len(poses)) if region is None else confidence.region_odds(
             self.landmark_map, region, poses)
+        scans = [self.scan and self.scan.fits(pose) for pose in poses]
         return list(map(Contender, finalists, poses, matches, supports, upright,
                         handicaps.tolist(), (confidence.utilities(supports) - handicaps).tolist(),
-                        priors.tolist()))
+                        priors.tolist(), scans))
 
     def supports(self, poses: NDArray[np.float64],
                  matches: Sequence[list[tuple[Match, ...]]]) -> list[confidence.Support]:
@@ -128,8 +139,9 @@ class JoinedFrames:
 
 
 def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
-                frames: Sequence[SearchedFrame]) -> JoinedFrames:
-    """Join searched frames, the last of which is to be localized.
+                frames: Sequence[SearchedFrame], grid: OccupancyGrid | None = None
+                ) -> JoinedFrames:
+    """Join searched frames, the last of which is to be localized, and the grid of its scan.
 
     Raises
     ------
@@ -139,7 +151,9 @@ def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
     cameras = cameras_from_last([frame.observation for frame in frames])
     rig = make_rig([frame.scene for frame in frames], cameras,
                    np.stack([frame.vertical for frame in frames]), landmark_map.position_sigmas)
-    return JoinedFrames(landmark_map, options, frames, rig, cameras)
+    scan = frames[-1].observation.scan
+    return JoinedFrames(landmark_map, options, frames, rig, cameras, ScanMatcher(
+        scan, grid, landmark_map) if scan and grid else None)
 
 
 def unrefined(map_from_camera: NDArray[np.float64]) -> Finalist:
