@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry import depth
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults, check_faults
+from cliploc_ros.core.geometry.grid import OccupancyGrid
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
@@ -33,6 +35,9 @@ _DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 _DEPTH_HEADER = struct.Struct('<iff')
 # Tolerance of the aspect ratio, for a depth image that is a rounded fraction of the colour image.
 _SAME_ASPECT = 0.02
+# Greatest number of beams of a scan, greatest angle between its first and last beam [rad], and
+# number of beams by which drivers miscount.
+_MOST_BEAMS, _FULL_TURN, _ODD_BEAMS = 2**14, 2.01 * math.pi, 2.5
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
 # JPEG markers that are followed by the image size.
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -44,6 +49,8 @@ _SECOND = re.compile('(?<!up)right|second|infra_?2|bottom|(^|[_/])r([_/]|$)', re
 type ImageMessage = Any
 type CompressedImageMessage = Any
 type CameraInfoMessage = Any
+type LaserScanMessage = Any
+type OccupancyGridMessage = Any  #: Of nav_msgs
 
 
 def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uint8]:
@@ -110,6 +117,43 @@ def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
         at += 2 + int.from_bytes(data[at + 2:at + 4])
     raise ImageError(f"compressed image ('{stated_format}', {len(data)} bytes) does not decode: "
                      'it is not a JPEG or PNG, or it is cut off')
+
+
+def scan_from_msg(msg: LaserScanMessage
+                  ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return angles (n,) [rad] and ranges (n,) [m] of a scan, and its greatest range [m].
+
+    As in REP 117, a range is infinite if nothing is in range, and NaN if it is invalid or too
+    short. OptionsError: a field is invalid; the message names it.
+    """
+    ranges, step = np.array(msg.ranges, dtype=np.float64), float(msg.angle_increment)
+    turn, spans = (len(ranges) - 1) * step, float(msg.angle_max) - float(msg.angle_min)
+    if not (2 <= len(ranges) <= _MOST_BEAMS and 0.0 < abs(turn) < _FULL_TURN
+            and abs(turn - spans) <= _ODD_BEAMS * abs(step)
+            and 0.0 <= msg.range_min < msg.range_max < math.inf):
+        raise OptionsError(
+            f'the scan has {len(ranges)} ranges, {msg.range_min:g} to {msg.range_max:g} m, angles '
+            f'{msg.angle_min:g} to {msg.angle_max:g} rad and angle_increment {step:g} rad, which '
+            'contradict each other: correct the driver of the laser')
+    with np.errstate(invalid='ignore'):
+        ranges[~(ranges >= msg.range_min)] = np.nan
+        ranges[ranges >= msg.range_max] = np.inf
+    if not np.isfinite(ranges).any():
+        raise OptionsError('the scan has no range between range_min and range_max')
+    return msg.angle_min + step * np.arange(len(ranges)), ranges, float(msg.range_max)
+
+
+def grid_from_msg(msg: OccupancyGridMessage) -> OccupancyGrid:
+    """Return an occupancy grid. OptionsError: a field is invalid; the message names it."""
+    size, pose = (msg.info.height, msg.info.width), msg.info.origin
+    position, quat_xyzw = (np.array([getattr(part, axis) for axis in axes]) for part, axes in (
+        (pose.position, 'xyz'), (pose.orientation, 'xyzw')))
+    if len(msg.data) != math.prod(size) or not abs(np.linalg.norm(quat_xyzw) - 1.0) < 0.01:
+        raise OptionsError(f'the grid has {len(msg.data)} cells for {size[1]} x {size[0]}, or the '
+                           f'quaternion {quat_xyzw} of its origin is not of unit length')
+    return OccupancyGrid(np.asarray(msg.data, dtype=np.int8).reshape(size),
+                         float(msg.info.resolution), transform_from_pose(position, quat_xyzw),
+                         msg.header.frame_id.lstrip('/'))
 
 
 def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.generic]:

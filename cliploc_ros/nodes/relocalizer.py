@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Localizes the robot in a map of objects, on request or with every image.
 
-  in         image, image/compressed, camera_info, detections; optional: odom, imu, depth
+  in         image, image/compressed, camera_info, detections; optional: odom, imu, depth,
+             scan, grid
   out        ~/pose, initialpose, ~/hypotheses, ~/landmarks, ~/matches, ~/debug_image, ~/answer,
              /diagnostics
   services   ~/relocalize, ~/relocalize_fields, ~/record, ~/reload_map,
@@ -74,7 +75,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             self.facts['topics'] = ' '.join(
                 f'{name}:={qos.resolved(self, name)}' for name in (
                     *(topic for source in sources for topic in source.topics.values()),
-                    *_OTHER_TOPICS, parameters.localizer_pose) if name)
+                    *_OTHER_TOPICS, parameters.localizer_pose, parameters.scan,
+                    parameters.scan and parameters.grid) if name)
         self._handoff = HandOff(self, self._robot.odometry, self._robot.transforms)
         self._handoff.on_shown(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))

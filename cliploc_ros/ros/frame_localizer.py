@@ -234,10 +234,10 @@ class Instants:
             self._observed(camera_frame, parameters, camera_state, by_odometry)
             for camera_frame, camera_state in (*beside, (frame, state))
             if run == _run_of(camera_state)), strict=True)
-        newest = replace(observations[-1], region=region)
+        newest = replace(observations[-1], region=region, scan=state.scan)
         others = (replace(other, stamp_ns=newest.stamp_ns) for other in observations[:-1])
         return Query((*others, newest), images, run, parameters.fuse_frames,
-                     parameters.fuse_window_s)
+                     parameters.fuse_window_s, grid=state.grid)
 
     def explained(self, found: Relocalization) -> Relocalization:
         """Return a result; a refusal gets the faults of the newest frames as further reasons."""

@@ -18,6 +18,7 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.geometry.transforms import move_covariance
+from cliploc_ros.core.map.grid_file import read_grid
 from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict, answer_to
@@ -31,7 +32,7 @@ from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode, NotActiveError
-from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.parameters import RelocalizerParameters, path_of
 from cliploc_ros.ros.visualization import Visualization
 
 # Each frame without odometry adds to the risk of a false accept.
@@ -78,7 +79,11 @@ class Pipeline:
 
     def load(self, former: FrameLocalizer | None = None) -> FrameLocalizer:
         """Load map and network, and return them. Keep the network of a former localizer."""
-        localizer = load_localizer(self._node, self._node.settings.snapshot(), former)
+        parameters = self._node.settings.snapshot()
+        localizer = load_localizer(self._node, parameters, former)
+        if parameters.scan and parameters.grid_file:
+            self._robot.laser.use(lambda: read_grid(path_of(parameters.grid_file),
+                                                    localizer.frame_ids[0]))
         self.localizer = localizer
         self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
                                     else localizer.keyframes.localizer.layer)

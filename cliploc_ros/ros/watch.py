@@ -25,7 +25,6 @@ from std_msgs.msg import Bool, Header, String
 
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import SAME_SPOT, invert_transform, is_rigid
-from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.watch.watch import WatchReport, WatchState
 from cliploc_ros.errors import CliplocError, StoppedError, TimeUpError
 from cliploc_ros.ros import qos
@@ -229,10 +228,10 @@ class Watcher:
         # The watch needs odometry even if fuse_frames is 1.
         parameters = replace(self._node.settings.snapshot().of_camera(frame.camera),
                              fuse_frames=MAX_FRAMES)
+        frame_ids = localizer.frame_ids
         state = self._robot.at(image, parameters, depth_frame=frame.depth_frame,
-                               info=frame.camera_info)
-        pose = self._pose.at(image, state, parameters, [
-            part.landmark_map.frame_id for part in parts_of(localizer.landmark_map)])
+                               info=frame.camera_info, frame_ids=frame_ids)
+        pose = self._pose.at(image, state, parameters, frame_ids)
         self._had_pose = True
 
         def score() -> WatchReport | None:

@@ -20,14 +20,16 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Imu
 from std_msgs.msg import Header
 
-from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.observation import Region
+from cliploc_ros.core.geometry.grid import OccupancyGrid
+from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
+from cliploc_ros.core.observation import Region, Scan
 from cliploc_ros.errors import CliplocError
-from cliploc_ros.messages import camera_from_frame
+from cliploc_ros.messages import camera_from_frame, scan_from_msg
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame
+from cliploc_ros.ros.inputs.laser import UNLINKED_NS, LaserSource
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometryPlace, OdometrySource
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.stamps import StampOrder, stamp_problem
@@ -54,6 +56,8 @@ _NOT_MEASURED = -1.0
 _RETRY_S = 0.02
 # Longest wait for the first message of a publisher of odometry that was just discovered.
 _DISCOVERY_S = 1.0
+# Longest wait for the message of odometry that follows a scan.
+_PATIENCE_S = 0.2
 
 
 class NoVerticalError(CliplocError):
@@ -225,6 +229,16 @@ class RobotState:
     place: OdometryPlace | None = None
     #: Pose (4, 4) of a depth camera that is not registered; None if unknown to tf2
     camera_from_depth: NDArray[np.float64] | None = None
+    #: The scan of the laser, and the grid that it shows; None if they are unknown or not asked for
+    scan: Scan | None = None
+    grid: OccupancyGrid | None = None
+
+
+class _Mounts(NamedTuple):
+    """Poses (4, 4) in the camera, which in a stereo pair has another pose than its frame."""
+
+    base: NDArray[np.float64]
+    frame: NDArray[np.float64]
 
 
 class KnownBefore(NamedTuple):
@@ -244,7 +258,7 @@ class RobotStateSource:
         self.transforms = CoordinateFrames(node)
         self.odometry = OdometrySource(node)
         self.vertical = VerticalSource(node, self.transforms)
-        self.prior = PriorSource(node, self.transforms)
+        self.prior, self.laser = PriorSource(node, self.transforms), LaserSource(node)
         self._unknown = set[str]()  # coordinate frames that tf2 did not know the last time
         #: Why optional inputs were not used for the newest image, by input
         self.problems: dict[str, str] = {}
@@ -255,9 +269,12 @@ class RobotStateSource:
         self.vertical.open(parameters.gravity)
         self.prior.open(parameters)
         self.odometry.open()
+        self.laser.open(parameters)
         remedy = 'set publish_tf: false' if parameters.publish_tf else 'set watch: amcl_pose' \
             if parameters.watch == 'tf' else 'set base_from_camera' \
-            if parameters.base_frame and not any(parameters.base_from_camera) else ''
+            if parameters.base_frame and not any(parameters.base_from_camera) \
+            else 'set base_from_laser' if parameters.scan and not any(
+                parameters.base_from_laser) else ''
         if remedy:  # in the worker, because importing tf2 takes long
             self._node.worker.run(partial(self.transforms.open, remedy=remedy))
 
@@ -266,6 +283,7 @@ class RobotStateSource:
         self.odometry.close()
         self.vertical.close()
         self.prior.close()
+        self.laser.close()
         self._node.worker.submit(self.transforms.close)  # after a search that may be running
 
     def forget(self) -> None:
@@ -273,10 +291,12 @@ class RobotStateSource:
         self.transforms.forget()
         self.vertical.forget()
         self.odometry.forget()
+        self.laser.forget()
 
     def examine(self, health: Health) -> None:
-        """Report invalid messages of odometry and of the IMU."""
-        for problem in (self.odometry.problem, self.vertical.problem):
+        """Report invalid messages of odometry and the IMU, and why the laser is not used."""
+        for problem in (self.odometry.problem, self.vertical.problem, self.problems.get(
+                'scan', self.laser.problem(self._node.settings.values))):
             if problem:
                 health.warn(problem)
 
@@ -298,7 +318,7 @@ class RobotStateSource:
         """
         header = frame.image.header
         state = self.at(header, parameters.of_camera(frame.camera), deadline, frame.depth_frame,
-                        frame.camera_info)
+                        frame.camera_info, frame_ids)
         beside = []
         for other in frame.beside:
             soon = min(deadline, time.monotonic() + parameters.tf_timeout_s)
@@ -312,10 +332,12 @@ class RobotStateSource:
             header.stamp, parameters, state.camera_from_base, frame_ids, map_hash))
 
     def at(self, image: Header, parameters: RelocalizerParameters, deadline: float = math.inf,
-           depth_frame: str = '', info: CameraInfo | None = None) -> RobotState:
+           depth_frame: str = '', info: CameraInfo | None = None, frame_ids: Sequence[str] = ()
+           ) -> RobotState:
         """Return the robot's state at the stamp of an image.
 
-        Vertical, odometry, and the pose of unregistered depth are optional. `info` of the second
+        Vertical, odometry, and the pose of unregistered depth are optional, and so is the scan,
+        which is asked for by the frames of the maps. `info` of the second
         camera of a stereo pair puts this camera beside its frame, see messages.camera_from_frame.
 
         The wait for the mount takes at most half of the time until `deadline` (monotonic clock)
@@ -347,19 +369,42 @@ class RobotStateSource:
         if depth_frame not in ('', image.frame_id):
             with suppress(NoTransformError):  # depths_from_msg reports it
                 camera_from_depth = from_frame @ self._lookup(image, depth_frame, parameters)
-        return RobotState(camera_from_base, up_in_camera, self._place(
-            image, parameters, camera_from_base, from_frame), camera_from_depth)
+        mounts = _Mounts(camera_from_base, from_frame)
+        return RobotState(
+            camera_from_base, up_in_camera, self._place(image, parameters, mounts),
+            camera_from_depth, *(self._scan(image, parameters, mounts, frame_ids)
+                                 if frame_ids and parameters.scan else ()))
 
-    def _place(self, image: Header, parameters: RelocalizerParameters,
-               camera_from_base: NDArray[np.float64], from_frame: NDArray[np.float64]
+    def _scan(self, image: Header, parameters: RelocalizerParameters, mounts: '_Mounts',
+              frame_ids: Sequence[str]) -> tuple[Scan | None, OccupancyGrid | None]:
+        """Return the scan as it is seen from the image, and its grid."""
+        try:
+            msg, grid = self.laser.near(image.stamp, parameters, frame_ids)
+            at, mount = msg.header, np.array(parameters.base_from_laser)
+            camera_from_laser = self._mount(image, at.frame_id, parameters, mounts) if \
+                not mount.any() else mounts.base @ transform_from_pose(mount[:3], mount[3:])
+            try:
+                motion, body = self.odometry.motion(image.stamp, at.stamp, _PATIENCE_S)
+                camera_from_body = self._mount(image, body, parameters, mounts)
+                camera_from_laser = camera_from_body @ motion @ invert_transform(
+                    camera_from_body) @ camera_from_laser
+            except NoOdometryError:  # the robot is assumed to be at rest for a moment
+                if abs(stamp_ns(at.stamp) - stamp_ns(image.stamp)) > UNLINKED_NS:
+                    raise
+            found = Scan(*scan_from_msg(msg), camera_from_laser)
+        except CliplocError as error:
+            self._warn('scan', f'localizing without the scan: {error}')
+            return None, None
+        self.problems.pop('scan', None)
+        return found, grid
+
+    def _place(self, image: Header, parameters: RelocalizerParameters, mounts: '_Mounts'
                ) -> OdometryPlace | None:
         if parameters.fuse_frames == 1:
             return None
         try:
             body = self.odometry.pose_at(image.stamp)
-            camera_from_body = from_frame if body.frame == image.frame_id else \
-                camera_from_base if body.frame == parameters.base_frame else \
-                from_frame @ self._lookup(image, body.frame, parameters)
+            camera_from_body = self._mount(image, body.frame, parameters, mounts)
         except NoOdometryError as error:
             if self.odometry.is_published:
                 self.problems['odometry'] = f'localizing without odometry: {error}'
@@ -372,13 +417,21 @@ class RobotStateSource:
             odom_from_frame=body.odom_from_frame @ invert_transform(camera_from_body),
             frame=image.frame_id)
 
+    def _mount(self, image: Header, frame: str, parameters: RelocalizerParameters,
+               mounts: '_Mounts') -> NDArray[np.float64]:
+        """Return the pose (4, 4) of a coordinate frame of the robot in the camera."""
+        return mounts.frame if frame == image.frame_id else \
+            mounts.base if frame == parameters.base_frame else \
+            mounts.frame @ self._lookup(image, frame, parameters)
+
     def _lookup(self, image: Header, frame: str, parameters: RelocalizerParameters
                 ) -> NDArray[np.float64]:
         """Return camera_from_frame; wait for a frame only if it was known the last time."""
         timeout_s = 0.0 if frame in self._unknown else parameters.tf_timeout_s
         self._unknown.add(frame)
         found = self.transforms.lookup(image.frame_id, frame, image.stamp, timeout_s,
-                                       f'set base_frame to {frame}, and base_from_camera')
+                                       f'set base_frame to {frame}, and base_from_camera, or '
+                                       'base_from_laser')
         self._unknown.discard(frame)
         return found
 
