@@ -181,7 +181,10 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                 health.fail(f'{wrong}: check camera_info, and the pixels and corners of the boxes')
             if parameters.depth_transport != 'none':
                 health.values['depth scale'] = f'{depth_scale.ratio:.2f}'
-            health.values |= {'map': localizer.description, 'map hash': localizer.map_hash}
+            if wrong := localizer.scans.fault:
+                health.warn(wrong)
+            health.values |= {'wrong scans': localizer.scans.fault,
+                              'map': localizer.description, 'map hash': localizer.map_hash}
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         answer = self._answer()

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 
 from cliploc_ros import messages
+from cliploc_ros.core.acceptance.scan_check import ScanCheck
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform
@@ -104,7 +105,7 @@ class FrameLocalizer:
         self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
         self.observer = observer
         self.instants = Instants(landmark_map, options.matching != 'clip')
-        self._options, self.watch = options, Watch(relocalizer)
+        self._options, self.watch, self.scans = options, Watch(relocalizer), ScanCheck()
         self.localizer = Localizer(relocalizer, None if keyframes is None else keyframes.localizer)
         relocalizer.warm_up()
 
@@ -133,6 +134,9 @@ class FrameLocalizer:
         query = replace(self.instants.query(frame, parameters, known),
                         is_thorough=not math.isinf(deadline))
         found = self.answer(query, parameters.options(), times, deadline)
+        fit, pose = found.evidence and found.evidence.scan, found.map_from_camera
+        if found.accepted and fit and query.grid and pose is not None:
+            self.scans.add(query.grid, fit, pose @ known.state.camera_from_base)
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest
         # the result of a request that is late is not published, and must not advance the filter
@@ -188,7 +192,8 @@ class FrameLocalizer:
             if can_do_without_crops(options) else by_classes(query.newest, len(self.landmark_map))
         pose = map_from_camera.copy()
         pose[:3, 3] += shift
-        return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
+        return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query),
+                               query.grid)
 
     def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
         """Return the localizer. If the options changed, it uses them, and the watch is new."""

@@ -86,6 +86,7 @@ class LaserSource:
             grid = read()
             if grid.cells.size > _MOST_CELLS:
                 raise OptionsError(f'the grid has {grid.cells.size} cells (limit {_MOST_CELLS})')
+            _ = grid.field  # no request waits for it
             self._grid, self._fault = grid, ''
         except CliplocError as error:
             self._grid, self._fault = None, str(error)
