@@ -49,8 +49,6 @@ _SECOND = re.compile('(?<!up)right|second|infra_?2|bottom|(^|[_/])r([_/]|$)', re
 type ImageMessage = Any
 type CompressedImageMessage = Any
 type CameraInfoMessage = Any
-type LaserScanMessage = Any
-type OccupancyGridMessage = Any  #: Of nav_msgs
 
 
 def image_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.uint8]:
@@ -119,41 +117,37 @@ def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
                      'it is not a JPEG or PNG, or it is cut off')
 
 
-def scan_from_msg(msg: LaserScanMessage
-                  ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return angles (n,) [rad] and ranges (n,) [m] of a scan, and its greatest range [m].
+def scan_from_msg(msg: Any) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return angles (n,) [rad] and ranges (n,) [m] of a LaserScan, and its greatest range [m].
 
     As in REP 117, a range is infinite if nothing is in range, and NaN if it is invalid or too
-    short. OptionsError: a field is invalid; the message names it.
+    short. OptionsError: a field is invalid; the message has all of them.
     """
     ranges, step = np.array(msg.ranges, dtype=np.float64), float(msg.angle_increment)
-    turn, spans = (len(ranges) - 1) * step, float(msg.angle_max) - float(msg.angle_min)
-    if not (2 <= len(ranges) <= _MOST_BEAMS and 0.0 < abs(turn) < _FULL_TURN
-            and abs(turn - spans) <= _ODD_BEAMS * abs(step)
+    ranges[~(ranges >= msg.range_min)] = np.nan
+    ranges[ranges >= msg.range_max] = np.inf
+    valid, turn = np.isfinite(ranges).sum(), (len(ranges) - 1) * step
+    if not (valid and len(ranges) <= _MOST_BEAMS and 0.0 < abs(turn) < _FULL_TURN
+            and abs(msg.angle_max - msg.angle_min - turn) <= _ODD_BEAMS * abs(step)
             and 0.0 <= msg.range_min < msg.range_max < math.inf):
         raise OptionsError(
-            f'the scan has {len(ranges)} ranges, {msg.range_min:g} to {msg.range_max:g} m, angles '
-            f'{msg.angle_min:g} to {msg.angle_max:g} rad and angle_increment {step:g} rad, which '
-            'contradict each other: correct the driver of the laser')
-    with np.errstate(invalid='ignore'):
-        ranges[~(ranges >= msg.range_min)] = np.nan
-        ranges[ranges >= msg.range_max] = np.inf
-    if not np.isfinite(ranges).any():
-        raise OptionsError('the scan has no range between range_min and range_max')
+            f'the scan has {valid} valid of {len(ranges)} ranges, {msg.range_min:g} to '
+            f'{msg.range_max:g} m, angles {msg.angle_min:g} to {msg.angle_max:g} rad and '
+            f'angle_increment {step:g} rad: correct the driver of the laser')
     return msg.angle_min + step * np.arange(len(ranges)), ranges, float(msg.range_max)
 
 
-def grid_from_msg(msg: OccupancyGridMessage) -> OccupancyGrid:
-    """Return an occupancy grid. OptionsError: a field is invalid; the message names it."""
-    size, pose = (msg.info.height, msg.info.width), msg.info.origin
-    position, quat_xyzw = (np.array([getattr(part, axis) for axis in axes]) for part, axes in (
-        (pose.position, 'xyz'), (pose.orientation, 'xyzw')))
+def grid_from_msg(msg: Any) -> OccupancyGrid:
+    """Return an OccupancyGrid of nav_msgs. OptionsError: a field is invalid."""
+    size, p, q = (msg.info.height, msg.info.width), msg.info.origin.position, \
+        msg.info.origin.orientation
+    quat_xyzw = np.array([q.x, q.y, q.z, q.w])
     if len(msg.data) != math.prod(size) or not abs(np.linalg.norm(quat_xyzw) - 1.0) < 0.01:
         raise OptionsError(f'the grid has {len(msg.data)} cells for {size[1]} x {size[0]}, or the '
                            f'quaternion {quat_xyzw} of its origin is not of unit length')
-    return OccupancyGrid(np.asarray(msg.data, dtype=np.int8).reshape(size),
-                         float(msg.info.resolution), transform_from_pose(position, quat_xyzw),
-                         msg.header.frame_id.lstrip('/'))
+    return OccupancyGrid(
+        np.asarray(msg.data, dtype=np.int8).reshape(size), float(msg.info.resolution),
+        transform_from_pose(np.array([p.x, p.y, p.z]), quat_xyzw), msg.header.frame_id.lstrip('/'))
 
 
 def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.generic]:

@@ -181,10 +181,8 @@ class Doctor(RelocalizerNode):
                 report.judge(of_camera(name, 'clock'), self._clock_fault(source.nearest_lag_s),
                              f'images come {1e3 * source.nearest_lag_s:.0f} ms after their stamps')
         if parameters.scan:
-            while (problem := self._robot.laser.problem(parameters)) and (
-                    time.monotonic() < after + patience_s):
-                time.sleep(_SPIN_S)
-            report.judge('scan', problem, f'{parameters.scan} and its grid arrive')
+            report.judge('scan', self._robot.laser.problem(parameters),
+                         f'{parameters.scan} and its grid arrive')
         image = None if frame is None else frame.image.header
         if frame is not None and image is not None and parameters.base_frame:
             with report.failing('tf'):

@@ -135,8 +135,8 @@ class FrameLocalizer:
                         is_thorough=not math.isinf(deadline))
         found = self.answer(query, parameters.options(), times, deadline)
         fit, pose = found.evidence and found.evidence.scan, found.map_from_camera
-        if found.accepted and fit and query.grid and pose is not None:
-            self.scans.add(query.grid, fit, pose @ known.state.camera_from_base)
+        if found.accepted and fit and pose is not None:
+            self.scans.add(fit, pose @ known.state.camera_from_base)
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest
         # the result of a request that is late is not published, and must not advance the filter

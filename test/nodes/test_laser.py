@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from diagnostic_msgs.srv import SelfTest
 from frames import header_of, messages_of
 from nav_msgs.msg import OccupancyGrid
 from processes import wait_for
@@ -13,7 +14,7 @@ from rclpy.qos import qos_profile_sensor_data
 from scene import level, make_room, see_room, write_map
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import LaserScan
-from tester import PIXELS, ask_until, transform_of
+from tester import PIXELS, transform_of
 
 from cliploc_ros.core.geometry.transforms import pose_error
 from cliploc_ros.ros.qos import LATCHED
@@ -65,43 +66,51 @@ def laser(own_relocalizer, tester, tmp_path):
     frame_s = [100.0]
 
     def ask(**fields):
-        """Return the answer for a robot at MAP_FROM_BASE."""
+        """Return the fields of the answer for a robot at MAP_FROM_BASE, and its message."""
         frame_s[0] += 1.0
         seen = see_room(ROOM, MAP_FROM_BASE @ level(z=0.4))
         frame = messages_of(seen, header_of(round(frame_s[0] * 1e9), 'camera'), PIXELS)
-        scan, future = scan_of(frame_s[0] + 0.03, **fields), tester.ask()
+        scan = scan_of(frame_s[0] + 0.03, **fields)
+        future = client.call_async(SelfTest.Request())
 
         def scanned():
             scans.publish(scan)
             return future.done()
         tester.feed_until(scanned, frame)
-        return future.result()
+        assert future.result().passed == b'\x01', future.result().status[0].message
+        return {field.key: field.value for field in future.result().status[0].values} | {
+            'message': future.result().status[0].message}
 
     def begin(**parameters):
         return own_relocalizer(map_file=tmp_path / 'level.yaml', scan='scan', base_frame='base',
                                algorithm='auto', time_budget_ms=5000.0, **MOUNTS, **parameters)
+    client = tester.create_client(SelfTest, 'relocalizer/relocalize_fields')
     yield begin, ask
+    tester.destroy_client(client)
     tester.destroy_publisher(scans)
 
 
 def test_scans_are_compared_with_the_newest_grid(laser, tester):
     begin, ask = laser
     process = begin()
-    answer = ask()
-    assert answer.success and 'of beams explained' not in answer.message
-    assert 'localizing without the scan: no grid: nobody publishes /map' in process.output()
+
+    def ask_until(text, **fields):
+        wait_for(lambda: text in ask(**fields)['scan'], text)
+    ask_until('no grid: nobody publishes /map')
     server = tester.create_publisher(OccupancyGrid, 'map', LATCHED)
+    large = np.pad(cells(), ((0, 3840), (0, 3760)), constant_values=-1)
+    for grid in (cells(), large):
+        server.publish(grid_of(grid))
+        ask_until('rank 1 of 2,000')
+        assert pose_error(transform_of(tester.poses[-1].pose.pose), MAP_FROM_BASE)[0] < 0.05
+        for wrong, named in (({'resolution': 0.0}, 'of 0.0 m'), (
+                {'frame_id': 'floor_2'}, "in frame 'floor_2', the map in 'map'")):
+            server.publish(grid_of(cells(), **wrong))
+            ask_until(named)
     server.publish(grid_of(cells()))
-    message = ask_until(ask, 'beams explained').message
-    assert 'rank 1 of 2,000' in message
-    assert pose_error(transform_of(tester.poses[-1].pose.pose), MAP_FROM_BASE)[0] < 0.05
-    for wrong, named in (({'resolution': 0.0}, '0.0 m'), ({'frame_id': 'floor_2'}, 'floor_2')):
-        server.publish(grid_of(cells(), **wrong))
-        wait_for(lambda text=named: text in process.output(), named, work=ask)
-        assert 'beams explained' not in ask().message
-    server.publish(grid_of(np.pad(cells(), ((0, 3840), (0, 3760)), constant_values=-1)))
-    ask_until(ask, 'beams explained')
-    assert ask(angle_increment=0.0).success
-    process.wait_for_output('angle_increment 0')
+    ask_until('angle_increment 0 rad', angle_increment=0.0)
+    ask_until('beams explained')
+    assert ', scan ' in ask()['message']
+    tester.wait(lambda: 'localizing without the scan' in process.output(), 'the log')
     assert 'Traceback' not in process.output()
     tester.destroy_publisher(server)

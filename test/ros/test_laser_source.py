@@ -70,13 +70,13 @@ def test_the_nearest_scan_is_moved_by_odometry(robot):
 
 
 @pytest.mark.parametrize(('fields', 'named'), [
-    ({'angle_increment': 0.0}, 'angle_increment 0 '), ({'angle_increment': np.nan}, 'nan'),
+    ({'angle_increment': 0.0}, 'angle_increment 0 '), ({'angle_increment': np.nan}, 'nan rad'),
     ({'angle_max': np.inf}, 'inf'), ({'ranges': [2.0] * 25}, '25 ranges'),
     ({'ranges': []}, 'has 0 '),
     ({'angle_min': -150.0, 'angle_max': 150.0, 'angle_increment': 10.0}, '10 rad'),
     ({'range_max': np.nan}, 'nan m'), ({'range_min': -1.0}, '-1 to'),
-    ({'range_max': 0.1}, '0.1 m'), ({'ranges': [-2.0] * 31}, 'no range between'),
-    ({'ranges': [np.nan] * 31}, 'no range between')])
+    ({'range_max': 0.1}, '0.1 m'), ({'ranges': [-2.0] * 31}, ' 0 valid'),
+    ({'ranges': [np.nan] * 31}, ' 0 valid')])
 def test_an_invalid_scan_is_left_out_and_named(robot, fields, named):
     robot.laser.take(scan_of(**fields))
     assert state_of(robot).scan is None

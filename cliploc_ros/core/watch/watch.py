@@ -229,7 +229,6 @@ class Watch:
         terms, belief = CALIBRATION.watch, self._belief
         likely, state = belief.probability, WatchState.UNCERTAIN
         missing = tuple(self._map.landmark_ids[row] for row in self._missing.named())
-        by_scan = '' if self._scan is None else f'; {self._scan}'
         is_contradicted = self._scan is not None and self._scan.odds < 0.0
         if likely > terms.localized and not self._missing.is_outdated and not is_contradicted:
             state = WatchState.LOCALIZED
@@ -238,15 +237,14 @@ class Watch:
             state = WatchState.LOST
         reason = f'{state}: probability {likely:.2f}'
         seen = f'{evidence.matched} of {evidence.known} objects fit the pose' if evidence else ''
+        seen += '' if self._scan is None else f', {self._scan}'
         if fault:
             reason += f'; {fault}; check the camera'
         elif state == WatchState.LOST:
-            reason += f' that the pose is right; {seen}{by_scan}; relocalize'
+            reason += f' that the pose is right; {seen}; relocalize'
         elif state == WatchState.LOCALIZED:
-            reason += f'; {seen}{by_scan}'
-        elif is_contradicted:
-            reason += f'; {seen}{by_scan}; turn the robot, or check grid and laser'
-        elif likely > terms.localized:
+            reason += f'; {seen}'
+        elif likely > terms.localized and not is_contradicted:
             reason += f'; {len(missing)} landmarks are missing here; update the map'
         else:
             reason += f'; {seen}; turn the camera to more objects'

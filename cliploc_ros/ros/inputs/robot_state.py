@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -29,13 +29,14 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame
-from cliploc_ros.ros.inputs.laser import UNLINKED_NS, LaserSource
+from cliploc_ros.ros.inputs.laser import LaserSource
 from cliploc_ros.ros.inputs.odometry import NoOdometryError, OdometryPlace, OdometrySource
 from cliploc_ros.ros.inputs.prior import PriorSource
 from cliploc_ros.ros.inputs.stamps import StampOrder, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.units import NS_PER_S
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STANDARD_GRAVITY = 9.80665
@@ -58,6 +59,11 @@ _RETRY_S = 0.02
 _DISCOVERY_S = 1.0
 # Longest wait for the message of odometry that follows a scan.
 _PATIENCE_S = 0.2
+# Greatest time between image and scan if odometry does not cover it: a laser at 5 Hz has a scan
+# within this time. Not measured.
+_UNLINKED_NS = NS_PER_S // 10
+# Returns the pose (4, 4) of a coordinate frame of the robot in the camera at an image.
+type MountOf = Callable[[str], NDArray[np.float64]]
 
 
 class NoVerticalError(CliplocError):
@@ -232,13 +238,7 @@ class RobotState:
     #: The scan of the laser, and the grid that it shows; None if they are unknown or not asked for
     scan: Scan | None = None
     grid: OccupancyGrid | None = None
-
-
-class _Mounts(NamedTuple):
-    """Poses (4, 4) in the camera, which in a stereo pair has another pose than its frame."""
-
-    base: NDArray[np.float64]
-    frame: NDArray[np.float64]
+    no_scan: str = ''  #: Why it is unknown
 
 
 class KnownBefore(NamedTuple):
@@ -369,42 +369,44 @@ class RobotStateSource:
         if depth_frame not in ('', image.frame_id):
             with suppress(NoTransformError):  # depths_from_msg reports it
                 camera_from_depth = from_frame @ self._lookup(image, depth_frame, parameters)
-        mounts = _Mounts(camera_from_base, from_frame)
+
+        def mount_of(frame: str) -> NDArray[np.float64]:
+            return from_frame if frame == image.frame_id else camera_from_base if (
+                frame == parameters.base_frame) else from_frame @ self._lookup(
+                    image, frame, parameters)
         return RobotState(
-            camera_from_base, up_in_camera, self._place(image, parameters, mounts),
-            camera_from_depth, *(self._scan(image, parameters, mounts, frame_ids)
+            camera_from_base, up_in_camera, self._place(image, parameters, mount_of),
+            camera_from_depth, *(self._scan(image, parameters, mount_of, frame_ids)
                                  if frame_ids and parameters.scan else ()))
 
-    def _scan(self, image: Header, parameters: RelocalizerParameters, mounts: '_Mounts',
-              frame_ids: Sequence[str]) -> tuple[Scan | None, OccupancyGrid | None]:
-        """Return the scan as it is seen from the image, and its grid."""
+    def _scan(self, image: Header, parameters: RelocalizerParameters, mount_of: MountOf,
+              frame_ids: Sequence[str]) -> tuple[Scan | None, OccupancyGrid | None, str]:
+        """Return the scan as it is seen from the image, and its grid, or why it is unknown."""
         try:
             msg, grid = self.laser.near(image.stamp, parameters, frame_ids)
             at, mount = msg.header, np.array(parameters.base_from_laser)
-            camera_from_laser = self._mount(image, at.frame_id, parameters, mounts) if \
-                not mount.any() else mounts.base @ transform_from_pose(mount[:3], mount[3:])
-            try:
+            camera_from_laser = mount_of(at.frame_id) if not mount.any() else mount_of(
+                parameters.base_frame) @ transform_from_pose(mount[:3], mount[3:])
+            # without odometry, the robot is assumed to be at rest for a moment
+            is_soon = abs(stamp_ns(at.stamp) - stamp_ns(image.stamp)) <= _UNLINKED_NS
+            with suppress(*[NoOdometryError] * is_soon):
                 motion, body = self.odometry.motion(image.stamp, at.stamp, _PATIENCE_S)
-                camera_from_body = self._mount(image, body, parameters, mounts)
-                camera_from_laser = camera_from_body @ motion @ invert_transform(
-                    camera_from_body) @ camera_from_laser
-            except NoOdometryError:  # the robot is assumed to be at rest for a moment
-                if abs(stamp_ns(at.stamp) - stamp_ns(image.stamp)) > UNLINKED_NS:
-                    raise
+                camera_from_laser = mount_of(body) @ motion @ invert_transform(
+                    mount_of(body)) @ camera_from_laser
             found = Scan(*scan_from_msg(msg), camera_from_laser)
         except CliplocError as error:
             self._warn('scan', f'localizing without the scan: {error}')
-            return None, None
+            return None, None, str(error)
         self.problems.pop('scan', None)
-        return found, grid
+        return found, grid, ''
 
-    def _place(self, image: Header, parameters: RelocalizerParameters, mounts: '_Mounts'
+    def _place(self, image: Header, parameters: RelocalizerParameters, mount_of: MountOf
                ) -> OdometryPlace | None:
         if parameters.fuse_frames == 1:
             return None
         try:
             body = self.odometry.pose_at(image.stamp)
-            camera_from_body = self._mount(image, body.frame, parameters, mounts)
+            camera_from_body = mount_of(body.frame)
         except NoOdometryError as error:
             if self.odometry.is_published:
                 self.problems['odometry'] = f'localizing without odometry: {error}'
@@ -416,13 +418,6 @@ class RobotStateSource:
         return body._replace(
             odom_from_frame=body.odom_from_frame @ invert_transform(camera_from_body),
             frame=image.frame_id)
-
-    def _mount(self, image: Header, frame: str, parameters: RelocalizerParameters,
-               mounts: '_Mounts') -> NDArray[np.float64]:
-        """Return the pose (4, 4) of a coordinate frame of the robot in the camera."""
-        return mounts.frame if frame == image.frame_id else \
-            mounts.base if frame == parameters.base_frame else \
-            mounts.frame @ self._lookup(image, frame, parameters)
 
     def _lookup(self, image: Header, frame: str, parameters: RelocalizerParameters
                 ) -> NDArray[np.float64]:
