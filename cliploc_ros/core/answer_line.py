@@ -45,6 +45,7 @@ def detail_of(found: Relocalization, frame_id: str, figures: Mapping[str, Any] |
            ] if points and found.source != 'objects' else []
     by += [f'depth of {depth.objects} objects'] if depth and depth.is_passed else []
     by += ['the prior'] if evidence and evidence.prior else []
+    by += [str(evidence.scan)] if evidence and evidence.scan else []
     images = len(found.frame_matches)
     of = figures or figures_of_pose(found.map_from_camera, found.covariance, 2)
     return (f'x {of["x [m]"]:.2f} y {of["y [m]"]:.2f} z {of["z [m]"]:.2f} m in {frame_id}, '

@@ -27,6 +27,7 @@ from cliploc_ros.core.acceptance.looks import NO_LOOKS, Look, Looks
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.fit.succession import FilterState, succeed
 from cliploc_ros.core.fit.verification import MAX_FRAMES
+from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.geometry.transforms import SAME_VIEW, pose_error
 from cliploc_ros.core.keyframes.localization import (
     LEAST_S,
@@ -123,7 +124,8 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
                        observation: Observation, crops: Crops | None = None,
                        looks: Looks = NO_LOOKS, recognizer: ImageRecognizer | None = None,
                        budget: TimeBudget | None = None, cameras: CameraCheck | None = None,
-                       request: float = math.inf) -> tuple[SearchedFrame, Relocalization]:
+                       request: float = math.inf, grid: OccupancyGrid | None = None
+                       ) -> tuple[SearchedFrame, Relocalization]:
     """Localize a frame with more and more of its crops until its pose is accepted.
 
     Parameters
@@ -143,6 +145,8 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
         Evidence about the cameras; by default there is none.
     request : float
         When a request needs the result (monotonic clock) [s].
+    grid : OccupancyGrid, optional
+        The grid of the frame's scan.
 
     Returns
     -------
@@ -166,12 +170,12 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
     while True:
         budget = budget or relocalizer.begin(len(earlier) + 1, request=request)
         frame = relocalizer.search(observation, budget.search_end())
-        found = relocalizer.locate([*earlier, frame], budget, looks, recognizer, cameras)
+        found = relocalizer.locate([*earlier, frame], budget, looks, recognizer, cameras, grid)
         search_ms, budget = search_ms + found.search_ms, None
         if found.accepted or crops is None or not len(left) or (count := crops.room()) <= 0:
             found = replace(found, search_ms=search_ms)
             return frame, relocalizer.look_again(found, [*earlier, frame], looks, recognizer,
-                                                 cameras)
+                                                 cameras, grid)
         compared, left = np.append(compared, left[:count]), left[count:]
         observation = replace(observation, similarities=crops.compare(compared),
                               compared=compared)
@@ -389,7 +393,7 @@ class Localizer:
         searched, found = localize_on_demand(
             self._relocalizer,
             [*(frame for instant in earlier for frame in instant.searched), *beside],
-            newest, crops, looks, recognizer, budget, self.cameras, request)
+            newest, crops, looks, recognizer, budget, self.cameras, request, query.grid)
         seen = found.recognition
         self.query = replace(query, frames=(*others, searched.observation), rooms=tuple(rooms),
                              by_keyframes=query.by_keyframes and (

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.camera import Camera
+from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.map.similarities import Similarities
 from cliploc_ros.errors import OptionsError
 
@@ -101,13 +102,28 @@ def tilt_deg(map_from_camera: NDArray[np.float64], up_in_camera: NDArray[np.floa
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A scan of a laser, moved by odometry to the instant of the image."""
+    """A scan of a laser, moved by odometry to the instant of the image.
+
+    Raises
+    ------
+    OptionsError
+        The numbers of angles and ranges differ, or the limit or the pose is invalid.
+    """
 
     angles: NDArray[np.float64]  #: (n,): direction of each beam about z of the laser [rad]
     #: (n,): range of each beam [m]; infinite if nothing is within `most_m`, NaN if it is invalid
     ranges: NDArray[np.float64]
     most_m: float  #: Greatest range that the laser measures [m]
     camera_from_laser: NDArray[np.float64]  #: (4, 4): the laser when the image was taken
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if self.angles.ndim != 1 or self.angles.shape != self.ranges.shape:
+            raise OptionsError(f'scan: {self.angles.shape} angles and {self.ranges.shape} ranges; '
+                               'expected one angle for each range')
+        if not 0.0 < self.most_m < np.inf or not is_rigid(self.camera_from_laser):
+            raise OptionsError(f'scan: its greatest range {self.most_m} m must be above 0, and '
+                               'the pose of the laser finite')
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings, Similarities
-from cliploc_ros.core.observation import Detections, Observation, Region
+from cliploc_ros.core.observation import Detections, Observation, Region, Scan
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.files.arrays import Arrays, Field, Offsets, Schema
@@ -83,8 +83,8 @@ class Case:
             raise DatasetError(f'the options of this case are invalid: {error}') from error
 
 
-# Limit of the coordinates, pixels and times of a case.
-_MOST = 1e9
+# Limit of the coordinates, pixels and times of a case, and of the cells of a grid.
+_MOST, _MOST_CELLS = 1e9, 2**26
 
 CASE = Schema('case', {
     'about': Field('uint8', ('t',)),  # JSON: report and queries, without images and crops
@@ -92,12 +92,16 @@ CASE = Schema('case', {
     'image_offsets': Field('integers', ('f',), (Offsets('images', 'bytes'),)),
     'crops': Field('float32', ('c', 'd')),  # embeddings or similarities
     'crop_offsets': Field('integers', ('g',), (Offsets('crops', 'crops'),)),
+    'grids': Field('uint8', ('z',), is_optional=True),  # PNG of each grid, with unknown as 255
+    'grid_offsets': Field('integers', ('h',), is_optional=True),
 }, DatasetError, 'store the request again with ~/record', {'f': 'images', 'g': 'frames'})
 
 
 def case_arrays(case: Case) -> Arrays:
     """Convert a case to the arrays of its file, see CASE."""
     images, crops = list[NDArray[np.uint8]](), list[NDArray[np.float32]]()
+    grids = [*dict.fromkeys(query.grid for query in case.queries if query.grid is not None)]
+    cells = [cv2.imencode('.png', grid.cells.view(np.uint8))[1].ravel() for grid in grids]
     for query in case.queries:
         images += [cv2.imencode('.png', cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].ravel()
                    for image in query.images]
@@ -110,16 +114,20 @@ def case_arrays(case: Case) -> Arrays:
            ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},
         'cameras': None if query.cameras is None else query.cameras.fields(),
         'has_images': bool(query.images),
+        'grid': None if query.grid is None else grids.index(query.grid),
         'frames': [asdict(replace(frame, similarities=None)) | {'crops': (
             '' if frame.similarities is None else 'embeddings' if isinstance(
                 frame.similarities, CropSimilarities) else 'similarities')}
-            for frame in query.frames]} for query in case.queries]}
+            for frame in query.frames]} for query in case.queries],
+        'grids': [vars(grid) | {'cells': grid.cells.shape, 'field': None} for grid in grids]}
     return {
         # NumPy arrays and scalars become lists and numbers
         'about': np.frombuffer(json.dumps(about, default=lambda value: value.tolist()).encode(),
                                dtype=np.uint8),
         'image_offsets': np.cumsum([0, *map(len, images)]),
         'images': np.concatenate([np.empty(0, np.uint8), *images]),
+        'grid_offsets': np.cumsum([0, *map(len, cells)]),
+        'grids': np.concatenate([np.empty(0, np.uint8), *cells]),
         'crop_offsets': np.cumsum([0, *map(len, crops)]),
         'crops': np.concatenate(crops) if crops else np.empty((0, 0), np.float32)}
 
@@ -134,7 +142,11 @@ def read_case(path: Path) -> Case:
     try:
         about = parse_json(arrays['about'].tobytes())
         images, crops = _parts(arrays, 'image'), _parts(arrays, 'crop')
-        first, *others = (_query_of(fields, images, crops) for fields in about['queries'])
+        grids = [_grid_of(fields, png) for fields, png in zip(
+            about.get('grids', ()), _parts(arrays, 'grid'), strict=True)] \
+            if 'grids' in arrays else []
+        first, *others = (replace(_query_of(fields, images, crops), grid=None if fields.get(
+            'grid') is None else grids[_count(fields['grid'])]) for fields in about['queries'])
         _expect(not [*images, *crops], 'the numbers of images and crops')
         report = dict(about['report'])
         _expect(isinstance(report.get('parameters', {}), dict), 'parameters')
@@ -160,6 +172,15 @@ def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
                  1 + _count(about['limit'] - 1), float(_numbers(about['length_s'])),
                  bool(about['by_keyframes']), bool(about.get('is_thorough')),
                  None if cameras is None else CameraCheck.of_fields(cameras), rooms)
+
+
+def _grid_of(about: Mapping[str, Any], cells_png: NDArray[np.uint8]) -> OccupancyGrid:
+    """Return the grid of JSON fields; any Python error means that they are damaged."""
+    height, width = map(_count, about['cells'])
+    _expect(height * width <= _MOST_CELLS and isinstance(about['frame_id'], str), 'grid')
+    return OccupancyGrid(_unpacked(cells_png, width, height, cv2.IMREAD_GRAYSCALE).view(np.int8),
+                         float(about['resolution_m']), _numbers(about['frame_from_grid'], 4, 4),
+                         about['frame_id'])
 
 
 def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) -> Observation:
@@ -196,18 +217,28 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
         known[name], *shape, nan=name == 'depths') for name, shape in (
             ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,)),
             ('base_up_in_camera', (3,))))
+    scan = known.get('scan')
+    if scan is not None:
+        ranges = np.array(scan['ranges'], dtype=np.float64)
+        scan = Scan(_numbers(scan['angles'], len(ranges)), ranges, float(scan['most_m']),
+                    _numbers(scan['camera_from_laser'], 4, 4))
     return Observation(
         Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
         similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,
-        float(_numbers(known['odom_way_m'])), compared, depths, region, base_up)
+        float(_numbers(known['odom_way_m'])), compared, depths, region, base_up, scan)
 
 
 def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
     """Decode a PNG image to RGB (h, w, 3); ValueError: its size is not that of its camera."""
+    return np.asarray(cv2.cvtColor(_unpacked(
+        image_png, camera.width, camera.height, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _unpacked(image_png: NDArray[np.uint8], width: int, height: int, mode: int) -> Any:
+    """Decode a PNG image; ValueError: its size is another one."""
     # a small file may declare a huge size, for which decoding would allocate memory
-    _expect(image_png[16:24].tobytes() == struct.pack('>II', camera.width, camera.height), 'image')
-    image = cv2.imdecode(image_png, cv2.IMREAD_COLOR)
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    _expect(image_png[16:24].tobytes() == struct.pack('>II', width, height), 'image')
+    return cv2.imdecode(image_png, mode)
 
 
 def _numbers(value: Any, *shape: int | None, nan: bool = False) -> NDArray[np.float64]:

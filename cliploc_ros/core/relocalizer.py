@@ -21,8 +21,10 @@ from cliploc_ros.core.acceptance.looks import NO_LOOKS, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Match, find_with_rivals
+from cliploc_ros.core.fit.scan_match import ScanMatcher
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
+from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.geometry.transforms import SAME_PLACE
 from cliploc_ros.core.kernels.compiled import warm_up
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
@@ -30,7 +32,7 @@ from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
 from cliploc_ros.core.keyframes.point_pose import refine
 from cliploc_ros.core.map.joined_map import MapPart, parts_of, place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Detections, Observation
+from cliploc_ros.core.observation import Detections, Observation, Scan
 from cliploc_ros.core.options import NEVER, Deadline, RelocalizerOptions
 from cliploc_ros.core.search.frame_search import SearchedFrame, coverage_of, search_frame
 from cliploc_ros.errors import OptionsError
@@ -215,13 +217,14 @@ class Relocalizer:
         warm_up(_call_every_kernel)
 
     def relocalize(self, observations: Sequence[Observation],
-                   recognizer: ImageRecognizer | None = None) -> Relocalization:
+                   recognizer: ImageRecognizer | None = None,
+                   grid: OccupancyGrid | None = None) -> Relocalization:
         """Find the pose of the camera at the last of one or more frames.
 
         Up to MAX_FRAMES frames of one moving camera are localized together: each frame gives
         hypotheses, which are scored and refined on all frames. The search of each frame has an
         equal share of the time budget. The recognizer searches the keyframes for the image of the
-        last frame.
+        last frame. The scan of the last frame is compared with the grid.
 
         Raises
         ------
@@ -233,8 +236,8 @@ class Relocalizer:
         budget = self.begin(len(observations))
         frames = [self.search(observation, budget.search_end(number, len(observations)))
                   for number, observation in enumerate(observations, start=1)]
-        return self.look_again(self.locate(frames, budget, recognizer=recognizer), frames,
-                               recognizer=recognizer)
+        return self.look_again(self.locate(frames, budget, recognizer=recognizer, grid=grid),
+                               frames, recognizer=recognizer, grid=grid)
 
     def begin(self, frames: int, cameras: int = 1, request: float = math.inf) -> TimeBudget:
         """Return the time budget of a relocalization with a number of frames; it starts now.
@@ -251,7 +254,8 @@ class Relocalizer:
 
     def locate(self, frames: Sequence[SearchedFrame], budget: TimeBudget | None = None,
                looks: Looks = NO_LOOKS, recognizer: ImageRecognizer | None = None,
-               cameras: CameraCheck | None = None) -> Relocalization:
+               cameras: CameraCheck | None = None, grid: OccupancyGrid | None = None
+               ) -> Relocalization:
         """Find the pose of the camera at the last of one or more searched frames.
 
         Parameters
@@ -266,6 +270,8 @@ class Relocalizer:
             Search of keyframes for the image of the last frame.
         cameras : CameraCheck, optional
             Evidence about the cameras; by default there is none.
+        grid : OccupancyGrid, optional
+            The grid of the last frame's scan.
 
         Raises
         ------
@@ -273,7 +279,10 @@ class Relocalizer:
             See relocalize.
         """
         budget = budget or self.begin(len(frames))
-        joined = join_frames(self.landmark_map, self.options, frames)
+        joined, scan = join_frames(self.landmark_map, self.options, frames), (
+            frames[-1].observation.scan)
+        if scan is not None and grid is not None:
+            joined = replace(joined, scan=ScanMatcher(scan, grid, self.landmark_map))
         met = self._meet(joined, budget)
         depth = check_depth(joined.rig, met[0].finalist) if met else None
         if depth is not None and not depth.is_passed:
@@ -292,10 +301,12 @@ class Relocalizer:
             link = weakest_link(joined, pose, compared.recognition,
                                 lambda own: self._meet(own, self.begin(len(own.frames))))
         if link.holds < self.options.min_confidence:
-            alone = self.locate(frames[-link.kept:], None, looks, recognizer, cameras)
+            alone = self.locate(frames[-link.kept:], None, looks, recognizer, cameras,
+                                grid)
             if alone.accepted:
                 return replace(alone, tried=result.tried, search_ms=budget.elapsed_ms)
-        evidence = replace(compared.evidence(covariance), linked=link.chance)
+        moved, smaller, by_scan = compared.by_scan(pose, covariance)
+        evidence = replace(compared.evidence(smaller), linked=link.chance, scan=by_scan)
         seen: list[CameraLook] = []
         if compared.by_boxes is not None and self.options.refine:
             # a wrong camera may be the cause of low confidence
@@ -304,10 +315,11 @@ class Relocalizer:
                 seen = looks_of(joined, compared.by_boxes.finalist)
             camera, covariance, fault = (cameras or CameraCheck()).judge(seen, covariance)
             evidence = replace(evidence, camera=camera, camera_fault=fault)
+            moved, smaller, _ = compared.by_scan(pose, covariance)
         refused = refusal(evidence, self.options)
         shown = compared.by_objects or compared.contenders[0]
         # the leading pose, and the best pose at each other place
-        poses = np.array([pose, *compared.poses[1:]])
+        poses = np.array([moved, *compared.poses[1:]])
         confidences = (compared.likely * evidence.found * evidence.certainty).tolist()
         confidences[0] = evidence.confidence
         hypotheses = tuple(Hypothesis(
@@ -317,13 +329,14 @@ class Relocalizer:
             result, accepted=refused is None, reason=refused.reason if refused else '',
             refusal_kind=refused.kind if refused else None,
             hypotheses=hypotheses, frame_matches=tuple(shown.matches),
-            evidence=evidence, covariance=covariance, best_iteration=shown.finalist.iteration,
+            evidence=evidence, covariance=smaller, best_iteration=shown.finalist.iteration,
             search_ms=budget.elapsed_ms, source=compared.source, depth=depth,
             cameras=tuple(seen))
 
     def look_again(self, found: Relocalization, frames: Sequence[SearchedFrame],
                    looks: Looks = NO_LOOKS, recognizer: ImageRecognizer | None = None,
-                   cameras: CameraCheck | None = None) -> Relocalization:
+                   cameras: CameraCheck | None = None, grid: OccupancyGrid | None = None
+                   ) -> Relocalization:
         """Repeat a refused result of locate with a thorough search of the keyframes.
 
         The result is returned unchanged if it was accepted, or if there is not enough time. The
@@ -332,7 +345,7 @@ class Relocalizer:
         if found.accepted or recognizer is None or not recognizer.begin_thorough():
             return found
         budget = self.begin(len(frames), request=recognizer.deadline)
-        again = self.locate(frames, budget, looks, recognizer, cameras)
+        again = self.locate(frames, budget, looks, recognizer, cameras, grid)
         assert again.recognition is not None
         kept = again if again.recognition.is_complete else found
         return replace(kept, search_ms=found.search_ms + again.search_ms)
@@ -373,7 +386,13 @@ def _call_every_kernel() -> None:
     for algorithm in ('bf', 'ransac', 'auto'):
         relocalizer = Relocalizer(landmark_map, RelocalizerOptions(k=1, algorithm=algorithm))
         relocalizer.search(frame)
-    relocalizer.relocalize([frame, replace(frame, up_in_camera=np.array([0.0, -1.0, 0.0]))])
+    cells = np.zeros((20, 20), dtype=np.int8)
+    cells[[0, -1]] = 100
+    angles = np.linspace(0.0, 6.0, 20)
+    relocalizer.relocalize([frame, replace(
+        frame, up_in_camera=np.array([0.0, -1.0, 0.0]), scan=Scan(
+            angles, np.full(20, 2.0), 9.0, np.eye(4)))],
+        grid=OccupancyGrid(cells, 0.2, np.eye(4), landmark_map.frame_id))
     points = np.indices((3, 3, 2)).reshape(3, -1).T + np.array([0.0, 0.0, 3.0])
     refine(points, points[:, :2] / points[:, 2:], np.eye(4))
 

@@ -10,6 +10,7 @@ import pytest
 from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, SEEN
 
 from cliploc_ros.core.acceptance.camera_check import CameraCheck
+from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.localizer import (
     BATCH,
@@ -20,7 +21,7 @@ from cliploc_ros.core.localizer import (
     repeat,
 )
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
-from cliploc_ros.core.observation import Detections, Observation, Region
+from cliploc_ros.core.observation import Detections, Observation, Region, Scan
 from cliploc_ros.core.options import NEVER, RelocalizerOptions
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays, read_case
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -115,12 +116,16 @@ def test_another_map_has_labels_of_its_own(tmp_path):
 def test_all_that_is_known_comes_back(tmp_path):
     region = Region('map', np.array([0.1, 0.2, 0.3]), np.diag([1.0, 2.0, 3.0]), 0.7)
     pose = make_transform(np.eye(3), np.array([0.1, 0.0, 1e-17]))
-    first = query(up_in_camera=np.array([0.0, -1.0, 0.0]), odom_from_camera=pose, odom_way_m=0.1,
-                  stamp_ns=7, region=region, base_up_in_camera=np.array([0.0, 0.0, 1.0]),
+    scan = Scan(np.linspace(0.0, 1.0, 4), np.array([1.0, 1.0 / 3.0, np.inf, np.nan]), 9.0, pose)
+    grid = OccupancyGrid(np.array([[0, 100, -1]], np.int8), 0.05, pose, 'map')
+    assert len(grid.field.poses) == 0
+    first = query(scan=scan, up_in_camera=np.array([0.0, -1.0, 0.0]), odom_from_camera=pose,
+                  odom_way_m=0.1, stamp_ns=7, region=region, base_up_in_camera=np.array([0.0, 0.0, 1.0]),
                   depths=np.where(np.arange(len(SEEN)) % 2, 1.0 / 3.0, np.nan),
                   similarities=CropSimilarities(np.eye(12, 16, dtype=np.float32)[:2], LABELS),
                   compared=np.array([3, 1]), camera_name='front')
-    first = replace(first, run=3, limit=5, length_s=2.5, by_keyframes=False, rooms=(1, 1, 0))
+    first = replace(first, run=3, limit=5, length_s=2.5, by_keyframes=False, rooms=(1, 1, 0),
+                    grid=grid)
     second = Query((Observation(CAMERA, SEEN.select(np.empty(0, np.int64))),), run=None)
     case = stored([first, second], RelocalizerOptions(height_range_m=(0.5, 2.0)),
                   tmp_path / 'case.npz')
@@ -129,6 +134,8 @@ def test_all_that_is_known_comes_back(tmp_path):
     assert (found.run, found.limit, found.length_s, found.by_keyframes, found.rooms) == (
         3, 5, 2.5, False, (1, 1, 0))
     np.testing.assert_array_equal(found.images[0], IMAGE)
+    np.testing.assert_equal(asdict(found.grid), asdict(grid))
+    assert empty.grid is None
     one, other = (asdict(replace(each, similarities=None)) for each in (
         found.newest, first.newest))
     np.testing.assert_equal(one, other)

@@ -38,6 +38,7 @@ from cliploc_ros.core.acceptance.verdict import Evidence, Rival
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import POSE_UNKNOWN, fuse, refined_covariance, shares_within
 from cliploc_ros.core.fit.finalists import Finalist, find_finalists, matches_of, meetings_of
+from cliploc_ros.core.fit.scan_match import ScanFit
 from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE
@@ -143,9 +144,13 @@ class Comparison:
 
     def _confidences(self, rows: NDArray[np.int64], odds: Sequence[float]
                      ) -> NDArray[np.float64]:
-        """Return the probabilities (r,) of the contenders of some rows, given their odds."""
+        """Return the probabilities (r,) of the contenders of some rows, given their odds.
+
+        A scan that fits one of the poses counts against the others, for the reason of the prior.
+        """
+        most = max([0.0, *(contender.by_scan for contender in self.contenders)])
         return confidences(np.array(odds), self.poses[rows], self._none, prior=np.array(
-            [self.contenders[row].prior for row in rows]))
+            [self.contenders[row].prior + self.contenders[row].by_scan - most for row in rows]))
 
     def proposed(self, seen: Recognition, met: Sequence[Contender]) -> list[Contender]:
         """Return the places that keyframes recognize, as contenders.
@@ -201,6 +206,14 @@ class Comparison:
                 np.array([contender.odds for contender in found_by_objects]))
         return (best.pose, covariance) if by_points is None else fuse(best.pose, covariance,
                                                                       *by_points)
+
+    def by_scan(self, pose: NDArray[np.float64], covariance: NDArray[np.float64]
+                ) -> tuple[NDArray[np.float64], NDArray[np.float64], ScanFit | None]:
+        """Move the leading pose (4, 4) and its covariance (6, 6) by the scan, see ScanMatcher."""
+        scan, fit = self._joined.scan, self.contenders[0].scan
+        if scan is None or fit is None or not self._joined.options.refine:
+            return pose, covariance, fit
+        return scan.moved(pose, covariance, fit)
 
     def evidence(self, covariance: NDArray[np.float64]) -> Evidence:
         """Return the evidence for the leading pose, given its covariance (6, 6)."""
@@ -352,7 +365,8 @@ class Comparison:
                                             bool(rooms[row]))
             else:  # the same lead as if the search had found the rival, see confidences
                 by_objects = (1.0 + CALIBRATION.objects.slope) * (best.odds - rival.odds)
-            leads[number] += best.prior - rival.prior + by_objects
+            leads[number] += (best.prior + best.by_scan - rival.prior - rival.by_scan
+                              + by_objects)
         chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
         return chance, place_of(landmark_map, poses[others][int(np.argmin(leads))])
 

@@ -15,6 +15,7 @@ from cliploc_ros.core.acceptance import confidence
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Finalist, Match, instants_of, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.scan_match import ScanFit, ScanMatcher
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
@@ -43,6 +44,7 @@ class Contender(NamedTuple):
     recognized: RecognizedPlace | None = None
     #: Log odds of a pose that keyframes propose, without the evidence of objects for it
     by_points: float = -math.inf
+    scan: ScanFit | None = None  #: How well the scan fits the grid there; None if it says nothing
 
     @property
     def landmarks(self) -> NDArray[np.int64]:
@@ -53,7 +55,12 @@ class Contender(NamedTuple):
     @property
     def rank(self) -> float:
         """Return the log odds by which the contenders are ranked."""
-        return self.odds + self.prior
+        return self.odds + self.prior + self.by_scan
+
+    @property
+    def by_scan(self) -> float:
+        """Return the log odds of the scan; 0 without it."""
+        return 0.0 if self.scan is None else self.scan.odds
 
 
 @dataclass(frozen=True)
@@ -65,6 +72,8 @@ class JoinedFrames:
     frames: Sequence[SearchedFrame]
     rig: Rig  #: The rig of these frames
     cameras: NDArray[np.float64]  #: (F, 4, 4): camera_from_last of each frame
+    #: The scan at the last frame and its grid; None without them
+    scan: ScanMatcher | None = None
 
     @cached_property
     def compared(self) -> list[confidence.ComparedFrame]:
@@ -92,10 +101,10 @@ class JoinedFrames:
 
     def without_depth(self) -> 'JoinedFrames':
         """Return the joined frames without their depths."""
-        return join_frames(self.landmark_map, self.options, [frame._replace(
+        return replace(join_frames(self.landmark_map, self.options, [frame._replace(
             observation=replace(frame.observation, depths=None),
             scene=frame.scene._replace(depths=np.zeros_like(frame.scene.depths)))
-            for frame in self.frames])
+            for frame in self.frames]), scan=self.scan)
 
     def contenders(self, finalists: Sequence[Finalist], upright: Sequence[bool]
                    ) -> list[Contender]:
@@ -109,9 +118,11 @@ class JoinedFrames:
         region = self.frames[-1].observation.region
         priors = np.zeros(len(poses)) if region is None else confidence.region_odds(
             self.landmark_map, region, poses)
-        return list(map(Contender, finalists, poses, matches, supports, upright,
-                        handicaps.tolist(), (confidence.utilities(supports) - handicaps).tolist(),
-                        priors.tolist()))
+        found = map(Contender, finalists, poses, matches, supports, upright, handicaps.tolist(),
+                    (confidence.utilities(supports) - handicaps).tolist(), priors.tolist())
+        scan = self.scan
+        return [*found] if scan is None else [each._replace(scan=scan.fits(each.pose))
+                                              for each in found]
 
     def supports(self, poses: NDArray[np.float64],
                  matches: Sequence[list[tuple[Match, ...]]]) -> list[confidence.Support]:

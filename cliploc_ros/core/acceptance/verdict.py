@@ -12,6 +12,7 @@ import numpy as np
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
 from cliploc_ros.core.acceptance.looks import EarlierLook
 from cliploc_ros.core.calibration import CALIBRATION
+from cliploc_ros.core.fit.scan_match import ScanFit
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 
@@ -129,6 +130,7 @@ class Evidence:
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: The place that keyframes recognize at the pose
     prior: float = 0.0  #: Log odds, at most 0, of the pose given the prior region
+    scan: ScanFit | None = None  #: How well the robot's scan fits its grid at the pose
     #: Probability that odometry links all frames, see cliploc_ros.core.acceptance.links
     linked: float = 1.0
     tilt_deg: float = 0.0  #: Tilt of the robot at the pose [deg]; 0 without a base_frame
@@ -142,9 +144,13 @@ class Evidence:
 
         A rival with as many inliers is sampled about as often as the best pose. Random draws miss
         it with probability exp(-meetings) (Fischler and Bolles 1981). This holds for ransac. For
-        auto and PROSAC, whose order is not random, it is an assumption.
+        auto and PROSAC, whose order is not random, it is an assumption. A better pose is less
+        likely where the scan fits.
         """
-        return 1.0 - CALIBRATION.search.missed_is_right * math.exp(-self.meetings)
+        missed = CALIBRATION.search.missed_is_right * math.exp(-self.meetings)
+        if self.scan is not None and self.scan.odds > 0.0:
+            missed /= missed + (1.0 - missed) * math.exp(self.scan.odds)
+        return 1.0 - missed
 
     @property
     def genuine(self) -> float:
@@ -260,6 +266,8 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
     compared = f'confidence {_rounded_down(confidence)} < {options.min_confidence:g}'
     if evidence.prior < 0.0:
         compared += '; the prior puts the robot elsewhere'
+    if evidence.scan is not None and evidence.scan.odds < 0.0:
+        compared += f'; {evidence.scan} at this pose'
     likely, rival = max(evidence.likely, evidence.by_points), evidence.rival
     found = max(evidence.likely * evidence.found, evidence.by_points) / max(likely, 1e-9)
     weakest = min(('likely', likely), *((name, getattr(evidence, name)) for name in _FACTORS),

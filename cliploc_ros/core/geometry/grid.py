@@ -3,12 +3,43 @@
 """Occupancy grids, in the conventions of nav_msgs/OccupancyGrid."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.errors import OptionsError
+
+#: Cells with at least, and with less than this value are occupied, and free [%]: the thresholds of
+#: map_server. Others are unknown.
+OCCUPIED, FREE = 65, 25
+#: Unit of GridField.gaps [m], their largest value, and their value where nothing is known.
+GAP_M, FAR, UNKNOWN = 0.005, 254, 255
+#: Deviation of the distance between the end of a beam and its wall [m], and between cells of the
+#: coarse field and this end.
+DEVIATION_M, COARSE_DEVIATION_M = 0.1, 0.25
+#: Side of a cell of the coarse field [m], unless the grid is coarser.
+COARSE_M = 0.2
+# Number of the random poses, and their least distance from occupied cells [m].
+_POSES, _CLEARANCE_M = 2000, 0.2
+# Margin of the field, so that walls at the border have a gradient on both sides [m].
+_MARGIN_M = 0.5
+
+
+class GridField(NamedTuple):
+    """The likelihood field of a grid (Thrun, Burgard and Fox 2005, ch. 6.4), and random poses."""
+
+    #: (h, w): distance of each cell from the nearest occupied cell [GAP_M]; UNKNOWN in unknown
+    #: cells that are farther than three deviations from an occupied cell
+    gaps: NDArray[np.uint8]
+    #: (H, W): likelihood that a beam ends in each cell of the coarse field, from 0 to 255
+    coarse: NDArray[np.uint8]
+    factor: int  #: Number of cells along the side of a cell of the coarse field
+    poses: NDArray[np.float64]  #: (n, 3): x, y [m] and yaw [rad] of random poses in free space
+    margin_m: float  #: The field begins with such a margin of unknown cells [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +63,43 @@ class OccupancyGrid:
     def __post_init__(self) -> None:
         """Check the numbers."""
         if self.cells.ndim != 2 or not self.cells.size or not 0.0 < self.resolution_m < np.inf:
-            raise OptionsError(f'grid: {self.cells.shape} cells of {self.resolution_m} m; '
-                               'expected rows and columns of cells, and a resolution above 0')
+            raise OptionsError(f'grid: {self.cells.shape} cells of {self.resolution_m} m; expected'
+                               ' rows and columns of cells, and a resolution above 0')
         if not is_rigid(self.frame_from_grid) or self.frame_from_grid[2, 2] < 0.999:
             raise OptionsError('grid: its origin must be a finite pose with a vertical z axis')
+
+    @cached_property
+    def field(self) -> GridField:
+        """Return the likelihood field. The first call takes time for a large grid."""
+        margin = round(_MARGIN_M / self.resolution_m) + 1
+        cells = np.pad(self.cells, margin, constant_values=-1)
+        occupied = (cells >= OCCUPIED).astype(np.uint8)
+        away = cv2.distanceTransform(1 - occupied, cv2.DIST_L2, 5)
+        unit = self.resolution_m / GAP_M
+        gaps = cv2.convertScaleAbs(np.minimum(away, FAR / unit), alpha=unit)
+        is_free = (cells >= 0) & (cells < FREE)
+        gaps[~is_free & (gaps > 3.0 * DEVIATION_M / GAP_M)] = UNKNOWN
+        factor = max(1, round(COARSE_M / self.resolution_m))
+        height, width = cells.shape
+        padded = np.pad(gaps, ((0, -height % factor), (0, -width % factor)),
+                        constant_values=UNKNOWN)
+        nearest = cv2.erode(padded, np.ones((factor, factor), np.uint8), anchor=(0, 0))[
+            ::factor, ::factor]
+        rng = np.random.default_rng(0)
+        spots = np.flatnonzero(is_free & (gaps >= _CLEARANCE_M / GAP_M))
+        if len(spots):
+            spots = rng.choice(spots, _POSES)
+        rows, columns = np.divmod(spots, width)
+        corners = self.resolution_m * np.column_stack([columns, rows])
+        return GridField(
+            gaps, likelihoods(COARSE_DEVIATION_M, 255.0).astype(np.uint8)[nearest], factor,
+            np.column_stack([corners + self.resolution_m * rng.random((len(spots), 2)),
+                             rng.uniform(-np.pi, np.pi, len(spots))]),
+            margin * self.resolution_m)
+
+
+def likelihoods(deviation_m: float, most: float = 1.0) -> NDArray[np.float64]:
+    """Return the likelihood (256,) of each value of GridField.gaps; 0 where nothing is known."""
+    found = most * np.exp(-0.5 * (GAP_M / deviation_m * np.arange(256.0)) ** 2)
+    found[UNKNOWN] = 0.0
+    return found
