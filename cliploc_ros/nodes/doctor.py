@@ -249,8 +249,7 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
                 given = [parameter for parameter in given if parameter.name != 'last_pose_file']
             # missing inputs of an active relocalizer are reported by the checks below
             report.judge('relocalizer', '; '.join(filter(None, (
-                values.get('wrong cameras'), values.get('wrong scans'),
-                values.get('rival of publish_tf'))))
+                values.get('wrong sensors'), values.get('rival of publish_tf'))))
                          if values['state'] == 'active' else status.problem(), f'{name} is active')
     except NotRunningError as error:
         return report.add('relocalizer', State.FAIL, str(error))

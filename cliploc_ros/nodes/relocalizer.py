@@ -176,15 +176,13 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                                   'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
             cameras, depth_scale = localizer.localizer.cameras, localizer.localizer.depth_scale
-            health.values |= cameras.values | {'wrong cameras': '; '.join(cameras.faults)}
+            health.values |= cameras.values | {'wrong sensors': '; '.join(filter(None, [
+                *cameras.faults, localizer.instants.scans.fault]))}
             for wrong in cameras.faults:
                 health.fail(f'{wrong}: check camera_info, and the pixels and corners of the boxes')
             if parameters.depth_transport != 'none':
                 health.values['depth scale'] = f'{depth_scale.ratio:.2f}'
-            if wrong := localizer.scans.fault:
-                health.warn(wrong)
-            health.values |= {'wrong scans': localizer.scans.fault,
-                              'map': localizer.description, 'map hash': localizer.map_hash}
+            health.values |= {'map': localizer.description, 'map hash': localizer.map_hash}
 
     def _on_relocalize(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         answer = self._answer()

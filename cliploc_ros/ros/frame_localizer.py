@@ -105,7 +105,7 @@ class FrameLocalizer:
         self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
         self.observer = observer
         self.instants = Instants(landmark_map, options.matching != 'clip')
-        self._options, self.watch, self.scans = options, Watch(relocalizer), ScanCheck()
+        self._options, self.watch = options, Watch(relocalizer)
         self.localizer = Localizer(relocalizer, None if keyframes is None else keyframes.localizer)
         relocalizer.warm_up()
 
@@ -136,7 +136,7 @@ class FrameLocalizer:
         found = self.answer(query, parameters.options(), times, deadline)
         fit, pose = found.evidence and found.evidence.scan, found.map_from_camera
         if found.accepted and fit and pose is not None:
-            self.scans.add(fit, pose @ known.state.camera_from_base)
+            self.instants.scans.add(fit, pose @ known.state.camera_from_base)
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest
         # the result of a request that is late is not published, and must not advance the filter
@@ -217,6 +217,7 @@ class Instants:
         self._detector = DetectorCheck(landmark_map, by_class)
         self._faults: dict[str, list[Fault]] = {}  # of the newest frame of each camera
         self.notes: list[str] = []  #: All warnings that are no faults, each once
+        self.scans = ScanCheck()
 
     @property
     def faults(self) -> list[Fault]:
@@ -224,7 +225,8 @@ class Instants:
         return [*(fault._replace(text=f'{name}: {fault.text}' if name else fault.text)
                   for name, faults in self._faults.copy().items() for fault in faults),
                 *(fault._replace(text=f'the detector: {fault.text}')
-                  for fault in self._detector.faults)]
+                  for fault in self._detector.faults),
+                *(Fault(text, False) for text in [self.scans.fault] if text)]
 
     def query(self, frame: Frame, parameters: RelocalizerParameters, known: KnownBefore) -> Query:
         """Return the query of an instant, without cameras whose odometry is of another run.

@@ -207,8 +207,8 @@ class RelocalizerParameters(CommonParameters):
         'cameras: seven numbers for each. All zeros: look it up in tf2.', unit='m', low=-1000.0,
         high=1000.0, repeats=True)
     scan: str = parameter('',
-        'Topic of the scans of a laser, which are compared with an occupancy grid; empty: none. '
-        'Needs base_frame.', read_only=True)
+        'Topic of the scans of a laser, which are compared with an occupancy grid; empty: none.',
+        read_only=True)
     grid: str = parameter('map', 'Topic of the occupancy grid of map_server.', read_only=True)
     grid_file: str = parameter('',
         "YAML file of map_server's grid, in the frame of the first map, read with the map; "
@@ -262,8 +262,6 @@ class RelocalizerParameters(CommonParameters):
             if any(mount) and abs(math.hypot(*mount[3:]) - 1.0) > 0.01:
                 raise OptionsError('base_from_camera or base_from_laser: the quaternion '
                                    f'{[*mount[3:]]} is not of unit length')
-        if self.scan and not self.base_frame:
-            raise OptionsError('scan: needs the parameter base_frame')
         if self.gravity == 'base_frame' and not self.base_frame:
             raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
         if self.camera_names and not self.base_frame:

@@ -272,9 +272,7 @@ class RobotStateSource:
         self.laser.open(parameters)
         remedy = 'set publish_tf: false' if parameters.publish_tf else 'set watch: amcl_pose' \
             if parameters.watch == 'tf' else 'set base_from_camera' \
-            if parameters.base_frame and not any(parameters.base_from_camera) \
-            else 'set base_from_laser' if parameters.scan and not any(
-                parameters.base_from_laser) else ''
+            if parameters.base_frame and not any(parameters.base_from_camera) else ''
         if remedy:  # in the worker, because importing tf2 takes long
             self._node.worker.run(partial(self.transforms.open, remedy=remedy))
 
