@@ -143,6 +143,12 @@ def make_world(kind: str, seed: int, groups: int = 4, has_depth: bool = False,
         _with_cameras(scene, camera, query, cameras, rng.spawn(1)[0]) for query in world.queries))
 
 
+def objects_of(kind: str, seed: int) -> tuple[Place, Objects]:
+    """Return the place and the true objects of make_world and make_drive."""
+    place, scene = _make_scene(kind, np.random.default_rng([seed, list(KINDS).index(kind)]))
+    return place, scene.objects
+
+
 @dataclass(frozen=True)
 class Drive:
     """A world, and the images of a long drive through it."""

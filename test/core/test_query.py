@@ -120,7 +120,8 @@ def test_all_that_is_known_comes_back(tmp_path):
     grid = OccupancyGrid(np.array([[0, 100, -1]], np.int8), 0.05, pose, 'map')
     assert len(grid.field.poses) == 0
     first = query(scan=scan, up_in_camera=np.array([0.0, -1.0, 0.0]), odom_from_camera=pose,
-                  odom_way_m=0.1, stamp_ns=7, region=region, base_up_in_camera=np.array([0.0, 0.0, 1.0]),
+                  odom_way_m=0.1, stamp_ns=7, region=region,
+                  base_up_in_camera=np.array([0.0, 0.0, 1.0]),
                   depths=np.where(np.arange(len(SEEN)) % 2, 1.0 / 3.0, np.nan),
                   similarities=CropSimilarities(np.eye(12, 16, dtype=np.float32)[:2], LABELS),
                   compared=np.array([3, 1]), camera_name='front')

@@ -77,6 +77,7 @@ class ScanFit(NamedTuple):
     odds: float  #: Log odds that the pose is right, by its rank
     explained: float  #: Share of the beams that end at walls, among those that should
     rank: int  #: Rank of the pose, from 1, behind all random poses that fit as well
+    better: int  #: The same behind those that fit clearly better
     of: int  #: Number of random poses
     #: x [m], y [m] and yaw [rad] by which the scan moves the laser, about the axes of the map
     step: tuple[float, float, float]
@@ -316,7 +317,7 @@ class ScanMatcher:
         against, by_rank = np.interp(np.log([better / count, rank / count]), np.log([*knots]),
                                      [*knots.values()])
         odds = known * float(max(0.0, by_rank) + min(0.0, against))
-        return ScanFit(odds, explained, rank, count, (float(x), float(y), float(turn)))
+        return ScanFit(odds, explained, rank, better, count, (float(x), float(y), float(turn)))
 
     def moved(self, pose: NDArray[np.float64], covariance: NDArray[np.float64], fit: ScanFit
               ) -> tuple[NDArray[np.float64], NDArray[np.float64], ScanFit]:
