@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 
 from cliploc_ros import messages
-from cliploc_ros.core.acceptance.scan_check import ScanCheck
+from cliploc_ros.core.acceptance.depth_check import ScanCheck
 from cliploc_ros.core.detector_check import DetectorCheck
 from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform

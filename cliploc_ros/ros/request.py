@@ -18,7 +18,6 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.geometry.transforms import move_covariance
-from cliploc_ros.core.map.grid_file import read_grid
 from cliploc_ros.errors import CliplocError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict, answer_to
@@ -82,6 +81,7 @@ class Pipeline:
         parameters = self._node.settings.snapshot()
         localizer = load_localizer(self._node, parameters, former)
         if parameters.scan and parameters.grid_file:
+            from cliploc_ros.core.map.grid_file import read_grid
             self._robot.laser.use(lambda: read_grid(path_of(parameters.grid_file),
                                                     localizer.frame_ids[0]))
         self.localizer = localizer
