@@ -25,10 +25,11 @@ from cliploc_ros.core.geometry.depth import depth_odds
 from cliploc_ros.core.geometry.transforms import SAME_BOXES
 
 _TERMS = CALIBRATION.depth
-# Of scans: least and greatest number of looks for a verdict, least step [m] and turn [rad] of a
-# fault, which is also this many standard errors, and the least share of beams that a right grid
+# Of scans: least and greatest number of looks for a verdict, least steps [m] and turn [rad] of a
+# fault, which are also this many standard errors, and the least share of beams that a right grid
 # explains. All chosen.
-_LEAST, _MOST, _STEP_M, _TURN, _ERRORS, _EXPLAINED = 5, 20, 0.1, math.radians(2.0), 3.0, 0.5
+_LEAST, _MOST, _ERRORS, _EXPLAINED = 5, 20, 3.0, 0.5
+_LEAST_STEPS = (0.1, 0.1, math.radians(2.0), 0.1, 0.1, math.inf)
 
 
 class DepthCheck(NamedTuple):
@@ -75,35 +76,30 @@ class ScanCheck:
     """
 
     def __init__(self) -> None:
-        # Each pose with the step of its laser in the axes of robot and map, and its explained
-        # share of beams: ahead, left, turn, x, y, share.
-        self._looks = deque[tuple[NDArray[np.float64], tuple[float, ...]]](maxlen=_MOST)
+        # Each pose, and the step of its laser ahead, left, in yaw, x and y, and its explained
+        # share of beams.
+        self._looks = deque[tuple[NDArray[np.float64], list[float]]](maxlen=_MOST)
 
     def add(self, fit: ScanFit, map_from_base: NDArray[np.float64]) -> None:
         """Add the scan of an accepted pose (4, 4), unless it is that of the look before."""
-        (x, y, turn), ((cos, _), (sin, _)) = fit.step, map_from_base[:2, :2]
         if not self._looks or not SAME_BOXES.agree(self._looks[-1][0], map_from_base):
-            self._looks.append((map_from_base, (
-                cos * x + sin * y, cos * y - sin * x, turn, x, y, fit.explained)))
+            x, y, turn = fit.step
+            ahead, left = map_from_base[:2, :2].T @ (x, y)
+            self._looks.append((map_from_base, [ahead, left, turn, x, y, fit.explained]))
 
     @property
     def fault(self) -> str:
         """Return what is wrong with laser or grid, and the remedy; empty without evidence."""
-        if len(self._looks) < _LEAST:
+        numbers = np.array([look for _, look in self._looks] or [[0.0] * 6])
+        ahead, left, turn, x, y, share = means = numbers.mean(axis=0)
+        errors = _ERRORS * numbers.std(axis=0) / math.sqrt(len(numbers))
+        is_alike = (np.abs(means) > np.maximum(errors, _LEAST_STEPS)).any()
+        if len(numbers) < _LEAST or (share >= _EXPLAINED and not is_alike):
             return ''
-        numbers = np.array([look for _, look in self._looks])
-        ahead, left, turn, x, y, share = numbers.mean(axis=0)
-        is_alike = np.abs(numbers.mean(axis=0)) > np.maximum(
-            _ERRORS * numbers.std(axis=0) / math.sqrt(len(numbers)),
-            [_STEP_M, _STEP_M, _TURN, _STEP_M, _STEP_M, np.inf])
-        if share >= _EXPLAINED and not is_alike.any():
-            return ''
-        wrong = 'the mount of the laser, or the origin of the grid' if share >= _EXPLAINED else \
-            'the grid (place, mirror, resolution, origin), or the mount of the laser'
         return (f'scans of {len(numbers)} accepted poses have {share:.2f} of beams explained, and '
-                f'move the laser by {ahead:+.2f} m ahead, {left:+.2f} m left and '
-                f'{math.degrees(turn):+.1f} degrees, by {x:+.2f} and {y:+.2f} m in the map: '
-                f'correct {wrong}')
+                f'move the laser by {ahead:+.2f} m ahead, {left:+.2f} m left, '
+                f'{math.degrees(turn):+.1f} degrees, in the map by {x:+.2f}, {y:+.2f} m: correct '
+                f'its mount, or the grid{"" if share >= _EXPLAINED else ": place, resolution"}')
 
 
 def check_depth(rig: Rig, pose: Finalist) -> DepthCheck | None:

@@ -240,13 +240,11 @@ class LaserSource:
 
     def open(self, parameters: RelocalizerParameters) -> None:
         """Subscribe to the topics that the parameters name."""
-        if parameters.scan:
-            self._subscriptions = [qos.AdaptiveSubscription(
-                self._node, LaserScan, parameters.scan, self.take, qos.SCAN)]
-        if parameters.scan and not parameters.grid_file:
-            self._subscriptions.append(qos.AdaptiveSubscription(
-                self._node, OccupancyGridMsg, parameters.grid,
-                lambda msg: self.use(lambda: grid_from_msg(msg)), qos.LATCHED))
+        topics = [(LaserScan, parameters.scan, self.take, qos.SCAN),
+                  (OccupancyGridMsg, '' if parameters.grid_file else parameters.grid,
+                   lambda msg: self.use(lambda: grid_from_msg(msg)), qos.LATCHED)]
+        self._subscriptions = [qos.AdaptiveSubscription(self._node, *topic) for topic in topics
+                               if parameters.scan and topic[1]]
 
     def close(self) -> None:
         """Unsubscribe, and forget the scans."""
@@ -261,11 +259,10 @@ class LaserSource:
     def take(self, msg: LaserScan) -> None:
         """Keep a scan, unless it follows another one closely."""
         msg.intensities, self._heard_at = [], time.monotonic()
-        later_ns = stamp_ns(msg.header.stamp) - (
-            stamp_ns(self._scans[-1].header.stamp) if self._scans else 0)
-        if later_ns < 0:  # time jumped back
+        early_ns = _between_ns(self._scans[-1], msg.header) if self._scans else -_LEAST_STEP_NS
+        if early_ns > 0:  # time jumped back
             self._scans.clear()
-        if not 0 <= later_ns < _LEAST_STEP_NS:
+        if not -_LEAST_STEP_NS < early_ns <= 0:
             self._scans.append(msg)
 
     def use(self, read: Callable[[], OccupancyGrid]) -> None:
@@ -283,25 +280,28 @@ class LaserSource:
         if not parameters.scan or not (is_silent or (self._grid is None and not self._fault)):
             return self._fault
         name, kind = ('scan', LaserScan) if is_silent else ('grid', OccupancyGridMsg)
-        topic = qos.resolved(self._node, getattr(parameters, name))
-        return qos.why_silent(self._node, name, topic, kind)
+        return qos.why_silent(self._node, name, qos.resolved(
+            self._node, getattr(parameters, name)), kind)
 
-    def near(self, stamp: Time, parameters: RelocalizerParameters, frame_ids: Sequence[str]
+    def near(self, image: Header, parameters: RelocalizerParameters, frame_ids: Sequence[str]
              ) -> tuple[LaserScan, OccupancyGrid]:
         """Return the scan that is nearest to an image, and the grid of a map with these frames.
 
         OptionsError: there is none, or the grid is of no map.
         """
-        def away_ns(scan: LaserScan) -> int:
-            return abs(stamp_ns(scan.header.stamp) - stamp_ns(stamp))
-        grid, scan = self._grid, min(tuple(self._scans), key=away_ns, default=None)
-        if scan is None or grid is None or away_ns(scan) > _LATEST_NS:
+        grid, scan = self._grid, min(tuple(self._scans), default=None,
+                                     key=lambda scan: abs(_between_ns(scan, image)))
+        if scan is None or grid is None or abs(_between_ns(scan, image)) > _LATEST_NS:
             raise OptionsError(self.problem(parameters) or 'no scan within '
                                f'{_LATEST_NS / NS_PER_S} s of the image: stamp both by one clock')
         if grid.frame_id not in frame_ids:
             raise OptionsError(f"the grid is in frame '{grid.frame_id}', the map in "
                                f"'{', '.join(frame_ids)}': correct the frame_id of one of them")
         return scan, grid
+
+
+def _between_ns(scan: LaserScan, other: Header) -> int:
+    return stamp_ns(scan.header.stamp) - stamp_ns(other.stamp)
 
 
 @dataclass(frozen=True)
@@ -462,14 +462,13 @@ class RobotStateSource:
               frame_ids: Sequence[str]) -> tuple[Scan | None, OccupancyGrid | None, str]:
         """Return the scan as it is seen from the image, and its grid, or why it is unknown."""
         try:
-            msg, grid = self.laser.near(image.stamp, parameters, frame_ids)
-            at, mount = msg.header, np.array(parameters.base_from_laser)
-            camera_from_laser = mount_of(at.frame_id) if not mount.any() else mount_of(
+            msg, grid = self.laser.near(image, parameters, frame_ids)
+            mount = np.array(parameters.base_from_laser)
+            camera_from_laser = mount_of(msg.header.frame_id) if not mount.any() else mount_of(
                 parameters.base_frame) @ transform_from_pose(mount[:3], mount[3:])
             # without odometry, the robot is assumed to be at rest for a moment
-            is_soon = abs(stamp_ns(at.stamp) - stamp_ns(image.stamp)) <= _UNLINKED_NS
-            with suppress(*[NoOdometryError] * is_soon):
-                motion, body = self.odometry.motion(image.stamp, at.stamp, _PATIENCE_S)
+            with suppress(*[NoOdometryError] * (abs(_between_ns(msg, image)) <= _UNLINKED_NS)):
+                motion, body = self.odometry.motion(image.stamp, msg.header.stamp, _PATIENCE_S)
                 camera_from_laser = mount_of(body) @ motion @ invert_transform(
                     mount_of(body)) @ camera_from_laser
             found = Scan(*scan_from_msg(msg), camera_from_laser)
