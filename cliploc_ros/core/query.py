@@ -6,11 +6,13 @@ A case is a recorded request: its queries, oldest first, and a report of its ans
 with the same map and options that answers these queries in order reproduces the answer bit by bit.
 """
 
+import base64
 import json
 import math
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -92,16 +94,12 @@ CASE = Schema('case', {
     'image_offsets': Field('integers', ('f',), (Offsets('images', 'bytes'),)),
     'crops': Field('float32', ('c', 'd')),  # embeddings or similarities
     'crop_offsets': Field('integers', ('g',), (Offsets('crops', 'crops'),)),
-    'grids': Field('uint8', ('z',), is_optional=True),  # PNG of each grid, with unknown as 255
-    'grid_offsets': Field('integers', ('h',), is_optional=True),
 }, DatasetError, 'store the request again with ~/record', {'f': 'images', 'g': 'frames'})
 
 
 def case_arrays(case: Case) -> Arrays:
     """Convert a case to the arrays of its file, see CASE."""
     images, crops = list[NDArray[np.uint8]](), list[NDArray[np.float32]]()
-    grids = [*dict.fromkeys(query.grid for query in case.queries if query.grid is not None)]
-    cells = [cv2.imencode('.png', grid.cells.view(np.uint8))[1].ravel() for grid in grids]
     for query in case.queries:
         images += [cv2.imencode('.png', cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].ravel()
                    for image in query.images]
@@ -114,22 +112,37 @@ def case_arrays(case: Case) -> Arrays:
            ('run', 'limit', 'length_s', 'by_keyframes', 'is_thorough', 'rooms')},
         'cameras': None if query.cameras is None else query.cameras.fields(),
         'has_images': bool(query.images),
-        'grid': None if query.grid is None else grids.index(query.grid),
+        'grid': None if query.grid is None else _packed(query.grid),
         'frames': [asdict(replace(frame, similarities=None)) | {'crops': (
             '' if frame.similarities is None else 'embeddings' if isinstance(
                 frame.similarities, CropSimilarities) else 'similarities')}
-            for frame in query.frames]} for query in case.queries],
-        'grids': [vars(grid) | {'cells': grid.cells.shape, 'field': None} for grid in grids]}
+            for frame in query.frames]} for query in case.queries]}
     return {
         # NumPy arrays and scalars become lists and numbers
         'about': np.frombuffer(json.dumps(about, default=lambda value: value.tolist()).encode(),
                                dtype=np.uint8),
         'image_offsets': np.cumsum([0, *map(len, images)]),
         'images': np.concatenate([np.empty(0, np.uint8), *images]),
-        'grid_offsets': np.cumsum([0, *map(len, cells)]),
-        'grids': np.concatenate([np.empty(0, np.uint8), *cells]),
         'crop_offsets': np.cumsum([0, *map(len, crops)]),
         'crops': np.concatenate(crops) if crops else np.empty((0, 0), np.float32)}
+
+
+@lru_cache(maxsize=1)
+def _packed(grid: OccupancyGrid) -> str:
+    """Return a grid as JSON, with its cells as a PNG."""
+    png = cv2.imencode('.png', grid.cells.view(np.uint8))[1]
+    return json.dumps([base64.b64encode(png).decode(), *grid.cells.shape, grid.resolution_m,
+                       grid.frame_from_grid.tolist(), grid.frame_id])
+
+
+@lru_cache(maxsize=1)
+def _unpacked(text: str) -> OccupancyGrid:
+    """Return the grid of _packed: one for all queries of a case; any error: it is damaged."""
+    packed, height, width, resolution_m, pose, frame_id = parse_json(text)
+    _expect(height * width <= _MOST_CELLS and isinstance(frame_id, str), 'grid')
+    png = np.frombuffer(base64.b64decode(packed), np.uint8)
+    return OccupancyGrid(_decoded(png, width, height, cv2.IMREAD_GRAYSCALE).view(np.int8),
+                         float(resolution_m), _numbers(pose, 4, 4), frame_id)
 
 
 def read_case(path: Path) -> Case:
@@ -142,11 +155,7 @@ def read_case(path: Path) -> Case:
     try:
         about = parse_json(arrays['about'].tobytes())
         images, crops = _parts(arrays, 'image'), _parts(arrays, 'crop')
-        grids = [_grid_of(fields, png) for fields, png in zip(
-            about.get('grids', ()), _parts(arrays, 'grid'), strict=True)] \
-            if 'grids' in arrays else []
-        first, *others = (replace(_query_of(fields, images, crops), grid=None if fields.get(
-            'grid') is None else grids[_count(fields['grid'])]) for fields in about['queries'])
+        first, *others = (_query_of(fields, images, crops) for fields in about['queries'])
         _expect(not [*images, *crops], 'the numbers of images and crops')
         report = dict(about['report'])
         _expect(isinstance(report.get('parameters', {}), dict), 'parameters')
@@ -164,23 +173,16 @@ def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
               crops: Iterator[NDArray[np.float32]]) -> Query:
     """Return the query of JSON fields; any Python error means that they are damaged."""
     frames = tuple(_frame_of(fields, crops) for fields in about['frames'])
-    decoded = tuple(_decoded(next(images), frame.camera)
-                    for frame in frames if about['has_images'])
+    decoded = tuple(cv2.cvtColor(_decoded(
+        next(images), frame.camera.width, frame.camera.height, cv2.IMREAD_COLOR),
+        cv2.COLOR_BGR2RGB) for frame in frames if about['has_images'])
     run, rooms, cameras = about['run'], tuple(map(_count, about['rooms'])), about['cameras']
     _expect(bool(frames) and (not rooms or frames[-1].compared is not None), 'frames')
     return Query(frames, decoded, None if run is None else _count(run),
                  1 + _count(about['limit'] - 1), float(_numbers(about['length_s'])),
                  bool(about['by_keyframes']), bool(about.get('is_thorough')),
-                 None if cameras is None else CameraCheck.of_fields(cameras), rooms)
-
-
-def _grid_of(about: Mapping[str, Any], cells_png: NDArray[np.uint8]) -> OccupancyGrid:
-    """Return the grid of JSON fields; any Python error means that they are damaged."""
-    height, width = map(_count, about['cells'])
-    _expect(height * width <= _MOST_CELLS and isinstance(about['frame_id'], str), 'grid')
-    return OccupancyGrid(_unpacked(cells_png, width, height, cv2.IMREAD_GRAYSCALE).view(np.int8),
-                         float(about['resolution_m']), _numbers(about['frame_from_grid'], 4, 4),
-                         about['frame_id'])
+                 None if cameras is None else CameraCheck.of_fields(cameras), rooms,
+                 _unpacked(about['grid']) if about.get('grid') else None)
 
 
 def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) -> Observation:
@@ -219,22 +221,15 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
             ('base_up_in_camera', (3,))))
     scan = known.get('scan')
     if scan is not None:
-        ranges = np.array(scan['ranges'], dtype=np.float64)
-        scan = Scan(_numbers(scan['angles'], len(ranges)), ranges, float(scan['most_m']),
-                    _numbers(scan['camera_from_laser'], 4, 4))
+        scan = Scan(_numbers(scan['angles'], None), np.array(scan['ranges'], np.float64),
+                    float(scan['most_m']), _numbers(scan['camera_from_laser'], 4, 4))
     return Observation(
         Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
         similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,
         float(_numbers(known['odom_way_m'])), compared, depths, region, base_up, scan)
 
 
-def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """Decode a PNG image to RGB (h, w, 3); ValueError: its size is not that of its camera."""
-    return np.asarray(cv2.cvtColor(_unpacked(
-        image_png, camera.width, camera.height, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
-
-
-def _unpacked(image_png: NDArray[np.uint8], width: int, height: int, mode: int) -> Any:
+def _decoded(image_png: NDArray[np.uint8], width: int, height: int, mode: int) -> Any:
     """Decode a PNG image; ValueError: its size is another one."""
     # a small file may declare a huge size, for which decoding would allocate memory
     _expect(image_png[16:24].tobytes() == struct.pack('>II', width, height), 'image')

@@ -386,13 +386,10 @@ def _call_every_kernel() -> None:
     for algorithm in ('bf', 'ransac', 'auto'):
         relocalizer = Relocalizer(landmark_map, RelocalizerOptions(k=1, algorithm=algorithm))
         relocalizer.search(frame)
-    cells = np.zeros((20, 20), dtype=np.int8)
-    cells[[0, -1]] = 100
-    angles = np.linspace(0.0, 6.0, 20)
     relocalizer.relocalize([frame, replace(
         frame, up_in_camera=np.array([0.0, -1.0, 0.0]), scan=Scan(
-            angles, np.full(20, 2.0), 9.0, np.eye(4)))],
-        grid=OccupancyGrid(cells, 0.2, np.eye(4), landmark_map.frame_id))
+            np.arange(20.0), np.ones(20), 9.0, np.eye(4)))],
+        grid=OccupancyGrid(np.eye(20, dtype=np.int8) * 100, 0.2, np.eye(4), 'map'))
     points = np.indices((3, 3, 2)).reshape(3, -1).T + np.array([0.0, 0.0, 3.0])
     refine(points, points[:, :2] / points[:, 2:], np.eye(4))
 

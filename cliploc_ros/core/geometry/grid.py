@@ -35,11 +35,13 @@ class GridField(NamedTuple):
     #: (h, w): distance of each cell from the nearest occupied cell [GAP_M]; UNKNOWN in unknown
     #: cells that are farther than three deviations from an occupied cell
     gaps: NDArray[np.uint8]
-    #: (H, W): likelihood that a beam ends in each cell of the coarse field, from 0 to 255
+    side_m: float  #: Side of a cell [m]
+    table: NDArray[np.float64]  #: (256,): likelihood that a beam ends at each value of gaps
+    #: (H, W): likelihood that a beam ends in each cell of a coarse field, from 0 to 255
     coarse: NDArray[np.uint8]
-    factor: int  #: Number of cells along the side of a cell of the coarse field
-    poses: NDArray[np.float64]  #: (n, 3): x, y [m] and yaw [rad] of random poses in free space
+    coarse_m: float  #: Side of its cells [m]
     margin_m: float  #: The field begins with such a margin of unknown cells [m]
+    poses: NDArray[np.float64]  #: (n, 3): x, y [m] and yaw [rad] of random poses in free space
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,35 +73,27 @@ class OccupancyGrid:
     @cached_property
     def field(self) -> GridField:
         """Return the likelihood field. The first call takes time for a large grid."""
-        margin = round(_MARGIN_M / self.resolution_m) + 1
+        side_m, margin = self.resolution_m, round(_MARGIN_M / self.resolution_m) + 1
         cells = np.pad(self.cells, margin, constant_values=-1)
-        occupied = (cells >= OCCUPIED).astype(np.uint8)
-        away = cv2.distanceTransform(1 - occupied, cv2.DIST_L2, 5)
-        unit = self.resolution_m / GAP_M
-        gaps = cv2.convertScaleAbs(np.minimum(away, FAR / unit), alpha=unit)
+        away = cv2.distanceTransform((cells < OCCUPIED).astype(np.uint8), cv2.DIST_L2, 5)
+        gaps = cv2.convertScaleAbs(np.minimum(away, FAR * GAP_M / side_m), alpha=side_m / GAP_M)
         is_free = (cells >= 0) & (cells < FREE)
         gaps[~is_free & (gaps > 3.0 * DEVIATION_M / GAP_M)] = UNKNOWN
-        factor = max(1, round(COARSE_M / self.resolution_m))
-        height, width = cells.shape
-        padded = np.pad(gaps, ((0, -height % factor), (0, -width % factor)),
-                        constant_values=UNKNOWN)
-        nearest = cv2.erode(padded, np.ones((factor, factor), np.uint8), anchor=(0, 0))[
-            ::factor, ::factor]
+        factor = max(1, round(COARSE_M / side_m))
+        nearest = cv2.erode(np.pad(gaps, (0, factor), constant_values=UNKNOWN), np.ones(
+            (factor, factor), np.uint8), anchor=(0, 0))[:-factor:factor, :-factor:factor]
         rng = np.random.default_rng(0)
-        spots = np.flatnonzero(is_free & (gaps >= _CLEARANCE_M / GAP_M))
+        spots = np.argwhere(is_free & (gaps >= _CLEARANCE_M / GAP_M))
         if len(spots):
             spots = rng.choice(spots, _POSES)
-        rows, columns = np.divmod(spots, width)
-        corners = self.resolution_m * np.column_stack([columns, rows])
-        return GridField(
-            gaps, likelihoods(COARSE_DEVIATION_M, 255.0).astype(np.uint8)[nearest], factor,
-            np.column_stack([corners + self.resolution_m * rng.random((len(spots), 2)),
-                             rng.uniform(-np.pi, np.pi, len(spots))]),
-            margin * self.resolution_m)
+        poses = side_m * np.column_stack([spots[:, ::-1] + rng.random(spots.shape),
+                                          rng.uniform(-np.pi, np.pi, len(spots)) / side_m])
+        return GridField(gaps, side_m, _likelihoods(DEVIATION_M), (255.0 * _likelihoods(
+            COARSE_DEVIATION_M)).astype(np.uint8)[nearest], factor * side_m, margin * side_m, poses)
 
 
-def likelihoods(deviation_m: float, most: float = 1.0) -> NDArray[np.float64]:
+def _likelihoods(deviation_m: float) -> NDArray[np.float64]:
     """Return the likelihood (256,) of each value of GridField.gaps; 0 where nothing is known."""
-    found = most * np.exp(-0.5 * (GAP_M / deviation_m * np.arange(256.0)) ** 2)
+    found = np.exp(-0.5 * (GAP_M / deviation_m * np.arange(256.0)) ** 2)
     found[UNKNOWN] = 0.0
     return found
