@@ -83,7 +83,8 @@ def laser(own_relocalizer, tester, tmp_path):
 
     def begin(**parameters):
         return own_relocalizer(map_file=tmp_path / 'level.yaml', scan='scan', base_frame='base',
-                               algorithm='auto', time_budget_ms=5000.0, **MOUNTS, **parameters)
+                               algorithm='auto', time_budget_ms=300.0,
+                               timeout_s=60.0, **MOUNTS, **parameters)
     client = tester.create_client(SelfTest, 'relocalizer/relocalize_fields')
     yield begin, ask
     tester.destroy_client(client)
