@@ -45,6 +45,8 @@ SIDE_M, HEIGHT_M, MOST_M, NOISE_M = 0.05, 0.25, 10.0, 0.02
 # of worlds with glass, its length [m], and mean number of people.
 _WALL_M, _MOVED, _GLASS, _GLASS_M, _PEOPLE = 0.5, 0.15, 0.3, (1.0, 2.5), 1.5
 _MOST_RADIUS_M = 0.4
+# Poses nearer to the truth may be moved to it by the scan [m].
+_FAR_M = 2.0
 
 
 class Floor(NamedTuple):
@@ -209,15 +211,17 @@ FAULTS: dict[str, Callable[..., tuple[LandmarkMap, Sequence[PosedQuery]]]] = {
         found, wrong_mount(queries, 10.0))}
 
 
-def answers(kind: str, seed: int, mode: str, fovs: Sequence[float]) -> Iterator[dict[str, Any]]:
-    """Yield the answers to the queries of a world, in all families, without and with a scan."""
+def answers(kind: str, seed: int, mode: str, fovs: Sequence[float], families: Sequence[str]
+            ) -> Iterator[dict[str, Any]]:
+    """Yield the answers to the queries of a world, in some families, without and with a scan."""
     world = Simulated(kind, seed).load()
     place, objects = objects_of(kind, seed)
     rng = np.random.default_rng([seed, 57])
     mapped = floor_of(place, objects, kind)
     other = grid_of(floor_of(*objects_of(kind, seed + 1000), kind))
     options = world.options(mode, RelocalizerOptions())
-    for fault, change in FAULTS.items():
+    for fault in [name for name in families if name in FAULTS]:
+        change = FAULTS[fault]
         found, queries = change(world.landmark_map, world.ask(mode, seed), 0.0,
                                 np.random.default_rng(seed))
         relocalizer = Relocalizer(found, replace(options, k=min(options.k, len(found))))
@@ -237,8 +241,8 @@ def answers(kind: str, seed: int, mode: str, fovs: Sequence[float]) -> Iterator[
                 if scan is not None and grid is not None:
                     matcher = ScanMatcher(scan, grid, found)
                     poses = [hypothesis.map_from_camera for hypothesis in plain.hypotheses]
-                    fits = [(fit.better, fit.rank, bool(
-                        pose_error(pose, truth)[0] < RIGHT_M) and not wrong)
+                    fits = [(fit.better, fit.rank, 99.0 if wrong else pose_error(pose, truth)[0],
+                             fit.explained)
                         for pose in poses if (fit := matcher.fits(pose))]
                 error = np.inf if result.map_from_camera is None or wrong else pose_error(
                     result.map_from_camera, truth)[0]
@@ -257,9 +261,9 @@ def answers(kind: str, seed: int, mode: str, fovs: Sequence[float]) -> Iterator[
                 yield answer(fault, fov, scan, grid)
                 if fault != 'nothing wrong' or fov != fovs[0]:
                     continue
-                for family, draw in SCANS.items():
+                for family, draw in SCANS.items() if 'scans' in families else ():
                     yield answer(family, fov, draw(seen, truth, rng), grid)
-                for family, make in GRIDS.items():
+                for family, make in GRIDS.items() if 'scans' in families else ():
                     yield answer(family, fov, scan, make(seen))
 
 
@@ -291,19 +295,17 @@ def fit(rows: Sequence[dict[str, Any]], wrong_scans: float = 0.05) -> None:
     """Print the log odds of each range of ranks: how often right and wrong poses have them."""
     edges = np.array([0, 1, 4, 20, 100, 249, np.inf])
     every = [(*found, row['family']) for row in rows for found in row['fits']]
+    good, bad, wrong = ([found for found in every if is_chosen(found)] for is_chosen in (
+        lambda found: found[2] < RIGHT_M and found[4] not in (*SCANS, *GRIDS),
+        lambda found: found[2] < RIGHT_M and found[4] in SCANS,
+        lambda found: found[2] > _FAR_M and found[4] not in (*SCANS, *GRIDS)))
     for column, name in enumerate(('better', 'rank')):
-        def shares(chosen: Sequence[Any], column: int = column) -> tuple[Floats, int]:
-            counts = np.histogram([found[column] for found in chosen], edges + 0.5)[0]
-            return (counts + 0.5) / (counts.sum() + 3.0), int(counts.sum())
-        good, many = shares([found for found in every
-                             if found[2] and found[3] not in (*SCANS, *GRIDS)])
-        bad, few = shares([found for found in every if found[2] and found[3] in SCANS])
-        wrong, most = shares([found for found in every if not found[2]
-                              and found[3] not in (*SCANS, *GRIDS)])
-        odds = np.log(((1.0 - wrong_scans) * good + wrong_scans * bad) / wrong)
-        print(f'{name}: up to {edges[1:]}; {many} right, {few} right with a wrong scan, {most} '
-              f'wrong poses\n  right {good.round(3)}\n  wrong {wrong.round(3)}\n  with a wrong '
-              f'scan {bad.round(3)}\n  log odds {odds.round(2)}')
+        counts = np.array([np.histogram([found[column] for found in chosen], edges + 0.5)[0]
+                           for chosen in (good, bad, wrong)])
+        right, late, chance = (counts + 0.5) / (counts.sum(axis=1, keepdims=True) + 3.0)
+        odds = np.log(((1.0 - wrong_scans) * right + wrong_scans * late) / chance)
+        print(f'{name}: up to {edges[1:]}; right poses, with a wrong scan, wrong poses:\n{counts}\n'
+              f'{np.array([right, late, chance]).round(3)}\n  log odds {odds.round(2)}')
 
 
 def main() -> None:
@@ -317,6 +319,7 @@ def main() -> None:
     parser.add_argument('--first', type=int, default=0)
     parser.add_argument('--mode', default=VERTICAL)
     parser.add_argument('--fov', type=float, nargs='+', default=[270.0, 60.0])
+    parser.add_argument('--families', nargs='+', default=[*FAULTS, 'scans'])
     parser.add_argument('--terms', type=json.loads, default={})
     options = parser.parse_args()
     CALIBRATION.scan.update(options.terms)
@@ -324,7 +327,7 @@ def main() -> None:
         with options.answers.open('a') as file:
             for seed in range(options.first, options.first + options.worlds):
                 for kind in options.kinds:
-                    for row in answers(kind, seed, options.mode, options.fov):
+                    for row in answers(kind, seed, options.mode, options.fov, options.families):
                         file.write(json.dumps(row) + '\n')
                     file.flush()
     rows = [json.loads(line) for line in options.answers.read_text().splitlines()]

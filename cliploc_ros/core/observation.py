@@ -118,12 +118,10 @@ class Scan:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if self.angles.ndim != 1 or self.angles.shape != self.ranges.shape:
-            raise OptionsError(f'scan: {self.angles.shape} angles and {self.ranges.shape} ranges; '
-                               'expected one angle for each range')
-        if not 0.0 < self.most_m < np.inf or not is_rigid(self.camera_from_laser):
-            raise OptionsError(f'scan: its greatest range {self.most_m} m must be above 0, and '
-                               'the pose of the laser finite')
+        if self.angles.shape != self.ranges.shape or not 0.0 < self.most_m < np.inf or (
+                not is_rigid(self.camera_from_laser)):
+            raise OptionsError('scan: it needs an angle for each range, a greatest range above 0, '
+                               'and the finite pose of its laser')
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,6 @@ def case_arrays(case: Case) -> Arrays:
         'crops': np.concatenate(crops) if crops else np.empty((0, 0), np.float32)}
 
 
-@lru_cache(maxsize=1)
 def _packed(grid: OccupancyGrid) -> str:
     """Return a grid as JSON, with its cells as a PNG."""
     png = cv2.imencode('.png', grid.cells.view(np.uint8))[1]
@@ -139,10 +138,11 @@ def _packed(grid: OccupancyGrid) -> str:
 def _unpacked(text: str) -> OccupancyGrid:
     """Return the grid of _packed: one for all queries of a case; any error: it is damaged."""
     packed, height, width, resolution_m, pose, frame_id = parse_json(text)
-    _expect(height * width <= _MOST_CELLS and isinstance(frame_id, str), 'grid')
-    png = np.frombuffer(base64.b64decode(packed), np.uint8)
-    return OccupancyGrid(_decoded(png, width, height, cv2.IMREAD_GRAYSCALE).view(np.int8),
-                         float(resolution_m), _numbers(pose, 4, 4), frame_id)
+    png = base64.b64decode(packed)
+    _expect(height * width <= _MOST_CELLS and png[16:24] == struct.pack('>II', width, height)
+            and isinstance(frame_id, str), 'grid')
+    cells = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE).view(np.int8)
+    return OccupancyGrid(cells, float(resolution_m), _numbers(pose, 4, 4), frame_id)
 
 
 def read_case(path: Path) -> Case:
@@ -173,9 +173,8 @@ def _query_of(about: Mapping[str, Any], images: Iterator[NDArray[np.uint8]],
               crops: Iterator[NDArray[np.float32]]) -> Query:
     """Return the query of JSON fields; any Python error means that they are damaged."""
     frames = tuple(_frame_of(fields, crops) for fields in about['frames'])
-    decoded = tuple(cv2.cvtColor(_decoded(
-        next(images), frame.camera.width, frame.camera.height, cv2.IMREAD_COLOR),
-        cv2.COLOR_BGR2RGB) for frame in frames if about['has_images'])
+    decoded = tuple(_decoded(next(images), frame.camera)
+                    for frame in frames if about['has_images'])
     run, rooms, cameras = about['run'], tuple(map(_count, about['rooms'])), about['cameras']
     _expect(bool(frames) and (not rooms or frames[-1].compared is not None), 'frames')
     return Query(frames, decoded, None if run is None else _count(run),
@@ -229,11 +228,12 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
         float(_numbers(known['odom_way_m'])), compared, depths, region, base_up, scan)
 
 
-def _decoded(image_png: NDArray[np.uint8], width: int, height: int, mode: int) -> Any:
-    """Decode a PNG image; ValueError: its size is another one."""
+def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """Decode a PNG image to RGB (h, w, 3); ValueError: its size is not that of its camera."""
     # a small file may declare a huge size, for which decoding would allocate memory
-    _expect(image_png[16:24].tobytes() == struct.pack('>II', width, height), 'image')
-    return cv2.imdecode(image_png, mode)
+    _expect(image_png[16:24].tobytes() == struct.pack('>II', camera.width, camera.height), 'image')
+    image = cv2.imdecode(image_png, cv2.IMREAD_COLOR)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def _numbers(value: Any, *shape: int | None, nan: bool = False) -> NDArray[np.float64]:

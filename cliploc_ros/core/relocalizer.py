@@ -21,7 +21,6 @@ from cliploc_ros.core.acceptance.looks import NO_LOOKS, Looks
 from cliploc_ros.core.acceptance.verdict import Evidence, RefusalKind, refusal
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Match, find_with_rivals
-from cliploc_ros.core.fit.scan_match import ScanMatcher
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.ellipsoid import ellipse_bboxes, project_ellipsoids
 from cliploc_ros.core.geometry.grid import OccupancyGrid
@@ -279,10 +278,7 @@ class Relocalizer:
             See relocalize.
         """
         budget = budget or self.begin(len(frames))
-        joined, scan = join_frames(self.landmark_map, self.options, frames), (
-            frames[-1].observation.scan)
-        if scan is not None and grid is not None:
-            joined = replace(joined, scan=ScanMatcher(scan, grid, self.landmark_map))
+        joined = join_frames(self.landmark_map, self.options, frames, grid)
         met = self._meet(joined, budget)
         depth = check_depth(joined.rig, met[0].finalist) if met else None
         if depth is not None and not depth.is_passed:

@@ -60,7 +60,7 @@ def test_distances_of_a_small_grid():
     assert field.margin_m == pytest.approx(11 * SIDE_M)
     assert field.gaps[12, 11:24].tolist() == [10 * number for number in range(13)]
     assert (field.gaps[12, 24:] == UNKNOWN).all() and (field.gaps[11, 6:17] < UNKNOWN).all()
-    assert field.coarse.shape == (7, 11) and field.coarse[3, 2] == 255
+    assert field.coarse.shape == (7, 11) and field.coarse[3, 2] == 0
     assert len(field.poses) == 2000 and (field.poses[:, 0] >= 15 * SIDE_M).all()
     assert (OccupancyGrid(np.zeros((9, 9), np.int8), 1.0, np.eye(4), 'map').field.gaps[
         2:-2, 2:-2] == FAR).all()

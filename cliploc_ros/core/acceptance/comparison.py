@@ -211,9 +211,7 @@ class Comparison:
                 ) -> tuple[NDArray[np.float64], NDArray[np.float64], ScanFit | None]:
         """Move the leading pose (4, 4) and its covariance (6, 6) by the scan, see ScanMatcher."""
         scan, fit = self._joined.scan, self.contenders[0].scan
-        if scan is None or fit is None or not self._joined.options.refine:
-            return pose, covariance, fit
-        return scan.moved(pose, covariance, fit)
+        return scan.moved(pose, covariance, fit) if scan and fit else (pose, covariance, None)
 
     def evidence(self, covariance: NDArray[np.float64]) -> Evidence:
         """Return the evidence for the leading pose, given its covariance (6, 6)."""

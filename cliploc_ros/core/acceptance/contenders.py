@@ -17,6 +17,7 @@ from cliploc_ros.core.fit.finalists import Finalist, Match, instants_of, matches
 from cliploc_ros.core.fit.refinement import refine_rig
 from cliploc_ros.core.fit.scan_match import ScanFit, ScanMatcher
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig
+from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -40,11 +41,11 @@ class Contender(NamedTuple):
     odds: float
     #: Log odds, at most 0, of the pose given the prior region; they are never sharpened
     prior: float = 0.0
+    scan: ScanFit | None = None  #: How well the scan fits the grid there; None if it says nothing
     #: The place that keyframes recognize, if they propose the pose
     recognized: RecognizedPlace | None = None
     #: Log odds of a pose that keyframes propose, without the evidence of objects for it
     by_points: float = -math.inf
-    scan: ScanFit | None = None  #: How well the scan fits the grid there; None if it says nothing
 
     @property
     def landmarks(self) -> NDArray[np.int64]:
@@ -118,11 +119,10 @@ class JoinedFrames:
         region = self.frames[-1].observation.region
         priors = np.zeros(len(poses)) if region is None else confidence.region_odds(
             self.landmark_map, region, poses)
-        found = map(Contender, finalists, poses, matches, supports, upright, handicaps.tolist(),
-                    (confidence.utilities(supports) - handicaps).tolist(), priors.tolist())
-        scan = self.scan
-        return [*found] if scan is None else [each._replace(scan=scan.fits(each.pose))
-                                              for each in found]
+        scans = [self.scan and self.scan.fits(pose) for pose in poses]
+        return list(map(Contender, finalists, poses, matches, supports, upright,
+                        handicaps.tolist(), (confidence.utilities(supports) - handicaps).tolist(),
+                        priors.tolist(), scans))
 
     def supports(self, poses: NDArray[np.float64],
                  matches: Sequence[list[tuple[Match, ...]]]) -> list[confidence.Support]:
@@ -139,8 +139,9 @@ class JoinedFrames:
 
 
 def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
-                frames: Sequence[SearchedFrame]) -> JoinedFrames:
-    """Join searched frames, the last of which is to be localized.
+                frames: Sequence[SearchedFrame], grid: OccupancyGrid | None = None
+                ) -> JoinedFrames:
+    """Join searched frames, the last of which is to be localized, and the grid of its scan.
 
     Raises
     ------
@@ -150,7 +151,9 @@ def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
     cameras = cameras_from_last([frame.observation for frame in frames])
     rig = make_rig([frame.scene for frame in frames], cameras,
                    np.stack([frame.vertical for frame in frames]), landmark_map.position_sigmas)
-    return JoinedFrames(landmark_map, options, frames, rig, cameras)
+    scan = frames[-1].observation.scan
+    return JoinedFrames(landmark_map, options, frames, rig, cameras,
+                        scan and grid and ScanMatcher(scan, grid, landmark_map))
 
 
 def unrefined(map_from_camera: NDArray[np.float64]) -> Finalist:

@@ -18,11 +18,12 @@ from cliploc_ros.errors import OptionsError
 OCCUPIED, FREE = 65, 25
 #: Unit of GridField.gaps [m], their largest value, and their value where nothing is known.
 GAP_M, FAR, UNKNOWN = 0.005, 254, 255
-#: Deviation of the distance between the end of a beam and its wall [m], and between cells of the
-#: coarse field and this end.
-DEVIATION_M, COARSE_DEVIATION_M = 0.1, 0.25
-#: Side of a cell of the coarse field [m], unless the grid is coarser.
-COARSE_M = 0.2
+#: Deviation of the distance between the end of a beam and its wall [m], and the likelihood (256,)
+#: that a beam ends at each value of GridField.gaps.
+DEVIATION_M = 0.1
+LIKELIHOODS = np.exp(-0.5 * (GAP_M / DEVIATION_M * np.arange(256.0)) ** 2)
+# This deviation in the coarse field, and the side of its cells unless the grid is coarser [m].
+_COARSE_DEVIATION_M, _COARSE_M = 0.25, 0.2
 # Number of the random poses, and their least distance from occupied cells [m].
 _POSES, _CLEARANCE_M = 2000, 0.2
 # Margin of the field, so that walls at the border have a gradient on both sides [m].
@@ -36,10 +37,9 @@ class GridField(NamedTuple):
     #: cells that are farther than three deviations from an occupied cell
     gaps: NDArray[np.uint8]
     side_m: float  #: Side of a cell [m]
-    table: NDArray[np.float64]  #: (256,): likelihood that a beam ends at each value of gaps
-    #: (H, W): likelihood that a beam ends in each cell of a coarse field, from 0 to 255
+    #: The least distances in larger cells, in a unit that is larger, for a larger deviation
     coarse: NDArray[np.uint8]
-    coarse_m: float  #: Side of its cells [m]
+    coarse_m: float
     margin_m: float  #: The field begins with such a margin of unknown cells [m]
     poses: NDArray[np.float64]  #: (n, 3): x, y [m] and yaw [rad] of random poses in free space
 
@@ -64,11 +64,10 @@ class OccupancyGrid:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        if self.cells.ndim != 2 or not self.cells.size or not 0.0 < self.resolution_m < np.inf:
-            raise OptionsError(f'grid: {self.cells.shape} cells of {self.resolution_m} m; expected'
-                               ' rows and columns of cells, and a resolution above 0')
-        if not is_rigid(self.frame_from_grid) or self.frame_from_grid[2, 2] < 0.999:
-            raise OptionsError('grid: its origin must be a finite pose with a vertical z axis')
+        if self.cells.ndim != 2 or not self.cells.size or not 0.0 < self.resolution_m < np.inf or (
+                not is_rigid(self.frame_from_grid) or self.frame_from_grid[2, 2] < 0.999):
+            raise OptionsError('grid: it needs cells, a resolution above 0, and an origin that is '
+                               'a finite pose with a vertical z axis')
 
     @cached_property
     def field(self) -> GridField:
@@ -79,21 +78,14 @@ class OccupancyGrid:
         gaps = cv2.convertScaleAbs(np.minimum(away, FAR * GAP_M / side_m), alpha=side_m / GAP_M)
         is_free = (cells >= 0) & (cells < FREE)
         gaps[~is_free & (gaps > 3.0 * DEVIATION_M / GAP_M)] = UNKNOWN
-        factor = max(1, round(COARSE_M / side_m))
+        factor = max(1, round(_COARSE_M / side_m))
         nearest = cv2.erode(np.pad(gaps, (0, factor), constant_values=UNKNOWN), np.ones(
             (factor, factor), np.uint8), anchor=(0, 0))[:-factor:factor, :-factor:factor]
         rng = np.random.default_rng(0)
         spots = np.argwhere(is_free & (gaps >= _CLEARANCE_M / GAP_M))
-        if len(spots):
-            spots = rng.choice(spots, _POSES)
+        spots = rng.choice(spots, _POSES if len(spots) else 0)
         poses = side_m * np.column_stack([spots[:, ::-1] + rng.random(spots.shape),
                                           rng.uniform(-np.pi, np.pi, len(spots)) / side_m])
-        return GridField(gaps, side_m, _likelihoods(DEVIATION_M), (255.0 * _likelihoods(
-            COARSE_DEVIATION_M)).astype(np.uint8)[nearest], factor * side_m, margin * side_m, poses)
+        coarse = (DEVIATION_M / _COARSE_DEVIATION_M * nearest).astype(np.uint8)
+        return GridField(gaps, side_m, coarse, factor * side_m, margin * side_m, poses)
 
-
-def _likelihoods(deviation_m: float) -> NDArray[np.float64]:
-    """Return the likelihood (256,) of each value of GridField.gaps; 0 where nothing is known."""
-    found = np.exp(-0.5 * (GAP_M / deviation_m * np.arange(256.0)) ** 2)
-    found[UNKNOWN] = 0.0
-    return found
