@@ -124,8 +124,7 @@ def scan_from_msg(msg: Any) -> tuple[NDArray[np.float64], NDArray[np.float64], f
     short. OptionsError: a field is invalid; the message has all of them.
     """
     ranges, step = np.array(msg.ranges, dtype=np.float64), float(msg.angle_increment)
-    ranges[~(ranges >= msg.range_min)] = np.nan
-    ranges[ranges >= msg.range_max] = np.inf
+    ranges[~(ranges >= msg.range_min)], ranges[ranges >= msg.range_max] = np.nan, np.inf
     valid, turn = np.isfinite(ranges).sum(), (len(ranges) - 1) * step
     if not (valid and len(ranges) <= _MOST_BEAMS and 0.0 < abs(turn) < _FULL_TURN
             and abs(msg.angle_max - msg.angle_min - turn) <= _ODD_BEAMS * abs(step)

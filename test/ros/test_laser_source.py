@@ -84,7 +84,8 @@ def test_an_invalid_scan_is_left_out_and_named(robot, fields, named):
 
 
 @pytest.mark.parametrize(('fields', 'named'), [
-    ({'resolution': 0.0}, '0.0 m'), ({'resolution': np.nan}, 'nan m'), ({'width': 4}, '4 x 2'),
+    ({'resolution': 0.0}, 'resolution'), ({'resolution': np.nan}, 'resolution'),
+    ({'width': 4}, '4 x 2'),
     ({'w': 0.0}, 'quaternion'), ({'frame_id': 'floor_2'}, "in frame 'floor_2', the map in 'map'")])
 def test_an_invalid_grid_replaces_a_valid_one_and_is_named(robot, fields, named):
     robot.laser.take(scan_of())
@@ -95,9 +96,9 @@ def test_an_invalid_grid_replaces_a_valid_one_and_is_named(robot, fields, named)
 
 
 def test_a_fast_laser_fills_no_memory_and_a_jump_back_forgets_its_scans(robot):
-    for number in range(1600):
+    for number in range(500):
         robot.laser.take(scan_of(50.0 + 0.025 * number, intensities=[1.0] * 31))
-    oldest, *others = robot.laser._scans
-    assert (oldest.header.stamp, len(others)) == (stamp(80.0), 199) and not oldest.intensities
+    oldest, *others = robot.laser.scans
+    assert (oldest.header.stamp, len(others)) == (stamp(52.5), 399) and not oldest.intensities
     robot.laser.take(scan_of(60.0))
-    assert len(robot.laser._scans) == 1
+    assert len(robot.laser.scans) == 1

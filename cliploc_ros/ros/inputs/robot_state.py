@@ -62,8 +62,8 @@ _PATIENCE_S = 0.2
 # Greatest time between image and scan if odometry does not cover it: a laser at 5 Hz has a scan
 # within this time. Not measured.
 _UNLINKED_NS = NS_PER_S // 10
-# Scans of 10 s are kept, for boxes of a slow detector; those of a fast laser are thinned out.
-_MOST_SCANS, _LEAST_STEP_NS = 200, NS_PER_S // 20
+# Number of scans of a fast laser in ten seconds: boxes of a slow detector arrive late.
+_MOST_SCANS = 400
 # Greatest time between image and scan. Not measured.
 _LATEST_NS = NS_PER_S // 2
 # Returns the pose (4, 4) of a coordinate frame of the robot in the camera at an image.
@@ -233,7 +233,9 @@ class LaserSource:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._subscriptions = list[qos.AdaptiveSubscription]()
-        self._scans, self._heard_at = deque[LaserScan](maxlen=_MOST_SCANS), -math.inf
+        #: The last scans, oldest first
+        self.scans = deque[LaserScan](maxlen=_MOST_SCANS)
+        self._heard_at = -math.inf
         # The current grid, or why it is invalid.
         self._grid: OccupancyGrid | None = None
         self._fault = ''
@@ -250,20 +252,14 @@ class LaserSource:
         """Unsubscribe, and forget the scans."""
         while self._subscriptions:
             self._subscriptions.pop().destroy()
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget all scans: time jumped."""
-        self._scans.clear()
+        self.scans.clear()
 
     def take(self, msg: LaserScan) -> None:
-        """Keep a scan, unless it follows another one closely."""
+        """Keep a scan."""
         msg.intensities, self._heard_at = [], time.monotonic()
-        early_ns = _between_ns(self._scans[-1], msg.header) if self._scans else -_LEAST_STEP_NS
-        if early_ns > 0:  # time jumped back
-            self._scans.clear()
-        if not -_LEAST_STEP_NS < early_ns <= 0:
-            self._scans.append(msg)
+        if self.scans and _between_ns(self.scans[-1], msg.header) > 0:  # time jumped back
+            self.scans.clear()
+        self.scans.append(msg)
 
     def use(self, read: Callable[[], OccupancyGrid]) -> None:
         """Replace the grid; an invalid grid replaces it, too, because the former is outdated."""
@@ -289,7 +285,7 @@ class LaserSource:
 
         OptionsError: there is none, or the grid is of no map.
         """
-        grid, scan = self._grid, min(tuple(self._scans), default=None,
+        grid, scan = self._grid, min(tuple(self.scans), default=None,
                                      key=lambda scan: abs(_between_ns(scan, image)))
         if scan is None or grid is None or abs(_between_ns(scan, image)) > _LATEST_NS:
             raise OptionsError(self.problem(parameters) or 'no scan within '
@@ -370,7 +366,7 @@ class RobotStateSource:
         self.transforms.forget()
         self.vertical.forget()
         self.odometry.forget()
-        self.laser.forget()
+        self.laser.scans.clear()
 
     def examine(self, health: Health) -> None:
         """Report invalid messages of odometry and the IMU, and why the laser is not used."""
