@@ -205,8 +205,10 @@ class ScanMatcher:
         others = random[(np.hypot(*offsets[:, :2].T) >= _SAME_M) | (apart >= _SAME), 3]
         better, rank = (1 + int((others > found[3] + margin).sum())
                         for margin in (_ALIKE, -_ALIKE))
-        against, by_rank = np.interp(np.log([better, rank]), np.log(_RANKS), [*_TERMS.values()])
-        odds = found[5] * (max(0.0, by_rank) + min(0.0, against))
+        against, by_rank = np.interp(np.log([better, rank]), np.log(_RANKS), [
+            _TERMS[f'rank_{knot}'] for knot in _RANKS])
+        odds = found[5] * (min(0.0, against) + max(0.0, by_rank) * np.interp(
+            found[4], (_TERMS.explained, _TERMS.well_explained), (0.0, 1.0)))
         return ScanFit(float(odds), float(found[4]), rank, better, len(self._grid.field.poses),
                        tuple((self._turn @ (found[:3] - start)).tolist()))
 
