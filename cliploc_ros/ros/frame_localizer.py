@@ -12,6 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from rclpy.node import Node
 from cliploc_ros import messages
 from cliploc_ros.core.acceptance.depth_check import ScanCheck
 from cliploc_ros.core.detector_check import DetectorCheck
+from cliploc_ros.core.fit.scan_match import prepare
 from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.kernels.compiled import KernelCache
@@ -133,6 +135,8 @@ class FrameLocalizer:
         # a frame without a deadline is one of a stream: no thorough search, the next one follows
         query = replace(self.instants.query(frame, parameters, known),
                         is_thorough=not math.isinf(deadline))
+        if (scan := query.newest.scan) is not None and query.grid is not None:
+            Thread(target=prepare, args=(scan, query.grid), daemon=True).start()
         found = self.answer(query, parameters.options(), times, deadline)
         fit, pose = found.evidence and found.evidence.scan, found.map_from_camera
         if found.accepted and fit and pose is not None:
