@@ -206,13 +206,11 @@ class RelocalizerParameters(CommonParameters):
         'Mount of the camera on base_frame: x, y, z [m] and quaternion x, y, z, w. Several '
         'cameras: seven numbers for each. All zeros: look it up in tf2.', unit='m', low=-1000.0,
         high=1000.0, repeats=True)
-    scan: str = parameter('',
-        'Topic of the scans of a laser, which are compared with an occupancy grid; empty: none.',
-        read_only=True)
+    scan: str = parameter('', "Topic of a laser's scans, which are compared with a grid; empty: "
+        'none.', read_only=True)
     grid: str = parameter('map', 'Topic of the occupancy grid of map_server.', read_only=True)
-    grid_file: str = parameter('',
-        "YAML file of map_server's grid, in the frame of the first map, read with the map; "
-        'empty: use the topic grid.')
+    grid_file: str = parameter('', "YAML file of map_server's grid, in the frame of the first "
+        'map, read with the map; empty: use the topic grid.')
     base_from_laser: list[float] = parameter([0.0] * 7,
         'Mount of the laser, as base_from_camera.', unit='m', low=-1000.0, high=1000.0)
     max_speed_m_s: float = parameter(0.1,
