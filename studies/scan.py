@@ -241,7 +241,7 @@ def answers(kind: str, seed: int, mode: str, fovs: Sequence[float], families: Se
                 if scan is not None and grid is not None:
                     matcher = ScanMatcher(scan, grid, found)
                     poses = [hypothesis.map_from_camera for hypothesis in plain.hypotheses]
-                    fits = [(fit.better, fit.rank, 99.0 if wrong else pose_error(pose, truth)[0],
+                    fits = [(fit.rank, fit.rank, 99.0 if wrong else pose_error(pose, truth)[0],
                              fit.explained)
                         for pose in poses if (fit := matcher.fits(pose))]
                 error = np.inf if result.map_from_camera is None or wrong else pose_error(

@@ -120,8 +120,7 @@ class Scan:
         """Check the numbers."""
         if self.angles.shape != self.ranges.shape or not 0.0 < self.most_m < np.inf or (
                 not is_rigid(self.camera_from_laser)):
-            raise OptionsError('scan: it needs an angle for each range, a greatest range above 0, '
-                               'and the finite pose of its laser')
+            raise OptionsError('scan: angles, ranges, greatest range or pose are invalid')
 
 
 @dataclass(frozen=True)

@@ -130,17 +130,16 @@ def case_arrays(case: Case) -> Arrays:
 def _packed(grid: OccupancyGrid) -> str:
     """Return a grid as JSON, with its cells as a PNG."""
     png = cv2.imencode('.png', grid.cells.view(np.uint8))[1]
-    return json.dumps([base64.b64encode(png).decode(), *grid.cells.shape, grid.resolution_m,
+    return json.dumps([base64.b64encode(png).decode(), grid.resolution_m,
                        grid.frame_from_grid.tolist(), grid.frame_id])
 
 
 @lru_cache(maxsize=1)
 def _unpacked(text: str) -> OccupancyGrid:
     """Return the grid of _packed: one for all queries of a case; any error: it is damaged."""
-    packed, height, width, resolution_m, pose, frame_id = parse_json(text)
+    packed, resolution_m, pose, frame_id = parse_json(text)
     png = base64.b64decode(packed)
-    _expect(height * width <= _MOST_CELLS and png[16:24] == struct.pack('>II', width, height)
-            and isinstance(frame_id, str), 'grid')
+    _expect(math.prod(struct.unpack('>II', png[16:24])) <= _MOST_CELLS, 'grid')
     cells = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE).view(np.int8)
     return OccupancyGrid(cells, float(resolution_m), _numbers(pose, 4, 4), frame_id)
 
@@ -218,10 +217,9 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
         known[name], *shape, nan=name == 'depths') for name, shape in (
             ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,)),
             ('base_up_in_camera', (3,))))
-    scan = known.get('scan')
-    if scan is not None:
-        scan = Scan(_numbers(scan['angles'], None), np.array(scan['ranges'], np.float64),
-                    float(scan['most_m']), _numbers(scan['camera_from_laser'], 4, 4))
+    scan = known.get('scan') and Scan(**{
+        name: np.array(value, np.float64) if isinstance(value, list) else float(value)
+        for name, value in known['scan'].items()})
     return Observation(
         Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
         similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,

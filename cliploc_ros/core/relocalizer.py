@@ -297,8 +297,7 @@ class Relocalizer:
             link = weakest_link(joined, pose, compared.recognition,
                                 lambda own: self._meet(own, self.begin(len(own.frames))))
         if link.holds < self.options.min_confidence:
-            alone = self.locate(frames[-link.kept:], None, looks, recognizer, cameras,
-                                grid)
+            alone = self.locate(frames[-link.kept:], None, looks, recognizer, cameras, grid)
             if alone.accepted:
                 return replace(alone, tried=result.tried, search_ms=budget.elapsed_ms)
         moved, smaller, by_scan = compared.by_scan(pose, covariance)
@@ -382,10 +381,9 @@ def _call_every_kernel() -> None:
     for algorithm in ('bf', 'ransac', 'auto'):
         relocalizer = Relocalizer(landmark_map, RelocalizerOptions(k=1, algorithm=algorithm))
         relocalizer.search(frame)
-    relocalizer.relocalize([frame, replace(
-        frame, up_in_camera=np.array([0.0, -1.0, 0.0]), scan=Scan(
-            np.arange(20.0), np.ones(20), 9.0, np.eye(4)))],
-        grid=OccupancyGrid(np.eye(20, dtype=np.int8) * 100, 0.2, np.eye(4), 'map'))
+    relocalizer.relocalize([frame, replace(frame, up_in_camera=-np.eye(3)[1], scan=Scan(
+        np.arange(20.0), np.ones(20), 9.0, np.eye(4)))], grid=OccupancyGrid(
+        100 * np.eye(20, dtype=np.int8), 0.2, np.eye(4), 'map'))
     points = np.indices((3, 3, 2)).reshape(3, -1).T + np.array([0.0, 0.0, 3.0])
     refine(points, points[:, :2] / points[:, 2:], np.eye(4))
 

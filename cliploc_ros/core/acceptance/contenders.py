@@ -152,8 +152,8 @@ def join_frames(landmark_map: LandmarkMap, options: RelocalizerOptions,
     rig = make_rig([frame.scene for frame in frames], cameras,
                    np.stack([frame.vertical for frame in frames]), landmark_map.position_sigmas)
     scan = frames[-1].observation.scan
-    return JoinedFrames(landmark_map, options, frames, rig, cameras,
-                        scan and grid and ScanMatcher(scan, grid, landmark_map))
+    return JoinedFrames(landmark_map, options, frames, rig, cameras, ScanMatcher(
+        scan, grid, landmark_map) if scan and grid else None)
 
 
 def unrefined(map_from_camera: NDArray[np.float64]) -> Finalist:

@@ -24,8 +24,7 @@ from scipy.optimize import least_squares
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import moved_pose
 from cliploc_ros.core.geometry import grid as grids
-from cliploc_ros.core.geometry.grid import GridField, OccupancyGrid
-from cliploc_ros.core.geometry.transforms import invert_transform, move_covariance
+from cliploc_ros.core.geometry.transforms import move_covariance
 from cliploc_ros.core.kernels.compiled import compiled
 from cliploc_ros.core.map.joined_map import place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -37,21 +36,20 @@ _TERMS = CALIBRATION.scan
 _BEAMS, _LEAST_BEAMS, _EVERY = 90, 10, 2
 # Windows: cells and steps of the yaw each way, and the step in the coarse and in the fine field
 # [rad]. Penalty of a step, in likelihood of a beam, against moves that the scan does not observe.
-_CELLS, _TURNS, _COARSE, _FINE, _STEP_COST = 2, 3, math.radians(3.0), math.radians(0.7), 0.002
+_CELLS, _SIDE, _TURNS, _COARSE, _FINE, _STEP_COST = 2, 5, 3, 0.05, 0.0125, 0.002
 # Number of the random poses that are moved in the fine field. Ranks with log odds in
 # calibration.yaml; the logarithm of the rank is interpolated.
 _REFINED, _RANKS = 250, (1, 4, 20, 100, 250)
-# Random poses nearer than this to a pose [m] [rad] are at the same place. Scores that differ by
-# less are equal: poses along a corridor are no evidence for or against each other.
-_SAME_M, _SAME, _ALIKE = 0.5, math.radians(12.0), 0.05
+# Random poses nearer than this to a pose [m] and in its direction are at the same place. Scores
+# that differ by less are equal: poses along a corridor are no evidence against each other.
+_SAME_M, _SAME_COSINE, _ALIKE = 0.5, 0.978, 0.05
 # A beam passes through a wall if it ends farther behind it than this [m]. Score of a beam that
 # does, and of one without an echo that does not.
 _BEHIND_M, _THROUGH, _FREE = 0.3, -0.4, 0.5
 # A beam is explained within two deviations. A scan with fewer explained beams moves no pose.
-_EXPLAINED, _LEAST_EXPLAINED = math.exp(-2.0), 0.5
-# A score is drawn to this value as if by a share of further beams, because nothing is known of
+# A score is drawn to a usual value as if by a share of further beams, because nothing is known of
 # beams that end in unknown cells.
-_USUAL, _USUAL_SHARE = 0.3, 0.15
+_EXPLAINED, _LEAST_EXPLAINED, _USUAL, _USUAL_SHARE = math.exp(-2.0), 0.5, 0.3, 0.15
 # Weight of 1 minus the mean likelihood of the beams: with all beams on one wall, the deviation
 # is 4 cm.
 _WEIGHT = 2.0 * (grids.DEVIATION_M / 0.04) ** 2
@@ -65,9 +63,7 @@ class ScanFit(NamedTuple):
 
     odds: float  #: Log odds that the pose is right, by its rank
     explained: float  #: Share of the known beams that end at walls, or rightly have no echo
-    rank: int  #: Rank of the pose, from 1, behind all random poses that fit as well
-    better: int  #: The same behind those that fit clearly better
-    of: int  #: Number of random poses
+    rank: int  #: Rank of the pose, from 1, behind all of 2,000 random poses that fit as well
     #: x [m], y [m] and yaw [rad] by which the scan moves the laser, about the axes of the map
     step: tuple[float, ...]
     moved_m: float = 0.0  #: Distance by which the camera was moved [m]
@@ -75,7 +71,7 @@ class ScanFit(NamedTuple):
     def __str__(self) -> str:
         """Return the fit in words."""
         return (f'scan {self.explained:.2f} of beams explained, rank {self.rank:,} of '
-                f'{self.of:,}, moved {self.moved_m:.2f} m')
+                f'2,000, moved {self.moved_m:.2f} m')
 
 
 @compiled
@@ -91,10 +87,8 @@ def correlate(poses, beams, gaps, side_m, step):
     step : float
         Step of the yaw [rad].
     """
-    found, side = np.empty((len(poses), 4)), 2 * _CELLS + 1
-    sums = np.empty((side, side))
+    found, sums = np.full((len(poses), 4), -np.inf), np.empty((_SIDE, _SIDE))
     for row in range(len(poses)):
-        found[row, 3] = -np.inf
         for turn in range(-_TURNS, _TURNS + 1):
             yaw = poses[row, 2] + turn * step
             cos, sin = math.cos(yaw) / side_m, math.sin(yaw) / side_m
@@ -103,13 +97,13 @@ def correlate(poses, beams, gaps, side_m, step):
             for beam in range(0, len(beams), _EVERY):
                 column = math.floor(x + cos * beams[beam, 0] - sin * beams[beam, 1])
                 line = math.floor(y + sin * beams[beam, 0] + cos * beams[beam, 1])
-                if (beams[beam, 2] and 0 <= column <= gaps.shape[1] - side
-                        and 0 <= line <= gaps.shape[0] - side):
-                    for i in range(side):
-                        for j in range(side):
+                if (beams[beam, 2] and 0 <= column <= gaps.shape[1] - _SIDE
+                        and 0 <= line <= gaps.shape[0] - _SIDE):
+                    for i in range(_SIDE):
+                        for j in range(_SIDE):
                             sums[i, j] += _LIKELIHOODS[gaps[line + i, column + j]]
-            for i in range(side):
-                for j in range(side):
+            for i in range(_SIDE):
+                for j in range(_SIDE):
                     value = sums[i, j] - _STEP_COST * len(beams) / _EVERY * (
                         (i - _CELLS) ** 2 + (j - _CELLS) ** 2 + turn ** 2)
                     if value > found[row, 3]:
@@ -150,7 +144,7 @@ def score(pose, beams, gaps, side_m):
     return (total + more * _USUAL) / (known + more), explained / max(1, known), known / count
 
 
-def _placed(poses: NDArray[np.float64], beams: NDArray[np.float64], field: GridField
+def _placed(poses: NDArray[np.float64], beams: NDArray[np.float64], field: grids.GridField
             ) -> NDArray[np.float64]:
     """Return poses (n, 3) where a scan fits best, with their scores: the best of them (m, 6)."""
     near = correlate(poses, beams, field.coarse, field.coarse_m, _COARSE)
@@ -163,7 +157,7 @@ def _placed(poses: NDArray[np.float64], beams: NDArray[np.float64], field: GridF
 
 
 @lru_cache(maxsize=2)
-def _random(scan: Scan, grid: OccupancyGrid, is_flipped: bool) -> NDArray[np.float64]:
+def _random(scan: Scan, grid: grids.OccupancyGrid, is_flipped: bool) -> NDArray[np.float64]:
     """Return the best of the random poses of a grid, see _placed."""
     return _placed(grid.field.poses, _beams(scan, is_flipped), grid.field)
 
@@ -192,7 +186,7 @@ class ScanMatcher:
         maps than its own.
     """
 
-    def __init__(self, scan: Scan, grid: OccupancyGrid, landmark_map: LandmarkMap) -> None:
+    def __init__(self, scan: Scan, grid: grids.OccupancyGrid, landmark_map: LandmarkMap) -> None:
         self._scan, self._grid, self._map = scan, grid, landmark_map
         self._turn = np.eye(3)  # rotates x, y and yaw from the grid to its coordinate frame
         self._turn[:2, :2] = grid.frame_from_grid[:2, :2]
@@ -206,15 +200,15 @@ class ScanMatcher:
         random, found = _random(self._scan, self._grid, is_flipped), _placed(
             start[None], beams, self._grid.field)[0]
         offsets = random[:, :3] - found[:3]
-        apart = np.abs((offsets[:, 2] + math.pi) % (2.0 * math.pi) - math.pi)
-        others = random[(np.hypot(*offsets[:, :2].T) >= _SAME_M) | (apart >= _SAME), 3]
-        better, rank = (1 + int((others > found[3] + margin).sum())
-                        for margin in (_ALIKE, -_ALIKE))
+        others = random[(np.hypot(*offsets[:, :2].T) >= _SAME_M)
+                        | (np.cos(offsets[:, 2]) <= _SAME_COSINE), 3]
+        # behind the poses that fit clearly better, and behind all that fit as well
+        better, rank = (others > found[3] + [[_ALIKE], [-_ALIKE]]).sum(axis=1) + 1
         against, by_rank = np.interp(np.log([better, rank]), np.log(_RANKS), [
             _TERMS[f'rank_{knot}'] for knot in _RANKS])
         odds = found[5] * (min(0.0, against) + max(0.0, by_rank) * np.interp(
             found[4], (_TERMS.explained, _TERMS.well_explained), (0.0, 1.0)))
-        return ScanFit(float(odds), float(found[4]), rank, better, len(self._grid.field.poses),
+        return ScanFit(float(odds), float(found[4]), int(rank),
                        tuple((self._turn @ (found[:3] - start)).tolist()))
 
     def moved(self, pose: NDArray[np.float64], covariance: NDArray[np.float64], fit: ScanFit
@@ -242,8 +236,7 @@ class ScanMatcher:
             return np.append(np.sqrt(weight * (1.0 - np.exp(-0.5 * gaps ** 2))),
                              root @ (its - start))
         best = least_squares(errors, start + turn.T @ fit.step, diff_step=1e-4, max_nfev=12)
-        rows = turn @ best.jac[:len(hits)].T
-        seen[_PLANAR] = rows @ rows.T
+        seen[_PLANAR] = (rows := turn @ best.jac[:len(hits)].T) @ rows.T
         smaller = np.linalg.inv(np.linalg.inv(of_laser) + seen)
         x, y, yaw = (turn @ (best.x - start)).tolist()
         shifted = moved_pose(pose, np.array([x, y, 0.0, 0.0, 0.0, yaw]))  # about the camera
@@ -259,14 +252,13 @@ class ScanMatcher:
         a standing robot is level, so the tilt of the pose is ignored.
         """
         its, grid = place_of(self._map, pose), self._grid
-        laser = (invert_transform(grid.frame_from_grid) @ its.map_from_camera
-                 @ self._scan.camera_from_laser)
-        is_flipped = bool(laser[2, 2] < 0.0)
-        beams = _beams(self._scan, is_flipped)
+        its_laser = its.map_from_camera @ self._scan.camera_from_laser
+        laser = np.linalg.solve(grid.frame_from_grid, its_laser)
+        beams = _beams(self._scan, is_flipped := bool(laser[2, 2] < 0.0))
         if (its.part.landmark_map.frame_id != grid.frame_id or not len(grid.field.poses)
                 or beams[:, 2].sum() < _LEAST_BEAMS):
             return None
-        spot = laser[:2, 3] + grid.field.margin_m
-        return np.array([*spot, math.atan2(laser[1, 0], laser[0, 0])]), beams, is_flipped
+        return np.append(laser[:2, 3] + grid.field.margin_m, math.atan2(
+            laser[1, 0], laser[0, 0])), beams, is_flipped
 
 

@@ -17,17 +17,15 @@ from cliploc_ros.errors import OptionsError
 #: map_server. Others are unknown.
 OCCUPIED, FREE = 65, 25
 #: Unit of GridField.gaps [m], their largest value, and their value where nothing is known.
-GAP_M, FAR, UNKNOWN = 0.005, 254, 255
 #: Deviation of the distance between the end of a beam and its wall [m], and the likelihood (256,)
-#: that a beam ends at each value of GridField.gaps.
-DEVIATION_M = 0.1
+#: that a beam ends at each value of gaps.
+GAP_M, FAR, UNKNOWN, DEVIATION_M = 0.005, 254, 255, 0.1
 LIKELIHOODS = np.exp(-0.5 * (GAP_M / DEVIATION_M * np.arange(256.0)) ** 2)
 # This deviation in the coarse field, and the side of its cells unless the grid is coarser [m].
 _COARSE_DEVIATION_M, _COARSE_M = 0.25, 0.2
-# Number of the random poses, and their least distance from occupied cells [m].
-_POSES, _CLEARANCE_M = 2000, 0.2
-# Margin of the field, so that walls at the border have a gradient on both sides [m].
-_MARGIN_M = 0.5
+# Number of the random poses, and their least distance from occupied cells [m]. Margin of the
+# field, so that walls at the border have a gradient on both sides [m].
+_POSES, _CLEARANCE_M, _MARGIN_M = 2000, 0.2, 0.5
 
 
 class GridField(NamedTuple):
@@ -66,8 +64,7 @@ class OccupancyGrid:
         """Check the numbers."""
         if self.cells.ndim != 2 or not self.cells.size or not 0.0 < self.resolution_m < np.inf or (
                 not is_rigid(self.frame_from_grid) or self.frame_from_grid[2, 2] < 0.999):
-            raise OptionsError('grid: it needs cells, a resolution above 0, and an origin that is '
-                               'a finite pose with a vertical z axis')
+            raise OptionsError('grid: cells, resolution or origin (with z up) are invalid')
 
     @cached_property
     def field(self) -> GridField:
@@ -79,13 +76,12 @@ class OccupancyGrid:
         is_free = (cells >= 0) & (cells < FREE)
         gaps[~is_free & (gaps > 3.0 * DEVIATION_M / GAP_M)] = UNKNOWN
         factor = max(1, round(_COARSE_M / side_m))
-        nearest = cv2.erode(np.pad(gaps, (0, factor), constant_values=UNKNOWN), np.ones(
-            (factor, factor), np.uint8), anchor=(0, 0))[:-factor:factor, :-factor:factor]
+        coarse = DEVIATION_M / _COARSE_DEVIATION_M * cv2.erode(gaps, np.ones(
+            (factor, factor), np.uint8), anchor=(0, 0))[::factor, ::factor]
         rng = np.random.default_rng(0)
         spots = np.argwhere(is_free & (gaps >= _CLEARANCE_M / GAP_M))
         spots = rng.choice(spots, _POSES if len(spots) else 0)
         poses = side_m * np.column_stack([spots[:, ::-1] + rng.random(spots.shape),
                                           rng.uniform(-np.pi, np.pi, len(spots)) / side_m])
-        coarse = (DEVIATION_M / _COARSE_DEVIATION_M * nearest).astype(np.uint8)
-        return GridField(gaps, side_m, coarse, factor * side_m, margin * side_m, poses)
-
+        return GridField(gaps, side_m, np.ascontiguousarray(coarse, np.uint8), factor * side_m,
+                         margin * side_m, poses)
