@@ -162,7 +162,7 @@ def _random(scan: Scan, grid: grids.OccupancyGrid, is_flipped: bool) -> NDArray[
     return _placed(grid.field.poses, _beams(scan, is_flipped), grid.field)
 
 
-def prepare(scan: Scan, grid: OccupancyGrid) -> None:
+def prepare(scan: Scan, grid: grids.OccupancyGrid) -> None:
     """Rank the random poses of a grid ahead, in another thread: the kernels hold no lock."""
     _random(scan, grid, False)
 
