@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry import depth
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults, check_faults
+from cliploc_ros.core.geometry.grid import OccupancyGrid
+from cliploc_ros.core.geometry.transforms import transform_from_pose
 from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
@@ -33,6 +35,9 @@ _DEPTH_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 _DEPTH_HEADER = struct.Struct('<iff')
 # Tolerance of the aspect ratio, for a depth image that is a rounded fraction of the colour image.
 _SAME_ASPECT = 0.02
+# Greatest number of beams of a scan, greatest angle between its first and last beam [rad], and
+# number of beams by which drivers miscount.
+_MOST_BEAMS, _FULL_TURN, _ODD_BEAMS = 2**14, 2.01 * math.pi, 2.5
 _PNG, _JPEG = b'\x89PNG\r\n\x1a\n', b'\xff\xd8'
 # JPEG markers that are followed by the image size.
 _JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -109,6 +114,38 @@ def declared_size(data: bytes, stated_format: str) -> tuple[int, int]:
         at += 2 + int.from_bytes(data[at + 2:at + 4])
     raise ImageError(f"compressed image ('{stated_format}', {len(data)} bytes) does not decode: "
                      'it is not a JPEG or PNG, or it is cut off')
+
+
+def scan_from_msg(msg: Any) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return angles (n,) [rad] and ranges (n,) [m] of a LaserScan, and its greatest range [m].
+
+    As in REP 117, a range is infinite if nothing is in range, and NaN if it is invalid or too
+    short. OptionsError: a field is invalid; the message has all of them.
+    """
+    ranges, step = np.array(msg.ranges, dtype=np.float64), float(msg.angle_increment)
+    ranges[~(ranges >= msg.range_min)], ranges[ranges >= msg.range_max] = np.nan, np.inf
+    valid, turn = np.isfinite(ranges).sum(), (len(ranges) - 1) * step
+    if not (valid and len(ranges) <= _MOST_BEAMS and 0.0 < abs(turn) < _FULL_TURN
+            and abs(msg.angle_max - msg.angle_min - turn) <= _ODD_BEAMS * abs(step)
+            and 0.0 <= msg.range_min < msg.range_max < math.inf):
+        raise OptionsError(
+            f'the scan has {valid} valid of {len(ranges)} ranges, {msg.range_min:g} to '
+            f'{msg.range_max:g} m, angles {msg.angle_min:g} to {msg.angle_max:g} rad and '
+            f'angle_increment {step:g} rad: correct the driver of the laser')
+    return msg.angle_min + step * np.arange(len(ranges)), ranges, float(msg.range_max)
+
+
+def grid_from_msg(msg: Any) -> OccupancyGrid:
+    """Return an OccupancyGrid of nav_msgs. OptionsError: a field is invalid."""
+    size, p, q = (msg.info.height, msg.info.width), msg.info.origin.position, \
+        msg.info.origin.orientation
+    quat_xyzw = np.array([q.x, q.y, q.z, q.w])
+    if len(msg.data) != math.prod(size) or not abs(np.linalg.norm(quat_xyzw) - 1.0) < 0.01:
+        raise OptionsError(f'the grid has {len(msg.data)} cells for {size[1]} x {size[0]}, or the '
+                           f'quaternion {quat_xyzw} of its origin is not of unit length')
+    return OccupancyGrid(
+        np.asarray(msg.data, dtype=np.int8).reshape(size), float(msg.info.resolution),
+        transform_from_pose(np.array([p.x, p.y, p.z]), quat_xyzw), msg.header.frame_id.lstrip('/'))
 
 
 def depth_counts_from_msg(msg: ImageMessage | CompressedImageMessage) -> NDArray[np.generic]:

@@ -180,6 +180,9 @@ class Doctor(RelocalizerNode):
             if math.isfinite(source.nearest_lag_s):
                 report.judge(of_camera(name, 'clock'), self._clock_fault(source.nearest_lag_s),
                              f'images come {1e3 * source.nearest_lag_s:.0f} ms after their stamps')
+        if parameters.scan:
+            report.judge('scan', self._robot.laser.problem(parameters),
+                         f'{parameters.scan} and its grid arrive')
         image = None if frame is None else frame.image.header
         if frame is not None and image is not None and parameters.base_frame:
             with report.failing('tf'):
@@ -246,7 +249,7 @@ def doctor(files: Sequence[Path], name: str, patience_s: float, report: Report) 
                 given = [parameter for parameter in given if parameter.name != 'last_pose_file']
             # missing inputs of an active relocalizer are reported by the checks below
             report.judge('relocalizer', '; '.join(filter(None, (
-                values.get('wrong cameras'), values.get('rival of publish_tf'))))
+                values.get('wrong sensors'), values.get('rival of publish_tf'))))
                          if values['state'] == 'active' else status.problem(), f'{name} is active')
     except NotRunningError as error:
         return report.add('relocalizer', State.FAIL, str(error))

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Localizes the robot in a map of objects, on request or with every image.
 
-  in         image, image/compressed, camera_info, detections; optional: odom, imu, depth
+  in         image, image/compressed, camera_info, detections; optional: odom, imu, depth,
+             scan, grid
   out        ~/pose, initialpose, ~/hypotheses, ~/landmarks, ~/matches, ~/debug_image, ~/answer,
              /diagnostics
   services   ~/relocalize, ~/relocalize_fields, ~/record, ~/reload_map,
@@ -75,7 +76,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             self.facts['topics'] = ' '.join(
                 f'{name}:={qos.resolved(self, name)}' for name in (
                     *(topic for source in sources for topic in source.topics.values()),
-                    *_OTHER_TOPICS, parameters.localizer_pose) if name not in ('', AUTO))
+                    *_OTHER_TOPICS, parameters.localizer_pose, parameters.scan,
+                    parameters.scan and parameters.grid) if name not in ('', AUTO))
         self._handoff = HandOff(self, self._robot.odometry, self._robot.transforms)
         self._handoff.localizer.listeners.append(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))
@@ -175,7 +177,8 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
                                   'keyframes file': keyframes.file,
                                   'keyframes hash': keyframes.file_hash}
             cameras, depth_scale = localizer.localizer.cameras, localizer.localizer.depth_scale
-            health.values |= cameras.values | {'wrong cameras': '; '.join(cameras.faults)}
+            health.values |= cameras.values | {'wrong sensors': '; '.join(filter(None, [
+                *cameras.faults, localizer.instants.scans.fault]))}
             for wrong in cameras.faults:
                 health.fail(f'{wrong}: check camera_info, and the pixels and corners of the boxes')
             if parameters.depth_transport != 'none':

@@ -110,6 +110,7 @@ def answer_to(frame: Frame, localized: Localized, state: RobotState,
         'keyframe recording': '' if points is None else points.recorded,
         'depth': '' if depth is None else f'depth of {depth.objects} objects' if depth.is_passed
         else 'depth contradicts the boxes',
+        'scan': state.no_scan if evidence is None or evidence.scan is None else str(evidence.scan),
         'cameras': len(localized.query.frames), 'left out': ', '.join(localized.left_out),
         'prior': 0.0 if evidence is None else evidence.prior,
         **{f'{stage} [ms]': f'{ms:.1f}' for stage, ms in stages_ms.items()}}

@@ -12,6 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,9 @@ from numpy.typing import NDArray
 from rclpy.node import Node
 
 from cliploc_ros import messages
+from cliploc_ros.core.acceptance.depth_check import ScanCheck
 from cliploc_ros.core.detector_check import DetectorCheck
+from cliploc_ros.core.fit.scan_match import prepare
 from cliploc_ros.core.geometry.camera_faults import Fault, check_faults
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.kernels.compiled import KernelCache
@@ -135,7 +138,12 @@ class FrameLocalizer:
         # a frame without a deadline is one of a stream: no thorough search, the next one follows
         query = replace(self.instants.query(frame, parameters, known),
                         is_thorough=not math.isinf(deadline))
+        if (scan := query.newest.scan) is not None and query.grid is not None:
+            Thread(target=prepare, args=(scan, query.grid), daemon=True).start()
         found = self.answer(query, parameters.options(), times, deadline)
+        fit, pose = found.evidence and found.evidence.scan, found.map_from_camera
+        if found.accepted and fit and pose is not None:
+            self.instants.scans.add(fit, pose @ known.state.camera_from_base)
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest
         for_filter = found.covariance
@@ -197,7 +205,8 @@ class FrameLocalizer:
             if can_do_without_crops(options) else by_classes(query.newest, len(self.landmark_map))
         pose = map_from_camera.copy()
         pose[:3, 3] += shift
-        return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query))
+        return self.watch.look(observation, pose, query.images[-1], localizer.recognizer(query),
+                               query.grid)
 
     def _localizer_for(self, options: RelocalizerOptions) -> Localizer:
         """Return the localizer. If the options changed, it uses them, and the watch is new."""
@@ -221,6 +230,7 @@ class Instants:
         self._detector = DetectorCheck(landmark_map, by_class)
         self._faults: dict[str, list[Fault]] = {}  # of the newest frame of each camera
         self.notes: list[str] = []  #: All warnings that are no faults, each once
+        self.scans = ScanCheck()
 
     @property
     def faults(self) -> list[Fault]:
@@ -228,7 +238,8 @@ class Instants:
         return [*(fault._replace(text=f'{name}: {fault.text}' if name else fault.text)
                   for name, faults in self._faults.copy().items() for fault in faults),
                 *(fault._replace(text=f'the detector: {fault.text}')
-                  for fault in self._detector.faults)]
+                  for fault in self._detector.faults),
+                *(Fault(text, False) for text in [self.scans.fault] if text)]
 
     def query(self, frame: Frame, parameters: RelocalizerParameters, known: KnownBefore) -> Query:
         """Return the query of an instant, without cameras whose odometry is of another run.
@@ -243,10 +254,10 @@ class Instants:
             self._observed(camera_frame, parameters, camera_state, by_odometry)
             for camera_frame, camera_state in (*beside, (frame, state))
             if run == _run_of(camera_state)), strict=True)
-        newest = replace(observations[-1], region=region)
+        newest = replace(observations[-1], region=region, scan=state.scan)
         others = (replace(other, stamp_ns=newest.stamp_ns) for other in observations[:-1])
         return Query((*others, newest), images, run, parameters.fuse_frames,
-                     parameters.fuse_window_s)
+                     parameters.fuse_window_s, grid=state.grid)
 
     def explained(self, found: Relocalization) -> Relocalization:
         """Return a result; a refusal gets the faults of the newest frames as further reasons."""

@@ -208,6 +208,13 @@ class RelocalizerParameters(CommonParameters):
         'Mount of the camera on base_frame: x, y, z [m] and quaternion x, y, z, w. Several '
         'cameras: seven numbers for each. All zeros: look it up in tf2.', unit='m', low=-1000.0,
         high=1000.0, repeats=True)
+    scan: str = parameter('', "Topic of a laser's scans, which are compared with a grid; empty: "
+        'none.', read_only=True)
+    grid: str = parameter('map', 'Topic of the occupancy grid of map_server.', read_only=True)
+    grid_file: str = parameter('', "YAML file of map_server's grid, in the frame of the first "
+        'map, read with the map; empty: use the topic grid.')
+    base_from_laser: list[float] = parameter([0.0] * 7,
+        'Mount of the laser, as base_from_camera.', unit='m', low=-1000.0, high=1000.0)
     max_speed_m_s: float = parameter(0.1,
         'Withhold initialpose while the robot is faster by odom.', unit='m/s', low=0.0, high=100.0)
     max_turn_rad_s: float = parameter(0.2,
@@ -251,10 +258,10 @@ class RelocalizerParameters(CommonParameters):
         super().check()
         if len(self.base_from_camera) not in (7, 7 * len(self.camera_names)):
             raise OptionsError('base_from_camera: needs 7 numbers, or 7 for each camera')
-        for mount in batched(self.base_from_camera, 7):
+        for mount in batched([*self.base_from_camera, *self.base_from_laser], 7):
             if any(mount) and abs(math.hypot(*mount[3:]) - 1.0) > 0.01:
-                raise OptionsError(
-                    f'base_from_camera: the quaternion {[*mount[3:]]} is not of unit length')
+                raise OptionsError('base_from_camera or base_from_laser: the quaternion '
+                                   f'{[*mount[3:]]} is not of unit length')
         if self.gravity == 'base_frame' and not self.base_frame:
             raise OptionsError("gravity: 'base_frame' needs the parameter base_frame")
         if self.camera_names and not self.base_frame:

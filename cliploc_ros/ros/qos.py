@@ -23,7 +23,7 @@ _BEST_EFFORT, _RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIA
 # Only the newest image counts.
 IMAGE = QoSProfile(depth=1, reliability=_BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
 # Small messages, paired with images by stamp: a burst must not displace them.
-CAMERA_INFO = DETECTIONS_IN = QoSProfile(depth=10, reliability=_BEST_EFFORT)
+CAMERA_INFO = DETECTIONS_IN = SCAN = QoSProfile(depth=10, reliability=_BEST_EFFORT)
 # Buffers the messages of a fast IMU or odometry while another callback runs.
 IMU = ODOM = QoSProfile(depth=100, reliability=_BEST_EFFORT)
 DETECTIONS_OUT = POSE = QoSProfile(depth=10, reliability=_RELIABLE)

@@ -31,7 +31,7 @@ from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode, NotActiveError
-from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.parameters import RelocalizerParameters, path_of
 from cliploc_ros.ros.visualization import Visualization
 
 # Each frame without odometry adds to the risk of a false accept.
@@ -78,7 +78,12 @@ class Pipeline:
 
     def load(self, former: FrameLocalizer | None = None) -> FrameLocalizer:
         """Load map and network, and return them. Keep the network of a former localizer."""
-        localizer = load_localizer(self._node, self._node.settings.snapshot(), former)
+        parameters = self._node.settings.snapshot()
+        localizer = load_localizer(self._node, parameters, former)
+        if parameters.scan and parameters.grid_file:
+            from cliploc_ros.core.map.grid_file import read_grid
+            self._robot.laser.use(lambda: read_grid(path_of(parameters.grid_file),
+                                                    localizer.frame_ids[0]))
         self.localizer = localizer
         self._visualization.set_map(localizer.landmark_map, None if localizer.keyframes is None
                                     else localizer.keyframes.localizer.layer)

@@ -229,10 +229,11 @@ class Watcher:
         # The watch needs odometry even if fuse_frames is 1.
         parameters = replace(self._node.settings.snapshot().of_camera(frame.camera),
                              fuse_frames=MAX_FRAMES)
+        frame_ids = localizer.frame_ids
         state = self._robot.at(image, parameters, depth_frame=frame.depth_frame,
-                               info=frame.camera_info)
+                               info=frame.camera_info, frame_ids=frame_ids)
         floors = self._handoff.floors.loaded
-        where, pose = self._pose.at(image, state, parameters, [*floors, *localizer.frame_ids])
+        where, pose = self._pose.at(image, state, parameters, [*floors, *frame_ids])
         self._had_pose = True
 
         def score() -> WatchReport | None:

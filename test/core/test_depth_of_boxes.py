@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth of boxes and of images: correct depth helps, wrong depth does no harm."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 from scene import CAMERA, MAP_FROM_CAMERA, ROOM, SEEN, rigid
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.depth_check import DepthCheck, DepthScale
+from cliploc_ros.core.acceptance.depth_check import DepthCheck, DepthScale, ScanCheck
+from cliploc_ros.core.fit.scan_match import ScanFit
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.depth import (
     DepthCamera,
@@ -162,3 +164,19 @@ def test_counts_and_floats_are_depths_in_metres():
     np.testing.assert_allclose(depth_from_counts(metres, None, 'x'), [[np.nan, np.nan, 1.5]])
     with pytest.raises(DatasetError, match='16-bit'):
         depth_from_counts(np.zeros((2, 2, 3), dtype=np.uint8), None, 'x')
+
+
+@pytest.mark.parametrize(('ahead_m', 'x_m', 'turn', 'explained', 'named'), [
+    (0.2, 0.0, 0.0, 0.9, r'\+0.20 m ahead, [-+]0.00 m left, .* correct its mount, or the grid$'),
+    (0.0, 0.2, 0.0, 0.9, r'in the map by \+0.20'), (0.0, 0.0, 0.1, 0.9, r'\+5.7 degrees'),
+    (0.0, 0.0, 0.0, 0.4, 'have 0.40 .* place'), (0.02, 0.05, 0.01, 0.9, '^$')])
+def test_what_scans_have_in_common_is_named(ahead_m, x_m, turn, explained, named):
+    check, rng = ScanCheck(), np.random.default_rng(0)
+    for number in range(12):
+        pose = rigid((number, 0.0, 0.0), degrees=60.0 * (number // 2))
+        x, y, _ = ahead_m * pose[:3, 0] + [x_m, 0.0, 0.0] + rng.normal(0.0, 0.03, 3)
+        fit = ScanFit(1.0, explained, 1, 1, 2000, (x, y, turn))
+        check.add(fit, pose)
+        check.add(fit, pose @ rigid((0.1, 0.0, 0.0)))  # the same look
+        assert number > 3 or not check.fault
+    assert re.search(named, check.fault)

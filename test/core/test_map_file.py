@@ -4,12 +4,14 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 from scene import BY_CLASS, CAMERA, MAP_FROM_CAMERA, ROOM, see_room, unit_rows
 
 from cliploc_ros.core.geometry.transforms import pose_error
+from cliploc_ros.core.map.grid_file import read_grid
 from cliploc_ros.core.map.joined_map import MAX_MAPS, join_maps, parts_of, place_of
 from cliploc_ros.core.map.landmark_details import LandmarkDetails, join_details
 from cliploc_ros.core.map.landmark_embeddings import (
@@ -291,3 +293,46 @@ def test_maps_that_cannot_be_told_apart_are_refused():
         join(floor('map'), floor('hall'), floor('map', seed=1))
     with pytest.raises(MapError, match=f'at most {MAX_MAPS}'):
         join(*[floor(f'floor_{number}') for number in range(MAX_MAPS + 1)])
+
+
+GRID = {'image': 'office.pgm', 'resolution': 0.05, 'origin': [-1.0, 2.0, 0.5], 'negate': 0,
+        'occupied_thresh': 0.65, 'free_thresh': 0.196}
+SHADES = np.array([[0, 89, 90], [205, 254, 255]], np.uint8)  # 254, 205 and 0 by map_saver
+
+
+def write_grid(folder, pixels=SHADES, **fields):
+    fields = GRID | fields
+    cv2.imwrite(str(folder / fields['image']), pixels)
+    (folder / 'office.yaml').write_text(yaml.safe_dump(fields))
+    return folder / 'office.yaml'
+
+
+@pytest.mark.parametrize(('fields', 'alpha', 'cells'), [
+    ({}, None, [[-1, 0, 0], [100, 100, -1]]),
+    ({'negate': 1}, None, [[100, 100, 100], [0, -1, -1]]),
+    ({'mode': 'scale', 'image': 'office.png'}, None, [[0, 0, 0], [100, 100, 99]]),
+    ({'mode': 'scale', 'image': 'office.png'}, 0, [[-1, -1, -1], [-1, -1, -1]]),
+    ({'image': 'office.png'}, 255, [[0, 0, 0], [100, -1, -1]]),
+    ({'mode': 'raw'}, None, [[-1, -1, -1], [0, 89, 90]])])
+def test_a_grid_is_read_as_map_server_reads_it(tmp_path, fields, alpha, cells):
+    """The image's last row is the grid's first; in trinary mode, alpha is one more colour."""
+    pixels = SHADES if alpha is None else np.dstack([SHADES] * 3 + [np.full_like(SHADES, alpha)])
+    grid = read_grid(write_grid(tmp_path, pixels, **fields), 'floor')
+    assert (grid.cells.tolist(), grid.frame_id, grid.resolution_m) == (cells, 'floor', 0.05)
+    assert grid.frame_from_grid[:2] @ [1.0, 0.0, 0.0, 1.0] == pytest.approx(
+        [np.cos(0.5) - 1.0, np.sin(0.5) + 2.0])
+
+
+@pytest.mark.parametrize(('fields', 'content', 'named'), [
+    ({'resolution': 0.0}, None, 'resolution'), ({'resolution': 'x'}, None, "float: 'x'"),
+    ({'origin': [0.0, 0.0]}, None, 'unpack'), ({'origin': [0.0, np.nan, 0.0]}, None, 'origin'),
+    ({'free_thresh': 0.7}, None, 'free_thresh 0.7'), ({'mode': 'colour'}, None, "'colour'"),
+    ({'occupied_thresh': None}, None, 'NoneType'), ({}, b'P5 9 9 255\n', 'office.pgm'),
+    ({}, b'', 'imdecode'), ({'image': ''}, None, 'a folder')])
+def test_a_grid_file_that_is_wrong_is_named(tmp_path, fields, content, named):
+    path = write_grid(tmp_path)
+    path.write_text(yaml.safe_dump(GRID | fields))
+    if content is not None:
+        (tmp_path / 'office.pgm').write_bytes(content)
+    with pytest.raises(MapError, match=f'office.yaml: .*{named}'):
+        read_grid(path)

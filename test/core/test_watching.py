@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scene import BY_CLASS, boxes_of, level, map_of, rigid, with_boxes
 from scipy.spatial.transform import Rotation
+from test_scan import ROOM as GRID
+from test_scan import scan_of
 
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.geometry.camera import Camera
@@ -162,6 +164,16 @@ def test_a_robot_that_is_carried_away_is_noticed(watch, room):
         seen = replace(see(room, moved(there, -0.7, 1.2, 80.0), number), odom_from_camera=here)
         report = watch.look(seen, here)
     assert report.state == WatchState.LOST and report.probability < 0.05
+
+
+def test_where_the_scan_contradicts_the_pose_the_watch_is_uncertain(watch, room):
+    mirrored = replace(GRID, cells=np.ascontiguousarray(GRID.cells[:, ::-1]))
+    for number, pose in enumerate(drive(5)):
+        seen = replace(see(room, pose, number), scan=scan_of(GRID, pose))
+        report = watch.look(seen, pose, grid=mirrored if number == 4 else GRID)
+        assert ', scan ' in report.reason
+        assert number != 3 or report.state is WatchState.LOCALIZED
+    assert report.state is WatchState.UNCERTAIN and 'turn' in report.reason
 
 
 def test_minutes_without_objects_end_in_uncertain(watch, room):

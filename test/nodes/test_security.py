@@ -49,7 +49,7 @@ def check(tester, node, *absent):
 
 def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
     process = own_relocalizer(mode='continuous', gravity='imu', depth_transport='raw',
-                              watch='amcl_pose')
+                              watch='amcl_pose', scan='scan')
     tester.feed_until(lambda: tester.poses, make_frame(), 'a pose')
     tester.ask()  # the node subscribes to odometry during a request
     check(tester, 'relocalizer', '/image/compressed', '/depth/compressedDepth', '/clock')
@@ -58,8 +58,8 @@ def test_the_relocalizer_does_what_its_policy_allows(own_relocalizer, tester):
     own_relocalizer(image_transport='compressed', use_sim_time='true',
                     depth_transport='compressed')
     tester.ask()
-    check(tester, 'relocalizer', '/image', '/depth', '/imu', '/relocalizer/localized',
-          '/relocalizer/localization_state')
+    check(tester, 'relocalizer', '/image', '/depth', '/imu', '/scan', '/map',
+          '/relocalizer/localized', '/relocalizer/localization_state')
 
 
 @pytest.mark.parametrize(('parameters', 'absent'), [

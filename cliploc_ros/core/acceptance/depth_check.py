@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Check the depths of a request, so that wrong depths do no harm.
+"""Check the depths of a request, so that wrong depths do no harm, and the scans of several.
 
 Depth may have a wrong unit or scale, be of another camera, or be noise. Then it agrees with no
 pose that fits the boxes. Right depths agree with the pose that the boxes determine, and hardly
@@ -19,10 +19,17 @@ from numpy.typing import NDArray
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit import refinement
 from cliploc_ros.core.fit.finalists import Finalist
+from cliploc_ros.core.fit.scan_match import ScanFit
 from cliploc_ros.core.fit.verification import Rig, camera_pose, verify_rig
 from cliploc_ros.core.geometry.depth import depth_odds
+from cliploc_ros.core.geometry.transforms import SAME_BOXES
 
 _TERMS = CALIBRATION.depth
+# Of scans: least and greatest number of looks for a verdict, least steps [m] and turn [rad] of a
+# fault, which are also this many standard errors, and the least share of beams that a right grid
+# explains. All chosen.
+_LEAST, _MOST, _ERRORS, _EXPLAINED = 5, 20, 3.0, 0.5
+_LEAST_STEPS = (0.1, 0.1, math.radians(2.0), 0.1, 0.1, math.inf)
 
 
 class DepthCheck(NamedTuple):
@@ -59,6 +66,40 @@ class DepthScale:
     def is_wrong(self) -> bool:
         """Return whether the scale is too far off for the depths to be used."""
         return abs(math.log(self.ratio)) > math.log(_TERMS.most_ratio)
+
+
+class ScanCheck:
+    """Compares the scans of accepted poses: what they have in common is no error of these poses.
+
+    A wrong mount of the laser moves all poses alike in the axes of the robot, a wrong origin of
+    the grid in those of the map. A grid that is mirrored, or has a wrong resolution, fits nowhere.
+    """
+
+    def __init__(self) -> None:
+        # Each pose, and the step of its laser ahead, left, in yaw, x and y, and its explained
+        # share of beams.
+        self._looks = deque[tuple[NDArray[np.float64], list[float]]](maxlen=_MOST)
+
+    def add(self, fit: ScanFit, map_from_base: NDArray[np.float64]) -> None:
+        """Add the scan of an accepted pose (4, 4), unless it is that of the look before."""
+        if not self._looks or not SAME_BOXES.agree(self._looks[-1][0], map_from_base):
+            x, y, turn = fit.step
+            ahead, left = map_from_base[:2, :2].T @ (x, y)
+            self._looks.append((map_from_base, [ahead, left, turn, x, y, fit.explained]))
+
+    @property
+    def fault(self) -> str:
+        """Return what is wrong with laser or grid, and the remedy; empty without evidence."""
+        numbers = np.array([look for _, look in self._looks] or [[0.0] * 6])
+        ahead, left, turn, x, y, share = means = numbers.mean(axis=0)
+        errors = _ERRORS * numbers.std(axis=0) / math.sqrt(len(numbers))
+        is_alike = (np.abs(means) > np.maximum(errors, _LEAST_STEPS)).any()
+        if len(numbers) < _LEAST or (share >= _EXPLAINED and not is_alike):
+            return ''
+        return (f'scans of {len(numbers)} accepted poses have {share:.2f} of beams explained, and '
+                f'move the laser by {ahead:+.2f} m ahead, {left:+.2f} m left, '
+                f'{math.degrees(turn):+.1f} degrees, in the map by {x:+.2f}, {y:+.2f} m: correct '
+                f'its mount, or the grid{"" if share >= _EXPLAINED else ": place, resolution"}')
 
 
 def check_depth(rig: Rig, pose: Finalist) -> DepthCheck | None:

@@ -162,6 +162,11 @@ def _random(scan: Scan, grid: grids.OccupancyGrid, is_flipped: bool) -> NDArray[
     return _placed(grid.field.poses, _beams(scan, is_flipped), grid.field)
 
 
+def prepare(scan: Scan, grid: grids.OccupancyGrid) -> None:
+    """Rank the random poses of a grid ahead, in another thread: the kernels hold no lock."""
+    _random(scan, grid, False)
+
+
 def _beams(scan: Scan, is_flipped: bool) -> NDArray[np.float64]:
     """Return the beams (b, 3) of a scan that are compared, see correlate."""
     rows = np.nonzero((scan.ranges > 0.0) & np.isfinite(scan.angles))[0]

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.acceptance.verdict import too_tilted
 from cliploc_ros.core.calibration import CALIBRATION
+from cliploc_ros.core.fit.scan_match import ScanFit, ScanMatcher
+from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.geometry.transforms import SAME_PLACE, invert_transform, is_rigid, pose_error
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.map.presence import Missing
@@ -145,10 +147,11 @@ class Watch:
         self._belief, self._missing = Belief(), Missing(self._map)
         self._turn, self._faults = TurnEstimate(), ImageFaults()
         self._count, self._stamp_ns = 0, -1
+        self._scan: ScanFit | None = None  # of the newest look
 
     def look(self, observation: Observation, map_from_camera: NDArray[np.float64],
-             image: NDArray[np.uint8] | None = None, recognizer: ImageRecognizer | None = None
-             ) -> WatchReport:
+             image: NDArray[np.uint8] | None = None, recognizer: ImageRecognizer | None = None,
+             grid: OccupancyGrid | None = None) -> WatchReport:
         """Compare a camera's view with the expected view at the pose of a localizer.
 
         Parameters
@@ -162,6 +165,8 @@ class Watch:
             Needed to detect faults of the camera.
         recognizer : ImageRecognizer, optional
             Keyframe recognizer of the image.
+        grid : OccupancyGrid, optional
+            The grid of the observation's scan.
 
         Raises
         ------
@@ -186,6 +191,9 @@ class Watch:
                                     self._options):
             fault = refused.reason
         self._belief.wait(observation, map_from_camera)
+        scan, self._scan = observation.scan, None
+        if scan is not None and grid is not None:
+            self._scan = ScanMatcher(scan, grid, self._map).fits(map_from_camera)
         return self._report(None if fault else self._weigh(
             observation, map_from_camera, recognizer), fault)
 
@@ -205,6 +213,8 @@ class Watch:
             by_points = alignment.by_keyframes(recognizer, given)
             is_full |= by_points < CALIBRATION.watch.elsewhere
             odds += by_points
+        if self._scan is not None:
+            odds += self._scan.odds
         if odds == 0.0:
             return evidence
         self._count += 1
@@ -219,20 +229,22 @@ class Watch:
         terms, belief = CALIBRATION.watch, self._belief
         likely, state = belief.probability, WatchState.UNCERTAIN
         missing = tuple(self._map.landmark_ids[row] for row in self._missing.named())
-        if likely > terms.localized and not self._missing.is_outdated:
+        is_contradicted = self._scan is not None and self._scan.odds < 0.0
+        if likely > terms.localized and not self._missing.is_outdated and not is_contradicted:
             state = WatchState.LOCALIZED
         elif likely < terms.lost and belief.against >= (
                 terms.against_jumped if belief.has_jumped else terms.against):
             state = WatchState.LOST
         reason = f'{state}: probability {likely:.2f}'
         seen = f'{evidence.matched} of {evidence.known} objects fit the pose' if evidence else ''
+        seen += '' if self._scan is None else f', {self._scan}'
         if fault:
             reason += f'; {fault}; check the camera'
         elif state == WatchState.LOST:
             reason += f' that the pose is right; {seen}; relocalize'
         elif state == WatchState.LOCALIZED:
             reason += f'; {seen}'
-        elif likely > terms.localized:
+        elif likely > terms.localized and not is_contradicted:
             reason += f'; {len(missing)} landmarks are missing here; update the map'
         else:
             reason += f'; {seen}; turn the camera to more objects'

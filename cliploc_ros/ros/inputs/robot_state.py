@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""All inputs except the frames: mount, vertical, odometry and prior of the robot."""
+"""All inputs except the frames: mount, vertical, odometry, laser and prior of the robot."""
 
 import math
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -14,16 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from numpy.typing import NDArray
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import CameraInfo, Imu
+from sensor_msgs.msg import CameraInfo, Imu, LaserScan
 from std_msgs.msg import Header
 
-from cliploc_ros.core.geometry.transforms import invert_transform
-from cliploc_ros.core.observation import Region
-from cliploc_ros.errors import CliplocError
-from cliploc_ros.messages import camera_from_frame
+from cliploc_ros.core.geometry.grid import OccupancyGrid
+from cliploc_ros.core.geometry.transforms import invert_transform, transform_from_pose
+from cliploc_ros.core.observation import Region, Scan
+from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.messages import camera_from_frame, grid_from_msg, scan_from_msg
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.conversions import stamp_ns
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
@@ -34,6 +36,7 @@ from cliploc_ros.ros.inputs.stamps import StampOrder, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.units import NS_PER_S
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STANDARD_GRAVITY = 9.80665
@@ -54,6 +57,17 @@ _NOT_MEASURED = -1.0
 _RETRY_S = 0.02
 # Longest wait for the first message of a publisher of odometry that was just discovered.
 _DISCOVERY_S = 1.0
+# Longest wait for the message of odometry that follows a scan.
+_PATIENCE_S = 0.2
+# Greatest time between image and scan if odometry does not cover it: a laser at 5 Hz has a scan
+# within this time. Not measured.
+_UNLINKED_NS = NS_PER_S // 10
+# Number of scans of a fast laser in ten seconds: boxes of a slow detector arrive late.
+_MOST_SCANS = 400
+# Greatest time between image and scan. Not measured.
+_LATEST_NS = NS_PER_S // 2
+# Returns the pose (4, 4) of a coordinate frame of the robot in the camera at an image.
+type MountOf = Callable[[str], NDArray[np.float64]]
 
 
 class NoVerticalError(CliplocError):
@@ -213,6 +227,79 @@ def _is_gravity(acceleration: NDArray[np.float64]) -> bool:
     return bool(abs(np.linalg.norm(acceleration) - _STANDARD_GRAVITY) <= _MAX_ACCELERATION)
 
 
+class LaserSource:
+    """Subscribes to scans and the grid while the node is active, if the parameter scan is set."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._subscriptions = list[qos.AdaptiveSubscription]()
+        #: The last scans, oldest first
+        self.scans = deque[LaserScan](maxlen=_MOST_SCANS)
+        self._heard_at = -math.inf
+        # The current grid, or why it is invalid.
+        self._grid: OccupancyGrid | None = None
+        self._fault = ''
+
+    def open(self, parameters: RelocalizerParameters) -> None:
+        """Subscribe to the topics that the parameters name."""
+        topics = [(LaserScan, parameters.scan, self.take, qos.SCAN),
+                  (OccupancyGridMsg, '' if parameters.grid_file else parameters.grid,
+                   lambda msg: self.use(lambda: grid_from_msg(msg)), qos.LATCHED)]
+        self._subscriptions = [qos.AdaptiveSubscription(self._node, *topic) for topic in topics
+                               if parameters.scan and topic[1]]
+
+    def close(self) -> None:
+        """Unsubscribe, and forget the scans."""
+        while self._subscriptions:
+            self._subscriptions.pop().destroy()
+        self.scans.clear()
+
+    def take(self, msg: LaserScan) -> None:
+        """Keep a scan."""
+        msg.intensities, self._heard_at = [], time.monotonic()
+        if self.scans and _between_ns(self.scans[-1], msg.header) > 0:  # time jumped back
+            self.scans.clear()
+        self.scans.append(msg)
+
+    def use(self, read: Callable[[], OccupancyGrid]) -> None:
+        """Replace the grid; an invalid grid replaces it, too, because the former is outdated."""
+        try:
+            grid, self._fault = read(), ''
+            _ = grid.field  # no request waits for it
+            self._grid = grid
+        except CliplocError as error:
+            self._grid, self._fault = None, str(error)
+
+    def problem(self, parameters: RelocalizerParameters) -> str:
+        """Return why scans or the grid are missing, and the remedy; empty without a problem."""
+        is_silent = time.monotonic() - self._heard_at > parameters.stale_after_s
+        if not parameters.scan or not (is_silent or (self._grid is None and not self._fault)):
+            return self._fault
+        name, kind = ('scan', LaserScan) if is_silent else ('grid', OccupancyGridMsg)
+        return qos.why_silent(self._node, name, qos.resolved(
+            self._node, getattr(parameters, name)), kind)
+
+    def near(self, image: Header, parameters: RelocalizerParameters, frame_ids: Sequence[str]
+             ) -> tuple[LaserScan, OccupancyGrid]:
+        """Return the scan that is nearest to an image, and the grid of a map with these frames.
+
+        OptionsError: there is none, or the grid is of no map.
+        """
+        grid, scan = self._grid, min(tuple(self.scans), default=None,
+                                     key=lambda scan: abs(_between_ns(scan, image)))
+        if scan is None or grid is None or abs(_between_ns(scan, image)) > _LATEST_NS:
+            raise OptionsError(self.problem(parameters) or 'no scan within '
+                               f'{_LATEST_NS / NS_PER_S} s of the image: stamp both by one clock')
+        if grid.frame_id not in frame_ids:
+            raise OptionsError(f"the grid is in frame '{grid.frame_id}', the map in "
+                               f"'{', '.join(frame_ids)}': correct the frame_id of one of them")
+        return scan, grid
+
+
+def _between_ns(scan: LaserScan, other: Header) -> int:
+    return stamp_ns(scan.header.stamp) - stamp_ns(other.stamp)
+
+
 @dataclass(frozen=True)
 class RobotState:
     """The robot at the stamp of one image."""
@@ -225,6 +312,10 @@ class RobotState:
     place: OdometryPlace | None = None
     #: Pose (4, 4) of a depth camera that is not registered; None if unknown to tf2
     camera_from_depth: NDArray[np.float64] | None = None
+    #: The scan of the laser, and the grid that it shows; None if they are unknown or not asked for
+    scan: Scan | None = None
+    grid: OccupancyGrid | None = None
+    no_scan: str = ''  #: Why it is unknown
 
 
 class KnownBefore(NamedTuple):
@@ -244,7 +335,7 @@ class RobotStateSource:
         self.transforms = CoordinateFrames(node)
         self.odometry = OdometrySource(node)
         self.vertical = VerticalSource(node, self.transforms)
-        self.prior = PriorSource(node, self.transforms)
+        self.prior, self.laser = PriorSource(node, self.transforms), LaserSource(node)
         self._unknown = set[str]()  # coordinate frames that tf2 did not know the last time
         #: Why optional inputs were not used for the newest image, by input
         self.problems: dict[str, str] = {}
@@ -255,6 +346,7 @@ class RobotStateSource:
         self.vertical.open(parameters.gravity)
         self.prior.open(parameters)
         self.odometry.open()
+        self.laser.open(parameters)
         remedy = 'set publish_tf: false' if parameters.publish_tf else 'set watch: amcl_pose' \
             if parameters.watch == 'tf' else 'set base_from_camera' \
             if parameters.base_frame and not any(parameters.base_from_camera) else ''
@@ -266,6 +358,7 @@ class RobotStateSource:
         self.odometry.close()
         self.vertical.close()
         self.prior.close()
+        self.laser.close()
         self._node.worker.submit(self.transforms.close)  # after a search that may be running
 
     def forget(self) -> None:
@@ -273,10 +366,12 @@ class RobotStateSource:
         self.transforms.forget()
         self.vertical.forget()
         self.odometry.forget()
+        self.laser.scans.clear()
 
     def examine(self, health: Health) -> None:
-        """Report invalid messages of odometry and of the IMU."""
-        for problem in (self.odometry.problem, self.vertical.problem):
+        """Report invalid messages of odometry and the IMU, and why the laser is not used."""
+        for problem in (self.odometry.problem, self.vertical.problem, self.problems.get(
+                'scan', self.laser.problem(self._node.settings.values))):
             if problem:
                 health.warn(problem)
 
@@ -298,7 +393,7 @@ class RobotStateSource:
         """
         header = frame.image.header
         state = self.at(header, parameters.of_camera(frame.camera), deadline, frame.depth_frame,
-                        frame.camera_info)
+                        frame.camera_info, frame_ids)
         beside = []
         for other in frame.beside:
             soon = min(deadline, time.monotonic() + parameters.tf_timeout_s)
@@ -312,10 +407,12 @@ class RobotStateSource:
             header.stamp, parameters, state.camera_from_base, frame_ids, map_hash))
 
     def at(self, image: Header, parameters: RelocalizerParameters, deadline: float = math.inf,
-           depth_frame: str = '', info: CameraInfo | None = None) -> RobotState:
+           depth_frame: str = '', info: CameraInfo | None = None, frame_ids: Sequence[str] = ()
+           ) -> RobotState:
         """Return the robot's state at the stamp of an image.
 
-        Vertical, odometry, and the pose of unregistered depth are optional. `info` of the second
+        Vertical, odometry, and the pose of unregistered depth are optional, and so is the scan,
+        which is asked for by the frames of the maps. `info` of the second
         camera of a stereo pair puts this camera beside its frame, see messages.camera_from_frame.
 
         The wait for the mount takes at most half of the time until `deadline` (monotonic clock)
@@ -347,19 +444,43 @@ class RobotStateSource:
         if depth_frame not in ('', image.frame_id):
             with suppress(NoTransformError):  # depths_from_msg reports it
                 camera_from_depth = from_frame @ self._lookup(image, depth_frame, parameters)
-        return RobotState(camera_from_base, up_in_camera, self._place(
-            image, parameters, camera_from_base, from_frame), camera_from_depth)
 
-    def _place(self, image: Header, parameters: RelocalizerParameters,
-               camera_from_base: NDArray[np.float64], from_frame: NDArray[np.float64]
+        def mount_of(frame: str) -> NDArray[np.float64]:
+            return from_frame if frame == image.frame_id else camera_from_base if (
+                frame == parameters.base_frame) else from_frame @ self._lookup(
+                    image, frame, parameters)
+        return RobotState(
+            camera_from_base, up_in_camera, self._place(image, parameters, mount_of),
+            camera_from_depth, *(self._scan(image, parameters, mount_of, frame_ids)
+                                 if frame_ids and parameters.scan else ()))
+
+    def _scan(self, image: Header, parameters: RelocalizerParameters, mount_of: MountOf,
+              frame_ids: Sequence[str]) -> tuple[Scan | None, OccupancyGrid | None, str]:
+        """Return the scan as it is seen from the image, and its grid, or why it is unknown."""
+        try:
+            msg, grid = self.laser.near(image, parameters, frame_ids)
+            mount = np.array(parameters.base_from_laser)
+            camera_from_laser = mount_of(msg.header.frame_id) if not mount.any() else mount_of(
+                parameters.base_frame) @ transform_from_pose(mount[:3], mount[3:])
+            # without odometry, the robot is assumed to be at rest for a moment
+            with suppress(*[NoOdometryError] * (abs(_between_ns(msg, image)) <= _UNLINKED_NS)):
+                motion, body = self.odometry.motion(image.stamp, msg.header.stamp, _PATIENCE_S)
+                camera_from_laser = mount_of(body) @ motion @ invert_transform(
+                    mount_of(body)) @ camera_from_laser
+            found = Scan(*scan_from_msg(msg), camera_from_laser)
+        except CliplocError as error:
+            self._warn('scan', f'localizing without the scan: {error}')
+            return None, None, str(error)
+        self.problems.pop('scan', None)
+        return found, grid, ''
+
+    def _place(self, image: Header, parameters: RelocalizerParameters, mount_of: MountOf
                ) -> OdometryPlace | None:
         if parameters.fuse_frames == 1:
             return None
         try:
             body = self.odometry.pose_at(image.stamp)
-            camera_from_body = from_frame if body.frame == image.frame_id else \
-                camera_from_base if body.frame == parameters.base_frame else \
-                from_frame @ self._lookup(image, body.frame, parameters)
+            camera_from_body = mount_of(body.frame)
         except NoOdometryError as error:
             if self.odometry.is_published:
                 self.problems['odometry'] = f'localizing without odometry: {error}'
@@ -378,7 +499,8 @@ class RobotStateSource:
         timeout_s = 0.0 if frame in self._unknown else parameters.tf_timeout_s
         self._unknown.add(frame)
         found = self.transforms.lookup(image.frame_id, frame, image.stamp, timeout_s,
-                                       f'set base_frame to {frame}, and base_from_camera')
+                                       f'set base_frame to {frame}, and base_from_camera, or '
+                                       'base_from_laser')
         self._unknown.discard(frame)
         return found
 
