@@ -79,8 +79,9 @@ def make_maps(room: Room, dim: Room, first: Rows, second: Rows) -> Iterator[tupl
     yield MAPS[3], _updated(begin, dim, second)
     world = moved_half(_STALE_M, World(begin.landmark_map, begin.layer, np.zeros(3)),
                        np.random.default_rng(0))
+    stale = replace(world.layer, landmark_centers=world.landmark_map.centers.astype(np.float32))
     yield MAPS[4], _updated(replace(
-        begin, landmark_map=world.landmark_map, layer=world.layer), dim, second)
+        begin, landmark_map=world.landmark_map, layer=stale), dim, second)
 
 
 def _updated(old: MadeMap, seen: Room, rows: Rows) -> MadeMap:
@@ -126,6 +127,8 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, elsewhere: int
             for other in others if which in MAPS[2:] else ():
                 found += [own(Task(name, which, 'other rooms'), other, other.queries[row], BOTH)
                           for row in rng.permutation(len(other))[:elsewhere]]
+            print(answer_table([answer for answer in found if answer.kind == which],
+                               ['room', 'kind', 'part', 'way']), flush=True)
         return found
     return ask
 

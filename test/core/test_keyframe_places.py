@@ -21,6 +21,7 @@ from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.keyframes.point_pose import find_pose, free_focal, refine
 from cliploc_ros.core.search.scene import Constraint
 from cliploc_ros.errors import MapError
+from cliploc_ros.files.arrays import StoredArray
 from cliploc_ros.offline.recording import layer_words
 from cliploc_ros.offline.recording.keyframe_layer import PosedFeatures, triangulate
 
@@ -74,10 +75,10 @@ def test_a_layer_of_version_1_has_one_deviation_and_no_recordings(file):
         load_layer_of_map(file, ROOM)
 
 
-def test_mapped_arrays_survive_a_replaced_file_and_a_flipped_bit_is_found(file, monkeypatch):
-    monkeypatch.setattr('cliploc_ros.files.arrays._MAPPED_BYTES', 0)
+def test_stored_arrays_survive_a_replaced_file_and_a_flipped_bit_is_found(file, monkeypatch):
+    monkeypatch.setattr('cliploc_ros.files.arrays._STORED_BYTES', 0)
     before, layer = make_layer(ROOM), load_layer_of_map(file, ROOM)
-    assert not layer.descriptors.flags.owndata
+    assert isinstance(layer.descriptors, StoredArray)
     save_layer(file, replace(before, descriptors=before.descriptors[::-1]))
     for name in ('pixels', 'points', 'descriptors'):
         np.testing.assert_array_equal(getattr(layer, name), getattr(before, name))

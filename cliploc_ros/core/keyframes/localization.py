@@ -467,9 +467,9 @@ def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,
 def keyframes_near(poses: NDArray[np.float64], guess: NDArray[np.float64], most: float = 1.0
                    ) -> NDArray[np.int64]:
     """Return the keyframes whose views overlap the view of a pose, the closest first."""
-    costs = _distances(poses, guess)
-    order = np.argsort(costs, kind='stable')
-    return np.asarray(order[costs[order] < most])
+    near = np.nonzero(np.linalg.norm(poses[:, :3, 3] - guess[:3, 3], axis=1) < most * NEAR_M)[0]
+    costs = _distances(poses[near], guess)
+    return near[np.argsort(costs, kind='stable')[:np.count_nonzero(costs < most)]]
 
 
 def _distances(poses: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
