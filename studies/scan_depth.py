@@ -36,21 +36,21 @@ _SIDE_M, _MOST_M, _SLICE_M, _BELOW_M, _BEAM = 0.05, 6.0, 0.15, 0.5, np.radians(0
 _LEAST_HITS = 2
 
 
-def slice_of(raw: RawFrame, height_m: float) -> Floats:
+def slice_of(raw: RawFrame, its_pose: Floats, height_m: float) -> Floats:
     """Return the nearest point (n, 2) of each beam of a slice of a depth image, in the map."""
-    assert raw.depth is not None and raw.map_from_camera is not None
+    assert raw.depth is not None
     depth, (_, camera) = raw.depth(), raw.color()
     its = depth.camera or camera
     rows, columns = np.mgrid[0:depth.depths_m.shape[0]:2, 0:depth.depths_m.shape[1]:2]
     z = depth.depths_m[::2, ::2].astype(float)
     points = np.stack([(columns - its.cx) / its.fx * z, (rows - its.cy) / its.fy * z, z], axis=-1)
     points = points[np.isfinite(z)]
-    pose = raw.map_from_camera
+    pose = its_pose
     if depth.camera is not None:
         pose = pose @ depth.camera.color_from_depth
     points = points @ pose[:3, :3].T + pose[:3, 3]
     points = points[np.abs(points[:, 2] - height_m) < _SLICE_M, :2]
-    offsets = points - raw.map_from_camera[:2, 3]
+    offsets = points - its_pose[:2, 3]
     ways = np.linalg.norm(offsets, axis=1)
     kept = (ways > 0.2) & (ways < _MOST_M)
     points, ways = points[kept], ways[kept]
@@ -59,14 +59,13 @@ def slice_of(raw: RawFrame, height_m: float) -> Floats:
     return points[order][np.unique(beams[order], return_index=True)[1]]
 
 
-def grid_of(raws: list[RawFrame], slices: list[Floats]) -> OccupancyGrid:
+def grid_of(poses: Floats, slices: list[Floats]) -> OccupancyGrid:
     """Return the grid of slices: cells that beams end in, and cells that they pass."""
-    every = np.concatenate([*slices, *[raw.map_from_camera[None, :2, 3] for raw in raws]])
+    every = np.concatenate([*slices, poses[:, :2, 3]])
     low = every.min(axis=0) - 1.0
     width, height = np.ceil((every.max(axis=0) + 1.0 - low) / _SIDE_M).astype(int)
     hits, passed = np.zeros((height, width), int), np.zeros((height, width), int)
-    for raw, points in zip(raws, slices, strict=True):
-        start = raw.map_from_camera[:2, 3]
+    for start, points in zip(poses[:, :2, 3], slices, strict=True):
         for point in points:
             count = int(np.linalg.norm(point - start) / _SIDE_M)
             line = np.linspace(start, point, max(2, count), endpoint=False)[:-2]
@@ -82,9 +81,8 @@ def grid_of(raws: list[RawFrame], slices: list[Floats]) -> OccupancyGrid:
     return OccupancyGrid(cells, _SIDE_M, pose, 'map')
 
 
-def scan_of(raw: RawFrame, points: Floats, side: float = 1.0) -> Scan:
+def scan_of(pose: Floats, points: Floats, side: float = 1.0) -> Scan:
     """Return the slice of an image as the scan of a laser at its camera."""
-    pose = raw.map_from_camera
     yaw = np.arctan2(pose[1, 2], pose[0, 2])
     offsets = points - pose[:2, 3]
     angles = np.arctan2(offsets[:, 1], offsets[:, 0]) - yaw
@@ -98,30 +96,28 @@ def answers(room: Room, kinds: list[str]) -> Iterator[dict[str, Any]]:
     """Yield the answers to the images of a room, in the form of studies.scan."""
     poses = room.detections.map_from_camera.copy()
     poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()  # rounded in files
-    raws = [replace(raw, map_from_camera=pose)
-            for raw, pose in zip(room.raws, poses, strict=True)]
     height = float(np.median(poses[:, 2, 3])) - _BELOW_M
-    slices = [slice_of(raw, height) for raw in raws]
+    slices = [slice_of(raw, pose, height) for raw, pose in zip(room.raws, poses, strict=True)]
     print(room.name, 'beams of an image:', np.quantile([*map(len, slices)], [0.1, 0.5, 0.9]))
     for kind, part, mapped, asked in room.parts():
         if kind not in kinds:
             continue
         landmark_map: LandmarkMap = build_map(room.detections.select_frames(mapped)).landmark_map
-        grid = grid_of([raws[row] for row in mapped], [slices[row] for row in mapped])
+        grid = grid_of(poses[mapped], [slices[row] for row in mapped])
         grid = replace(grid, frame_id=landmark_map.frame_id)
         relocalizer = Relocalizer(landmark_map, RelocalizerOptions(matching='class'))
         rng = np.random.default_rng(0)
         for row in asked:
             query = room.queries[row]
             query = replace(query, observation=replace(query.observation, depths=None))
-            truth, raw = query.map_from_camera, raws[row]
+            truth = poses[row]
             other = int(rng.choice(asked))
-            away = pose_error(raws[other].map_from_camera, truth)
-            scans = {'nothing wrong': scan_of(raw, slices[row]),
-                     'scan mirrored': scan_of(raw, slices[row], -1.0)}
+            away = pose_error(poses[other], truth)
+            scans = {'nothing wrong': scan_of(truth, slices[row]),
+                     'scan mirrored': scan_of(truth, slices[row], -1.0)}
             if away[0] > 1.5 or away[1] > 60.0:
                 scans['scan of another place'] = replace(
-                    scan_of(raws[other], slices[other]),
+                    scan_of(poses[other], slices[other]),
                     camera_from_laser=scans['nothing wrong'].camera_from_laser)
             found = {'nothing wrong': relocalizer.search(query.observation)}
             for factor in (0.5, 2.0):

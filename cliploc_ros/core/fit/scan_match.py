@@ -54,7 +54,6 @@ _EXPLAINED, _LEAST_EXPLAINED, _USUAL, _USUAL_SHARE = math.exp(-2.0), 0.5, 0.3, 0
 # Weight of 1 minus the mean likelihood of the beams: with all beams on one wall, the deviation
 # is 4 cm.
 _WEIGHT = 2.0 * (grids.DEVIATION_M / 0.04) ** 2
-_GAP_M, _UNKNOWN, _LIKELIHOODS = grids.GAP_M, grids.UNKNOWN, grids.LIKELIHOODS
 # Least deviations of a pose before it is moved [m] [rad], and the rows of x, y and yaw.
 _LEAST_DEVIATIONS, _PLANAR = (0.05, 0.05, math.radians(1.0)), np.ix_([0, 1, 5], [0, 1, 5])
 
@@ -102,7 +101,7 @@ def correlate(poses, beams, gaps, side_m, step):
                         and 0 <= line <= gaps.shape[0] - _SIDE):
                     for i in range(_SIDE):
                         for j in range(_SIDE):
-                            sums[i, j] += _LIKELIHOODS[gaps[line + i, column + j]]
+                            sums[i, j] += grids.LIKELIHOODS[gaps[line + i, column + j]]
             at, best = np.argmax(sums), sums.max()
             if best > found[row, 3]:
                 found[row] = (poses[row, 0] + (at % _SIDE - _CELLS) * side_m,
@@ -127,15 +126,15 @@ def score(pose, beams, gaps, side_m):
                     break
                 is_free = gaps[i, j] > 0
                 # unknown cells are at least three deviations from an occupied cell
-                gap = _BEHIND_M if gaps[i, j] == _UNKNOWN else _GAP_M * gaps[i, j]
+                gap = _BEHIND_M if gaps[i, j] == grids.UNKNOWN else grids.GAP_M * gaps[i, j]
                 gone += max(side_m, gap - side_m)
         j = math.floor((pose[0] + way_m * cos) / side_m)
         i = math.floor((pose[1] + way_m * sin) / side_m)
         is_inside = 0 <= i < gaps.shape[0] and 0 <= j < gaps.shape[1]
-        if is_free and not (is_inside and gaps[i, j] != _UNKNOWN):
+        if is_free and not (is_inside and gaps[i, j] != grids.UNKNOWN):
             continue
         known += 1
-        reached = _LIKELIHOODS[gaps[i, j]] if beams[beam, 2] else _FREE
+        reached = grids.LIKELIHOODS[gaps[i, j]] if beams[beam, 2] else _FREE
         value = reached if is_free else _THROUGH
         total, explained = total + value, explained + (value > _EXPLAINED)
     more, count = _USUAL_SHARE * len(beams), len(beams)
@@ -200,7 +199,8 @@ class ScanMatcher:
         against, by_rank = np.interp(np.log([better, rank]), np.log(_RANKS), [
             _TERMS[f'rank_{knot}'] for knot in _RANKS])
         odds = found[5] * (min(0.0, against) + max(0.0, by_rank) * np.interp(
-            found[4], (_TERMS.explained, _TERMS.well_explained), (0.0, 1.0)))
+            found[4], (_TERMS.explained, _TERMS.well_explained), (0.0, 1.0)) * min(
+                1.0, np.ptp(self._scan.angles) / _TERMS.wide_rad))
         return ScanFit(float(odds), float(found[4]), int(rank),
                        tuple((self._turn @ (found[:3] - start)).tolist()))
 
@@ -225,7 +225,7 @@ class ScanMatcher:
             cos, sin = math.cos(its[2]), math.sin(its[2])
             ends = its[:2] + hits @ [[cos, sin], [-sin, cos]]
             away = map_coordinates(gaps, ends.T[::-1] / side_m - 0.5, float, 1, 'nearest')
-            return np.append(np.sqrt(weight * (1.0 - _LIKELIHOODS[1] ** away ** 2)),
+            return np.append(np.sqrt(weight * (1.0 - grids.LIKELIHOODS[1] ** away ** 2)),
                              root @ (its - start))
         best = least_squares(errors, start + turn.T @ fit.step, diff_step=1e-4, max_nfev=12)
         seen[_PLANAR] = (rows := turn @ best.jac[:len(hits)].T) @ rows.T
