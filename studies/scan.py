@@ -26,18 +26,14 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Scan
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.relocalizer import Relocalizer
+from cliploc_ros.core.search.frame_search import SearchedFrame
 from cliploc_ros.offline.posed_query import PosedQuery
 from studies.acceptance.places import VERTICAL, Simulated
-from studies.acceptance.troubles import (
-    FAMILIES,
-    add_aged_twin,
-    exchange_landmarks,
-    unchanged,
-)
-from studies.wrong_sensors import scaled_focal, wrong_mount
+from studies.acceptance.troubles import FAMILIES, add_aged_twin, exchange_landmarks, unchanged
 from studies.worlds.cameras import looking
 from studies.worlds.places import Objects, Place
 from studies.worlds.world import objects_of
+from studies.wrong_sensors import scaled_focal, wrong_mount
 
 Floats = NDArray[np.float64]
 SIDE_M, HEIGHT_M, MOST_M, NOISE_M = 0.05, 0.25, 10.0, 0.02
@@ -173,7 +169,7 @@ def elsewhere(seen: Seen, pose: Floats, rng: np.random.Generator) -> Floats:
     """Draw a free spot (3,) far from a pose, if there is one."""
     poses = grid_of(seen.floor).field
     low = seen.floor.walls[:, :2].min(axis=0) - 1.0 - poses.margin_m
-    spots = poses.poses + [*low, 0.0]
+    spots = poses.poses + np.append(low, 0.0)
     far = np.linalg.norm(spots[:, :2] - pose[:2, 3], axis=1) > 2.0
     return np.asarray(spots[rng.choice(np.nonzero(far)[0] if far.any() else len(spots))])
 
@@ -229,50 +225,62 @@ def answers(kind: str, seed: int, mode: str, fovs: Sequence[float], families: Se
         its = doubled(mapped, world.landmark_map, 2.0) if fault == 'aged twin' else mapped
         floor, grid = moved(its, _MOVED, rng), grid_of(its)
         for query in queries:
-            truth = query.map_from_camera
             about = {'kind': kind, 'seed': seed, 'number': query.number, 'mode': mode}
-
-            def answer(family: str, fov: float, scan: Scan | None, grid: OccupancyGrid | None,
-                       ) -> dict[str, Any]:
-                result = relocalizer.locate([searched._replace(observation=replace(
-                    query.observation, scan=scan))], grid=grid)
-                evidence = result.evidence
-                fits, wrong = [], fault == 'another place'
-                if scan is not None and grid is not None:
-                    matcher = ScanMatcher(scan, grid, found)
-                    poses = [hypothesis.map_from_camera for hypothesis in plain.hypotheses]
-                    fits = [(fit.rank, fit.rank, 99.0 if wrong else pose_error(pose, truth)[0],
-                             fit.explained)
-                        for pose in poses if (fit := matcher.fits(pose))]
-                error = np.inf if result.map_from_camera is None or wrong else pose_error(
-                    result.map_from_camera, truth)[0]
-                return about | {
-                    'family': family, 'fov': fov, 'accepted': result.accepted,
-                    'error_m': float(error), 'confidence': result.confidence, 'fits': fits,
-                    'reason': str(result.refusal_kind or ''),
-                    'odds': None if evidence is None or evidence.scan is None
-                    else evidence.scan.odds}
-            searched = relocalizer.search(query.observation)
-            plain = relocalizer.locate([searched])
-            yield answer(fault, 0.0, None, None)
+            case = Case(relocalizer, relocalizer.search(query.observation), query,
+                        fault == 'another place')
+            yield about | case.answer(fault, 0.0)
             for fov in fovs if fault in ('nothing wrong', 'aged twin') else fovs[:1]:
                 seen = Seen(its, floor, other, fov)
-                scan = scan_of(seen, truth, rng)
-                yield answer(fault, fov, scan, grid)
-                if fault != 'nothing wrong' or fov != fovs[0]:
+                scan = scan_of(seen, query.map_from_camera, rng)
+                yield about | case.answer(fault, fov, scan, grid)
+                if fault != 'nothing wrong' or fov != fovs[0] or 'scans' not in families:
                     continue
-                for family, draw in SCANS.items() if 'scans' in families else ():
-                    yield answer(family, fov, draw(seen, truth, rng), grid)
-                for family, make in GRIDS.items() if 'scans' in families else ():
-                    yield answer(family, fov, scan, make(seen))
+                for family, draw in SCANS.items():
+                    yield about | case.answer(family, fov, draw(
+                        seen, query.map_from_camera, rng), grid)
+                for family, make in GRIDS.items():
+                    yield about | case.answer(family, fov, scan, make(seen))
+
+
+class Case(NamedTuple):
+    """A searched image of a place."""
+
+    relocalizer: Relocalizer
+    searched: SearchedFrame
+    query: PosedQuery
+    is_elsewhere: bool  #: Whether every pose is wrong
+
+    def answer(self, family: str, fov: float, scan: Scan | None = None,
+               grid: OccupancyGrid | None = None) -> dict[str, Any]:
+        """Return the fields of the answer with a scan."""
+        result = self.relocalizer.locate([self.searched._replace(observation=replace(
+            self.searched.observation, scan=scan))], grid=grid)
+        fits = []
+        if scan is not None and grid is not None:
+            matcher = ScanMatcher(scan, grid, self.relocalizer.landmark_map)
+            plain = self.relocalizer.locate([self.searched])
+            fits = [(found.rank, self.error_m(hypothesis.map_from_camera), found.explained)
+                    for hypothesis in plain.hypotheses
+                    if (found := matcher.fits(hypothesis.map_from_camera))]
+        evidence = result.evidence
+        return {'family': family, 'fov': fov, 'accepted': result.accepted,
+                'error_m': self.error_m(result.map_from_camera), 'fits': fits,
+                'confidence': result.confidence, 'reason': str(result.refusal_kind or ''),
+                'scan': str(evidence.scan) if evidence and evidence.scan else ''}
+
+    def error_m(self, pose: Floats | None) -> float:
+        """Return the distance of a pose (4, 4) from the truth [m]; infinite without one."""
+        if pose is None or self.is_elsewhere:
+            return float('inf')
+        return pose_error(pose, self.query.map_from_camera)[0]
 
 
 def doubled(floor: Floor, landmark_map: LandmarkMap, gap_m: float) -> Floor:
     """Return a floor with a copy beside it, as add_equal_room does."""
     step = float(np.ptp(landmark_map.centers[:, 0])) + gap_m
     # walls between the rooms that the copy would cut are left out
-    return Floor(np.concatenate([floor.walls, floor.walls + [step, 0.0, step, 0.0]]),
-                 np.concatenate([floor.things, floor.things + [step, 0.0, 0.0]]))
+    return Floor(np.concatenate([floor.walls, floor.walls + np.array([step, 0.0, step, 0.0])]),
+                 np.concatenate([floor.things, floor.things + np.array([step, 0.0, 0.0])]))
 
 
 def report(rows: Sequence[dict[str, Any]]) -> None:
@@ -295,17 +303,15 @@ def fit(rows: Sequence[dict[str, Any]], wrong_scans: float = 0.05) -> None:
     """Print the log odds of each range of ranks: how often right and wrong poses have them."""
     edges = np.array([0, 1, 4, 20, 100, 249, np.inf])
     every = [(*found, row['family']) for row in rows for found in row['fits']]
-    good, bad, wrong = ([found for found in every if is_chosen(found)] for is_chosen in (
-        lambda found: found[2] < RIGHT_M and found[4] not in (*SCANS, *GRIDS),
-        lambda found: found[2] < RIGHT_M and found[4] in SCANS,
-        lambda found: found[2] > _FAR_M and found[4] not in (*SCANS, *GRIDS)))
-    for column, name in enumerate(('better', 'rank')):
-        counts = np.array([np.histogram([found[column] for found in chosen], edges + 0.5)[0]
-                           for chosen in (good, bad, wrong)])
-        right, late, chance = (counts + 0.5) / (counts.sum(axis=1, keepdims=True) + 3.0)
-        odds = np.log(((1.0 - wrong_scans) * right + wrong_scans * late) / chance)
-        print(f'{name}: up to {edges[1:]}; right poses, with a wrong scan, wrong poses:\n{counts}\n'
-              f'{np.array([right, late, chance]).round(3)}\n  log odds {odds.round(2)}')
+    counts = np.array([np.histogram([found[0] for found in every if is_chosen(found)],
+                                    edges + 0.5)[0] for is_chosen in (
+        lambda found: found[1] < RIGHT_M and found[3] not in (*SCANS, *GRIDS),
+        lambda found: found[1] < RIGHT_M and found[3] in SCANS,
+        lambda found: found[1] > _FAR_M and found[3] not in (*SCANS, *GRIDS))])
+    right, late, chance = (counts + 0.5) / (counts.sum(axis=1, keepdims=True) + 3.0)
+    odds = np.log(((1.0 - wrong_scans) * right + wrong_scans * late) / chance)
+    print(f'ranks up to {edges[1:]}: right poses, right poses with a wrong scan, wrong poses:\n'
+          f'{counts}\n{np.array([right, late, chance]).round(3)}\n  log odds {odds.round(2)}')
 
 
 def main() -> None:

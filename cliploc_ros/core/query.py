@@ -140,8 +140,8 @@ def _unpacked(text: str) -> OccupancyGrid:
     packed, resolution_m, pose, frame_id = parse_json(text)
     png = base64.b64decode(packed)
     _expect(math.prod(struct.unpack('>II', png[16:24])) <= _MOST_CELLS, 'grid')
-    cells = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE).view(np.int8)
-    return OccupancyGrid(cells, float(resolution_m), _numbers(pose, 4, 4), frame_id)
+    cells = np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE))
+    return OccupancyGrid(cells.view(np.int8), float(resolution_m), _numbers(pose, 4, 4), frame_id)
 
 
 def read_case(path: Path) -> Case:
@@ -217,9 +217,9 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
         known[name], *shape, nan=name == 'depths') for name, shape in (
             ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,)),
             ('base_up_in_camera', (3,))))
-    scan = known.get('scan') and Scan(**{
-        name: np.array(value, np.float64) if isinstance(value, list) else float(value)
-        for name, value in known['scan'].items()})
+    scan = known.get('scan') and Scan(**dict[str, Any](
+        (name, np.array(value, np.float64) if isinstance(value, list) else float(value))
+        for name, value in known['scan'].items()))
     return Observation(
         Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
         similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,

@@ -148,9 +148,15 @@ class Comparison:
 
         A scan that fits one of the poses counts against the others, for the reason of the prior.
         """
-        most = max([0.0, *(contender.by_scan for contender in self.contenders)])
-        return confidences(np.array(odds), self.poses[rows], self._none, prior=np.array(
-            [self.contenders[row].prior + self.contenders[row].by_scan - most for row in rows]))
+        most = max([0.0, *map(self._by_scan, self.contenders)])
+        return confidences(np.array(odds), self.poses[rows], self._none, prior=np.array([
+            self.contenders[row].prior + self._by_scan(self.contenders[row]) - most
+            for row in rows]))
+
+    def _by_scan(self, contender: Contender) -> float:
+        """Return the log odds of a scan, which prefers no pose unless it fits the leading one."""
+        lead = self.contenders[0].by_scan
+        return contender.by_scan if lead > 0.0 else max(lead, contender.by_scan)
 
     def proposed(self, seen: Recognition, met: Sequence[Contender]) -> list[Contender]:
         """Return the places that keyframes recognize, as contenders.
@@ -363,7 +369,7 @@ class Comparison:
                                             bool(rooms[row]))
             else:  # the same lead as if the search had found the rival, see confidences
                 by_objects = (1.0 + CALIBRATION.objects.slope) * (best.odds - rival.odds)
-            leads[number] += (best.prior + best.by_scan - rival.prior - rival.by_scan
+            leads[number] += (best.prior + best.by_scan - rival.prior - self._by_scan(rival)
                               + by_objects)
         chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
         return chance, place_of(landmark_map, poses[others][int(np.argmin(leads))])

@@ -35,8 +35,9 @@ _TERMS = CALIBRATION.scan
 # those that correlation uses, and those that are traced: neighbours meet the same walls.
 _BEAMS, _LEAST_BEAMS, _EVERY = 90, 10, 2
 # Windows: cells and steps of the yaw each way, and the step in the coarse and in the fine field
-# [rad]. Penalty of a step, in likelihood of a beam, against moves that the scan does not observe.
-_CELLS, _SIDE, _TURNS, _COARSE, _FINE, _STEP_COST = 2, 5, 3, 0.05, 0.0125, 0.002
+# [rad]. Penalty of a step, in beams, against moves that the scan does not observe.
+_CELLS, _SIDE, _TURNS, _COARSE, _FINE, _STEP_COST = 2, 5, 3, 0.05, 0.0125, 0.1
+_STEPS = np.add.outer(np.arange(-_CELLS, _CELLS + 1) ** 2, np.arange(-_CELLS, _CELLS + 1) ** 2)
 # Number of the random poses that are moved in the fine field. Ranks with log odds in
 # calibration.yaml; the logarithm of the rank is interpolated.
 _REFINED, _RANKS = 250, (1, 4, 20, 100, 250)
@@ -53,7 +54,6 @@ _EXPLAINED, _LEAST_EXPLAINED, _USUAL, _USUAL_SHARE = math.exp(-2.0), 0.5, 0.3, 0
 # Weight of 1 minus the mean likelihood of the beams: with all beams on one wall, the deviation
 # is 4 cm.
 _WEIGHT = 2.0 * (grids.DEVIATION_M / 0.04) ** 2
-_GAP_M, _UNKNOWN, _LIKELIHOODS = grids.GAP_M, grids.UNKNOWN, grids.LIKELIHOODS
 # Least deviations of a pose before it is moved [m] [rad], and the rows of x, y and yaw.
 _LEAST_DEVIATIONS, _PLANAR = (0.05, 0.05, math.radians(1.0)), np.ix_([0, 1, 5], [0, 1, 5])
 
@@ -93,7 +93,7 @@ def correlate(poses, beams, gaps, side_m, step):
             yaw = poses[row, 2] + turn * step
             cos, sin = math.cos(yaw) / side_m, math.sin(yaw) / side_m
             x, y = poses[row, 0] / side_m - _CELLS, poses[row, 1] / side_m - _CELLS
-            sums[:] = 0.0
+            sums[:] = -_STEP_COST * (_STEPS + turn ** 2)
             for beam in range(0, len(beams), _EVERY):
                 column = math.floor(x + cos * beams[beam, 0] - sin * beams[beam, 1])
                 line = math.floor(y + sin * beams[beam, 0] + cos * beams[beam, 1])
@@ -101,14 +101,11 @@ def correlate(poses, beams, gaps, side_m, step):
                         and 0 <= line <= gaps.shape[0] - _SIDE):
                     for i in range(_SIDE):
                         for j in range(_SIDE):
-                            sums[i, j] += _LIKELIHOODS[gaps[line + i, column + j]]
-            for i in range(_SIDE):
-                for j in range(_SIDE):
-                    value = sums[i, j] - _STEP_COST * len(beams) / _EVERY * (
-                        (i - _CELLS) ** 2 + (j - _CELLS) ** 2 + turn ** 2)
-                    if value > found[row, 3]:
-                        found[row] = (poses[row, 0] + (j - _CELLS) * side_m,
-                                      poses[row, 1] + (i - _CELLS) * side_m, yaw, value)
+                            sums[i, j] += grids.LIKELIHOODS[gaps[line + i, column + j]]
+            at, best = np.argmax(sums), sums.max()
+            if best > found[row, 3]:
+                found[row] = (poses[row, 0] + (at % _SIDE - _CELLS) * side_m,
+                              poses[row, 1] + (at // _SIDE - _CELLS) * side_m, yaw, best)
     return found
 
 
@@ -129,15 +126,15 @@ def score(pose, beams, gaps, side_m):
                     break
                 is_free = gaps[i, j] > 0
                 # unknown cells are at least three deviations from an occupied cell
-                gap = _BEHIND_M if gaps[i, j] == _UNKNOWN else _GAP_M * gaps[i, j]
+                gap = _BEHIND_M if gaps[i, j] == grids.UNKNOWN else grids.GAP_M * gaps[i, j]
                 gone += max(side_m, gap - side_m)
         j = math.floor((pose[0] + way_m * cos) / side_m)
         i = math.floor((pose[1] + way_m * sin) / side_m)
         is_inside = 0 <= i < gaps.shape[0] and 0 <= j < gaps.shape[1]
-        if is_free and not (is_inside and gaps[i, j] != _UNKNOWN):
+        if is_free and not (is_inside and gaps[i, j] != grids.UNKNOWN):
             continue
         known += 1
-        reached = _LIKELIHOODS[gaps[i, j]] if beams[beam, 2] else _FREE
+        reached = grids.LIKELIHOODS[gaps[i, j]] if beams[beam, 2] else _FREE
         value = reached if is_free else _THROUGH
         total, explained = total + value, explained + (value > _EXPLAINED)
     more, count = _USUAL_SHARE * len(beams), len(beams)
@@ -188,8 +185,8 @@ class ScanMatcher:
 
     def __init__(self, scan: Scan, grid: grids.OccupancyGrid, landmark_map: LandmarkMap) -> None:
         self._scan, self._grid, self._map = scan, grid, landmark_map
-        self._turn = np.eye(3)  # rotates x, y and yaw from the grid to its coordinate frame
-        self._turn[:2, :2] = grid.frame_from_grid[:2, :2]
+        # rotates x, y and yaw from the grid to its coordinate frame, because it is level
+        self._turn = grid.frame_from_grid[:3, :3]
 
     def fits(self, pose: NDArray[np.float64]) -> ScanFit | None:
         """Return how well the scan fits at a pose (4, 4); None if it says nothing."""
@@ -207,7 +204,8 @@ class ScanMatcher:
         against, by_rank = np.interp(np.log([better, rank]), np.log(_RANKS), [
             _TERMS[f'rank_{knot}'] for knot in _RANKS])
         odds = found[5] * (min(0.0, against) + max(0.0, by_rank) * np.interp(
-            found[4], (_TERMS.explained, _TERMS.well_explained), (0.0, 1.0)))
+            found[4], (_TERMS.explained, _TERMS.well_explained), (0.0, 1.0)) * min(
+                1.0, np.ptp(self._scan.angles) / _TERMS.wide_rad))
         return ScanFit(float(odds), float(found[4]), int(rank),
                        tuple((self._turn @ (found[:3] - start)).tolist()))
 
@@ -221,7 +219,7 @@ class ScanMatcher:
         at = self._laser(pose)
         if at is None or fit.odds < 0.0 or fit.explained < _LEAST_EXPLAINED:
             return pose, covariance, fit
-        (start, beams, _), field, turn = at, self._grid.field, self._turn
+        (start, beams, _), (gaps, side_m, *_), turn = at, self._grid.field, self._turn
         hits = beams[beams[:, 2] > 0.0, :2]
         lever = pose[:3, :3] @ self._scan.camera_from_laser[:3, 3]
         of_laser, seen = move_covariance(covariance, lever), np.zeros((6, 6))
@@ -231,9 +229,8 @@ class ScanMatcher:
         def errors(its: NDArray[np.float64]) -> NDArray[np.float64]:
             cos, sin = math.cos(its[2]), math.sin(its[2])
             ends = its[:2] + hits @ [[cos, sin], [-sin, cos]]
-            gaps = map_coordinates(field.gaps, ends.T[::-1] / field.side_m - 0.5, float, 1,
-                                   'nearest') * (grids.GAP_M / grids.DEVIATION_M)
-            return np.append(np.sqrt(weight * (1.0 - np.exp(-0.5 * gaps ** 2))),
+            away = map_coordinates(gaps, ends.T[::-1] / side_m - 0.5, float, 1, 'nearest')
+            return np.append(np.sqrt(weight * (1.0 - grids.LIKELIHOODS[1] ** away ** 2)),
                              root @ (its - start))
         best = least_squares(errors, start + turn.T @ fit.step, diff_step=1e-4, max_nfev=12)
         seen[_PLANAR] = (rows := turn @ best.jac[:len(hits)].T) @ rows.T

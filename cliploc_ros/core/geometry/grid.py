@@ -76,12 +76,11 @@ class OccupancyGrid:
         is_free = (cells >= 0) & (cells < FREE)
         gaps[~is_free & (gaps > 3.0 * DEVIATION_M / GAP_M)] = UNKNOWN
         factor = max(1, round(_COARSE_M / side_m))
-        coarse = DEVIATION_M / _COARSE_DEVIATION_M * cv2.erode(gaps, np.ones(
-            (factor, factor), np.uint8), anchor=(0, 0))[::factor, ::factor]
+        coarse = (DEVIATION_M / _COARSE_DEVIATION_M * cv2.erode(gaps, np.ones(
+            (factor, factor), np.uint8), anchor=(0, 0))[::factor, ::factor]).astype(np.uint8)
         rng = np.random.default_rng(0)
         spots = np.argwhere(is_free & (gaps >= _CLEARANCE_M / GAP_M))
         spots = rng.choice(spots, _POSES if len(spots) else 0)
         poses = side_m * np.column_stack([spots[:, ::-1] + rng.random(spots.shape),
                                           rng.uniform(-np.pi, np.pi, len(spots)) / side_m])
-        return GridField(gaps, side_m, np.ascontiguousarray(coarse, np.uint8), factor * side_m,
-                         margin * side_m, poses)
+        return GridField(gaps, side_m, coarse, factor * side_m, margin * side_m, poses)
