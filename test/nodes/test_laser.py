@@ -104,7 +104,7 @@ def test_scans_are_compared_with_the_newest_grid(laser, tester):
         server.publish(grid_of(grid))
         ask_until('rank 1 of 2,000')
         assert pose_error(transform_of(tester.poses[-1].pose.pose), MAP_FROM_BASE)[0] < 0.05
-        for wrong, named in (({'resolution': 0.0}, 'a resolution above 0'), (
+        for wrong, named in (({'resolution': 0.0}, 'grid: '), (
                 {'frame_id': 'floor_2'}, "in frame 'floor_2', the map in 'map'")):
             server.publish(grid_of(cells(), **wrong))
             ask_until(named)
