@@ -154,6 +154,13 @@ def recording_of(options: argparse.Namespace, file: Path, scale: float,
                         scale=scale, rotation=rotation.tolist(), **topics)
 
 
+def has_unit(recording: MapRecording) -> bool:
+    """Return whether the unit of the poses of a map's recording was known or given."""
+    layout = recording.source and find_layout(recording.source, recording.layout)
+    return (not layout or layout.key not in ('colmap', 'nerf') or recording.scale != 1.0
+            or not recording.placing.keys().isdisjoint(('scale', 'known_distance')))
+
+
 def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str, frames.Frames]:
     """Return the images of the source by camera, with their poses in a map, see read_cameras.
 
@@ -164,8 +171,9 @@ def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str
     if built_from is None or built_from.source is None or (
             built_from.source.resolve() != source_of(options).resolve()):
         if options.bag is not None and built_from is not None and built_from.is_moved:
-            raise OptionsError(f'{map_file}: was levelled or scaled by build_map, the poses of '
-                               '--bag were not; give the recording that the map was built from')
+            raise OptionsError(f'{map_file}: was levelled or scaled by build_map, or aligned, the '
+                               'poses of --bag were not; give the recording that the map was '
+                               'built from')
         return read_cameras(options, gap_s=0.0)
     if not any(getattr(options, name) for name in _PLACING):
         for name, value in built_from.placing.items():
@@ -174,7 +182,7 @@ def read_cameras_of_map(options: argparse.Namespace, map_file: Path) -> dict[str
     images = read_cameras(options, gap_s=0.0, any_unit=is_scaled)
     if not built_from.is_moved:
         return images
-    return {name: frames.move_frames(own, built_from.scale, np.array(built_from.rotation))
+    return {name: frames.move_frames(own, *built_from.placing_of_poses)
             for name, own in images.items()}
 
 
@@ -235,7 +243,8 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
     joined = join_detections(parts)
     file = options.out.with_suffix(f'.{len(joined)}.npz')
     # its poses are those of the first recording
-    save_observations(file, joined.moved(1.0 / recording.scale, np.array(recording.rotation).T))
+    scale, rotation, shift = recording.placing_of_poses
+    save_observations(file, joined.moved(1.0 / scale, rotation.T, -rotation.T @ shift / scale))
     return joined, replace(recording, observations=file), None, layer
 
 
@@ -269,7 +278,8 @@ def read_cameras(options: argparse.Namespace, gap_s: float | None = None, *,
     folder = frames.FolderOptions(
         options.intrinsics, options.trajectory and read_tum_trajectory(options.trajectory), gap_ns,
         mounts[''], _depth_format(options), key, options.images, options.axes, options.scale,
-        distance, any_unit or getattr(options, 'object_size', None) is not None, options.level,
+        distance, any_unit or any(getattr(options, name, None) for name in (
+            'object_size', 'align_grid')), options.level,
         round(options.stamp_tolerance * NS_PER_S))
     return {'': rgbd_frames(path, folder) if key == 'rgbd' else read_folder(path, folder)}
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import are_rigid, make_transform
+from cliploc_ros.core.geometry.transforms import are_rigid, make_transform, move_poses
 from cliploc_ros.core.keyframes.features import ONLY_SIFT, SIFT, FeatureKind, FeatureKinds
 from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
@@ -133,6 +133,14 @@ class KeyframeLayer:
             array := getattr(self, name), np.ndarray)}
         return replace(self, offsets=self.offsets[:len(self)][chosen], ends=ends[chosen],
                        images=None, image_offsets=None, **columns)
+
+    def moved(self, scale: float, rotation: NDArray[np.float64], shift: NDArray[np.float64]
+              ) -> 'KeyframeLayer':
+        """Return the layer scaled, rotated (3, 3), then shifted (3,), see move_poses."""
+        return replace(
+            self, map_from_camera=move_poses(self.map_from_camera, scale, rotation, shift),
+            points=(scale * self.points).astype(self.points.dtype), landmark_centers=(
+                scale * self.landmark_centers @ rotation.T + shift).astype(np.float32))
 
     def plain(self) -> 'KeyframeLayer':
         """Return the layer without compression and no view, to join or to change it."""

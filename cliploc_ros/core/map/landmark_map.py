@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.ellipsoid import STANDS_IN, normalized_lengths, shape_matrices
 from cliploc_ros.core.map.culling import SortedLandmarks, sort_landmarks
@@ -169,6 +170,17 @@ class LandmarkMap:
             self.frame_id, pick(self.landmark_ids), pick(self.labels), pick(self.class_ids),
             self.centers[rows], self.semi_axes[rows], self.quats_xyzw[rows],
             pick(self.details) if self.details else ())
+
+    def moved(self, scale: float, rotation: NDArray[np.float64], shift: NDArray[np.float64]
+              ) -> 'LandmarkMap':
+        """Return the map scaled, rotated (3, 3), then shifted (3,), see move_poses."""
+        quats = Rotation.from_matrix(rotation) * Rotation.from_quat(self.quats_xyzw.reshape(-1, 4))
+        return replace(
+            self, centers=scale * self.centers @ rotation.T + shift,
+            semi_axes=scale * self.semi_axes, quats_xyzw=quats.as_quat(),
+            details=tuple(replace(detail, **{
+                name: scale * value for name in ('position_sigma', 'shared_sigma')
+                if (value := getattr(detail, name)) is not None}) for detail in self.details))
 
     def with_more(self, other: 'LandmarkMap') -> 'LandmarkMap':
         """Return the map with the landmarks of another map appended."""

@@ -119,18 +119,19 @@ class Frames:
         return replace(self, count=len(chosen), read_raw=read_raw, camera='', of_cameras=())
 
 
-def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64]) -> Frames:
-    """Scale and rotate the poses of frames, see move_poses."""
+def move_frames(frames: Frames, scale: float, rotation: NDArray[np.float64],
+                shift: NDArray[np.float64] | float = 0.0) -> Frames:
+    """Scale, rotate and shift the poses of frames, see move_poses."""
     def moved(pose: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-        return None if pose is None else move_poses(pose[None], scale, rotation)[0]
+        return None if pose is None else move_poses(pose[None], scale, rotation, shift)[0]
 
     def read_raw(is_wanted: Wanted) -> Iterator[RawFrame]:
         for raw in frames.read_raw(lambda place, stamp_ns, pose: is_wanted(place, stamp_ns,
                                                                            moved(pose))):
             yield replace(raw, map_from_camera=moved(raw.map_from_camera))
     return replace(
-        frames, read_raw=read_raw, digest=f'{frames.digest} {scale} {rotation.tolist()}',
-        of_cameras=tuple(move_frames(part, scale, rotation) for part in frames.of_cameras))
+        frames, read_raw=read_raw, digest=f'{frames.digest} {scale} {rotation.tolist()} {shift}',
+        of_cameras=tuple(move_frames(part, scale, rotation, shift) for part in frames.of_cameras))
 
 
 def join_frames(of_cameras: Mapping[str, Frames]) -> Frames:

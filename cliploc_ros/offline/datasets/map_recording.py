@@ -8,11 +8,12 @@ map, so that the folders can be moved together, unless they are in the cache fol
 
 import json
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cliploc_ros.core.geometry.transforms import is_rigid, make_transform
 from cliploc_ros.core.map.parameter_file import check_set, set_of
@@ -43,18 +44,32 @@ class MapRecording:
     #: The options that were given for the poses of a folder, see FolderOptions
     placing: dict[str, Any] = field(default_factory=dict)
     #: From poses of the observations to poses in the map: a factor of the positions, then a
-    #: rotation (3, 3)
+    #: rotation (3, 3), then a shift [m]
     scale: float = 1.0
     rotation: list[list[float]] = field(default_factory=lambda: np.eye(3).tolist())
+    shift: list[float] = field(default_factory=lambda: [0.0] * 3)
 
     @property
     def is_moved(self) -> bool:
         """Return whether the poses of the map differ from those of the recording."""
-        return self.scale != 1.0 or not np.array_equal(self.rotation, np.eye(3))
+        return (self.scale != 1.0 or not np.array_equal(self.rotation, np.eye(3))
+                or any(self.shift))
+
+    @property
+    def placing_of_poses(self) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+        """Return scale, rotation (3, 3) and shift (3,), as move_poses takes them."""
+        return self.scale, np.array(self.rotation), np.array(self.shift)
+
+    def moved(self, scale: float, rotation: NDArray[np.float64], shift: NDArray[np.float64]
+              ) -> 'MapRecording':
+        """Return the recording of the map after its move, see move_poses."""
+        return replace(self, scale=scale * self.scale,
+                       rotation=(rotation @ self.rotation).tolist(),
+                       shift=(scale * rotation @ self.shift + shift).tolist())
 
     def load(self) -> PosedDetections:
         """Read the observations, with poses in the map; DatasetError: they cannot be read."""
-        return load_observations(self.observations).moved(self.scale, np.array(self.rotation))
+        return load_observations(self.observations).moved(*self.placing_of_poses)
 
 
 def recordings_folder() -> Path:
@@ -104,9 +119,9 @@ def load_recording(map_file: Path) -> MapRecording | None:
             name: path if path.exists() else None for name, path in paths.items()}))
         turn = np.array(found.rotation, dtype=float)
         is_valid = turn.shape == (3, 3) and 0.0 < found.scale < np.inf and is_rigid(
-            make_transform(turn, np.zeros(3)))
+            make_transform(turn, np.array(found.shift, dtype=float)))
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DatasetError(f'{path}: cannot be read: {error}; remove it') from error
     if not is_valid:
-        raise DatasetError(f'{path}: has no valid scale and rotation; remove it')
+        raise DatasetError(f'{path}: has no valid scale, rotation and shift; remove it')
     return None if found.observations is None else found

@@ -37,7 +37,7 @@ from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection
 from cliploc_ros.offline.mapping.update.updating import UpdatedMap, UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
-from cliploc_ros.offline.recording.joining import join_layers
+from cliploc_ros.offline.recording.joining import Placing, join_layers
 from cliploc_ros.offline.recording.keyframe_layer import LayerOptions, build_layer
 from cliploc_ros.offline.recording.updating import UpdatedLayer, check_belongs, update_layer
 from cliploc_ros.offline.vocabulary.vocabulary import load_vocabulary, shipped_phrases
@@ -60,6 +60,15 @@ class MadeMap:
     removed: LandmarkMap | None = None  #: Landmarks that updates removed from the map
     keyframes: UpdatedLayer | None = None  #: What an update made of the keyframes
     updated: MapSet | None = None  #: The map that was updated
+
+    def moved(self, placing: Placing) -> 'MadeMap':
+        """Return the map and its files in another coordinate frame."""
+        def moved[Part: (LandmarkMap, KeyframeLayer)](part: Part | None) -> Part | None:
+            return None if part is None else part.moved(*placing)
+        return replace(
+            self, landmark_map=self.landmark_map.moved(*placing), removed=moved(self.removed),
+            layer=moved(self.layer), keyframes=self.keyframes and self.keyframes._replace(
+                removed=moved(self.keyframes.removed)))
 
 
 @dataclass(frozen=True)
@@ -253,13 +262,12 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
         The map is invalid, the recording does not belong to it, or the text tower cannot be
         loaded.
     """
-    old, place, kinds = LandmarkMap.from_file(path), layer_path(path), feature_kinds()
-    old_layer = load_layer_of_map(place, old, kinds) if place.exists() else None
+    before = read_made_map(path)
+    old, old_layer = before.landmark_map, before.layer
     if layer is not None and old_layer is not None:
         layer = replace(layer, kind=old_layer.kind)
     if len(old):
-        found = update_landmarks(old, detections, options, load_embeddings_of_map(
-            path, old.landmark_ids, old.map_set), load_removed(path, old.map_set.family))
+        found = update_landmarks(old, detections, options, before.embeddings, before.removed)
         made = _with_layer(_label_new(found, detections, labeller), frames, layer)
         gone = found.gone
         if (new := made.layer) is not None:
@@ -273,11 +281,27 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
     keyframes = update_layer(old_layer, made.layer, gone)
     if not len(old):
         check_belongs(keyframes)
-    removed = [] if keyframes.removed is None else [keyframes.removed]
-    with suppress(MapError):  # there is none, or it is of another map
-        removed.append(load_layer_of_map(layer_path(removed_path(path)), old, kinds))
+    removed = [own.removed for own in (keyframes, before.keyframes)
+               if own is not None and own.removed is not None]
     return replace(_with_layer(made, None, keyframes.layer), keyframes=keyframes._replace(
         removed=join_layers(removed) if removed else None))
+
+
+def read_made_map(path: Path) -> MadeMap:
+    """Read a map and the files next to it; its report is empty.
+
+    CliplocError: a file is invalid.
+    """
+    found, kinds, removed = LandmarkMap.from_file(path), feature_kinds(), None
+    layer, before = layer_path(path), layer_path(removed_path(path))
+    with suppress(MapError):  # there is none, or it is of another map
+        gone = load_layer_of_map(before, found, kinds)
+        removed = UpdatedLayer(gone, gone, ())
+    nothing = MappingReport(0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, (), ())
+    return MadeMap(
+        found, nothing, load_embeddings_of_map(path, found.landmark_ids, found.map_set),
+        load_layer_of_map(layer, found, kinds) if layer.exists() else None,
+        removed=load_removed(path, found.map_set.family), keyframes=removed, updated=found.map_set)
 
 
 def _label_new(updated: UpdatedMap, detections: PosedDetections, labeller: Labeller) -> MadeMap:
@@ -295,8 +319,8 @@ def _label_new(updated: UpdatedMap, detections: PosedDetections, labeller: Label
     return MadeMap(landmark_map, report, updated.embeddings, removed=updated.removed)
 
 
-def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording: MapRecording,
-                   updated: Path | None = None) -> list[str]:
+def write_made_map(path: Path, made: MadeMap, comments: Iterable[str],
+                   recording: MapRecording | None, updated: Path | None = None) -> list[str]:
     """Write a map and the files next to it as one set; return lines about its keyframes.
 
     The keyframes of a map that is replaced are removed if the new one has none.
@@ -308,7 +332,8 @@ def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording
     if is_in_place and LandmarkMap.from_file(path).map_set != made.updated:
         raise MapError(f'{path}: another program changed it during this update; update again')
     besides: dict[Path, WriteOfSet | None] = {
-        recording_path(path): partial(save_recording, path, recording),
+        recording_path(path): None if recording is None else partial(
+            save_recording, path, recording),
         removed_path(path): partial(
             write_landmarks, landmark_map=made.removed) if made.removed else None}
     for place, layer in ((layer_path(path), made.layer), (

@@ -192,8 +192,7 @@ def add_layer(layer: KeyframeLayer, new: KeyframeLayer, is_scaled: bool, same_fr
         note = (f'{agreed} keyframes place it {shift_m:.2f} m and '
                 f'{transforms.rotation_angle_deg(found.rotation):.1f} degrees from where its '
                 f'poses are{", which stay" * same_frame}')
-    new = replace(new, map_from_camera=transforms.move_poses(new.map_from_camera, *placing),
-                  points=(placing.scale * new.points).astype(np.float32))
+    new = new.moved(*placing)
     poses, first = np.concatenate([layer.map_from_camera, new.map_from_camera]), len(layer)
     kept, votes, displaced = np.ones(len(poses), bool), np.zeros(len(poses), dtype=np.int64), 0
     for sight in sights:
