@@ -173,11 +173,14 @@ class LandmarkMap:
 
     def moved(self, scale: float, rotation: NDArray[np.float64], shift: NDArray[np.float64]
               ) -> 'LandmarkMap':
-        """Return the map scaled, rotated (3, 3), then shifted (3,), see move_poses."""
+        """Return the map scaled, rotated (3, 3), then shifted (3,), see move_poses.
+
+        It is of no set: the files next to it do not fit any more.
+        """
         quats = Rotation.from_matrix(rotation) * Rotation.from_quat(self.quats_xyzw.reshape(-1, 4))
         return replace(
             self, centers=scale * self.centers @ rotation.T + shift,
-            semi_axes=scale * self.semi_axes, quats_xyzw=quats.as_quat(),
+            semi_axes=scale * self.semi_axes, quats_xyzw=quats.as_quat(), map_set=NO_SET,
             details=tuple(replace(detail, **{
                 name: scale * value for name in ('position_sigma', 'shared_sigma')
                 if (value := getattr(detail, name)) is not None}) for detail in self.details))

@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 _LEVEL_M, _LEAST_SHARE = 0.1, 0.03
 # Heights above the floor [m] of the slice, and the heights that a wall fills: this many of .1 m
 # above a cell [m]. More than the last number do not count more.
-_SLICE_M, _COLUMN_M, _TALL, _TALLEST = (0.1, 2.0), 0.05, 3, 8
+_SLICE_M, _COLUMN_M, _TALL, _TALLEST = (0.1, 2.0), 0.1, 3, 8
 _LEAST_CELLS = 100
 # Cells of the coarse search, and the deviations of a wall from the grid, coarse to fine [m]. A
 # cell that is known to be free counts against a wall.
@@ -50,7 +50,7 @@ _TRIED = 10  # placings that are refined, of each scale
 _APART_M = 0.5
 # A placing must fit better than all others, and than the mirrored map, by this factor; measured
 # on 4 places, see studies/README.md. A scale that is off by more is named.
-_BETTER, _WRONG_SCALE = 1.25, 0.05
+_BETTER, _WRONG_SCALE, _STRETCHED = 1.3, 0.05, 1.1
 _SCALE_STEP = 0.05
 # Images whose depth is used, and the step of their pixels.
 _IMAGES, _PIXELS = 200, 8
@@ -225,8 +225,9 @@ def place_walls(walls: Walls, grid: OccupancyGrid, heights: Floats | None = None
         found += [np.append(fit[0] / chance, fit) for fit in fits[0]]
     best = _distinct(sorted(found, key=lambda one: -one[0]), walls.radius_m, 2)
     better = min(best[0][0], *(best[0][0] / other[0] for other in best[1:]))
-    free = _refined(walls, field, best[0][2:], True)
-    stretched = np.linalg.norm(free[1:3]) / np.linalg.norm(best[0][2:4])
+    score, *free = _refined(walls, field, best[0][2:], True)
+    stretched = np.hypot(*free[:2]) / np.hypot(*best[0][2:4]) if score > (
+        _STRETCHED * best[0][1]) else 1.0
     return [Fit(better, best[0][1], best[0][2:], float(stretched)),
             *(Fit(1.0, other[1], other[2:]) for other in best[1:])]
 
