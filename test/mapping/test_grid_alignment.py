@@ -3,6 +3,7 @@
 """Alignment with an occupancy grid: the whole map moves, or a picture says why not."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -27,7 +28,7 @@ def make(corners):
     """Return a map with the points of walls and floor, its z up, the camera 1.2 m high."""
     rng, made = np.random.default_rng(0), made_map(1)
     walls = np.concatenate([a + rng.random((int(400 * np.hypot(*(b - a))), 1)) * (b - a)
-                            for a, b in zip(corners[:-1], corners[1:], strict=True)])
+                            for a, b in pairwise(corners)])
     points = np.concatenate([np.column_stack([walls, rng.uniform(0.0, 1.9, len(walls))]),
                              np.column_stack([rng.uniform(0.0, 3.9, (900, 2)), np.zeros(900)])])
     count, pose = len(points), make_transform(np.eye(3), np.array([2.0, 2.0, 1.2]))

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, maximum_filter1d
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -45,13 +45,13 @@ _LEAST_CELLS = 100
 _COARSE_M, _SIGMAS_M, _FREE = 0.2, (0.2, 0.1, 0.05), 0.5
 _SIGMA_M = 0.1
 _LEAST_SCORE = 0.15
-_TRIED = 10  # placings that are refined, of each scale
+_TRIED, _TRIED_EACH = 10, 3  # placings that are refined: of one scale, or of each of several
 # Placings further apart (root mean square of the walls) are different [m].
 _APART_M = 0.5
 # A placing must fit better than all others, and than the mirrored map, by this factor; measured
 # on 4 places, see studies/README.md. A scale that is off by more is named.
 _BETTER, _WRONG_SCALE, _STRETCHED = 1.3, 0.05, 1.1
-_SCALE_STEP = 0.05
+_SCALE_STEP, _LESS = 0.04, 0.7
 # Images whose depth is used, and the step of their pixels.
 _IMAGES, _PIXELS = 200, 8
 _PICTURE_PX = 1000
@@ -106,13 +106,17 @@ def find_walls(points: Floats, unit_m: float = 1.0) -> Walls:
     inside = (heights > floor_m + low) & (heights < floor_m + high)
     cells = np.floor(np.column_stack([points[inside, :2] * (unit_m / _COLUMN_M),
                                       (heights[inside] - floor_m) / 0.1]))
-    columns, tall = np.unique(np.unique(cells, axis=0)[:, :2], axis=0, return_counts=True)
-    columns, tall = columns[tall >= _TALL], np.minimum(tall[tall >= _TALL], _TALLEST)
-    if len(columns) < _LEAST_CELLS:
-        raise MappingError(f'the map has {len(columns)} cells of walls from {low:g} to {high:g} m '
+    column = np.unique(cells[:, :2], axis=0, return_inverse=True)[1].ravel()
+    heights = np.unique(np.column_stack([column, cells[:, 2]]), axis=0)
+    tall = np.bincount(heights[:, 0].astype(np.int64))
+    if (count := int((tall >= _TALL).sum())) < _LEAST_CELLS:
+        raise MappingError(f'the map has {count} cells of walls from {low:g} to {high:g} m '
                            f'above the floor, expected {_LEAST_CELLS} or more: give depth, or '
                            'more images of walls and furniture')
-    places, weights = (columns + 0.5) * (_COLUMN_M / unit_m), tall / tall.sum()
+    places = np.column_stack([np.bincount(column, points[inside, axis]) / np.bincount(column)
+                              for axis in range(2)])[tall >= _TALL]
+    weights = np.minimum(tall[tall >= _TALL], _TALLEST).astype(np.float64)
+    weights /= weights.sum()
     middle = weights @ places
     return Walls(places - middle, weights, middle, floor_m / unit_m)
 
@@ -187,7 +191,7 @@ def align(layer: KeyframeLayer, points: Floats, grid: OccupancyGrid, is_scaled: 
         return Alignment(None, f'{fit}; expected {_BETTER} times as much: is it the grid of this '
                          'floor, not mirrored, with the right resolution? Else map more walls',
                          picture)
-    if abs(np.log(best.stretched)) > _WRONG_SCALE:
+    if not is_scaled and abs(np.log(best.stretched)) > _WRONG_SCALE:
         return Alignment(None, f"its walls are {best.stretched:.2f} times as long in the grid: "
                          "correct the grid's resolution or the scale of the map", picture)
     cos, sin, *middle = best.place
@@ -207,28 +211,34 @@ def place_walls(walls: Walls, grid: OccupancyGrid, heights: Floats | None = None
 
     The scale is free, if `heights` has the heights of the cameras above the floor.
     """
-    field, scales, found = _Field(grid), np.ones(1), list[Floats]()
+    field, scales, fits = _Field(grid), np.ones(1), list[list[Floats]]()
     if heights is not None:
         least, most = np.array(_HEIGHTS_M) / np.median(heights)
         scales = np.geomspace(least, most, 2 + int(np.log(most / least) / _SCALE_STEP))
     sides = walls, walls._replace(places=walls.places * [1.0, -1.0])
     for row, scale in enumerate(scales):
-        fits = []
         for column, side in enumerate(sides):
             rough = list[Floats]()
             for share, some in _search(side, field, scale):
                 rough += some
                 progress('align with the grid', (row + 0.5 * (column + share)) / len(scales))
-            best = _distinct(sorted(rough, key=lambda one: -one[0]), walls.radius_m, _TRIED)
-            fits.append([_refined(side, field, one[1:], heights is not None) for one in best])
-        chance = max(_LEAST_SCORE, *(fit[0] for fit in fits[1]))
-        found += [np.append(fit[0] / chance, fit) for fit in fits[0]]
-    best = _distinct(sorted(found, key=lambda one: -one[0]), walls.radius_m, 2)
-    better = min(best[0][0], *(best[0][0] / other[0] for other in best[1:]))
-    score, *free = _refined(walls, field, best[0][2:], True)
-    stretched = np.hypot(*free[:2]) / np.hypot(*best[0][2:4]) if score > (
-        _STRETCHED * best[0][1]) else 1.0
-    return [Fit(better, best[0][1], best[0][2:], float(stretched)),
+            fits.append([_refined(side, field, one[1:]) for one in _distinct(
+                rough, walls.radius_m, _TRIED if len(scales) == 1 else _TRIED_EACH)])
+    # the best of the mirrored map at similar scales
+    chances = maximum_filter1d([max(fit[0] for fit in some) for some in fits[1::2]], 5)
+    best = _distinct([
+        np.append(fit[0] / max(chance, _LEAST_SCORE), fit)
+        for some, chance in zip(fits[::2], chances, strict=True) for fit in some],
+        walls.radius_m, 2)
+    better = min([best[0][0], *(best[0][0] / other[0] for other in best[1:])])
+    near = _LESS if heights is None else 1.0 - _SCALE_STEP
+    score, *place = max((_refined(walls, field, best[0][2:] * [factor, factor, 1.0, 1.0])
+                         for factor in np.geomspace(near, 1.0 / near, 17)), key=lambda fit: fit[0])
+    stretched = float(np.hypot(*place[:2]) / np.hypot(*best[0][2:4]))
+    if heights is None:  # the unit is kept
+        stretched = stretched if score > _STRETCHED * best[0][1] else 1.0
+        _, score, *place = best[0]
+    return [Fit(better, score, np.array(place), stretched),
             *(Fit(1.0, other[1], other[2:]) for other in best[1:])]
 
 
@@ -254,26 +264,25 @@ def _search(walls: Walls, field: _Field, scale: float) -> Iterator[tuple[float, 
             for score, place in zip(peaks[best], at, strict=True)]
 
 
-def _refined(walls: Walls, field: _Field, place: Floats, is_scaled: bool) -> Floats:
-    """Refine a place by least squares; return (5,) its score and the place."""
+def _refined(walls: Walls, field: _Field, place: Floats) -> Floats:
+    """Refine yaw and position by least squares; return (5,) the score and the place."""
     def moved(step: Floats) -> Floats:
-        turn = np.exp(step[2:3] * 1j + step[3:].sum()) * complex(*place[:2])
-        return np.concatenate([turn.real, turn.imag, place[2:] + step[:2]])
+        turn = np.exp(1j * step[2]) * complex(*place[:2])
+        return np.array([turn.real, turn.imag, *place[2:] + step[:2]])
 
-    step, weights = np.zeros(3 + is_scaled), np.sqrt(walls.weights)
+    step, weights = np.zeros(3), np.sqrt(walls.weights)
     for sigma_m in _SIGMAS_M:
         step = least_squares(lambda step, most: weights * field.distances(
-            walls.at(moved(step)), most), step, diff_step=1e-3, x_scale=np.append(
-                [1.0, 1.0], np.full(1 + is_scaled, 1.0 / walls.radius_m)),
-                             max_nfev=20, args=(3.0 * sigma_m,)).x
+            walls.at(moved(step)), most), step, diff_step=1e-3, max_nfev=20,
+                             x_scale=[1.0, 1.0, 1.0 / walls.radius_m], args=(3.0 * sigma_m,)).x
     found = moved(step)
     return np.append(walls.weights @ field.scores(walls.at(found)), found)
 
 
 def _distinct(found: list[Floats], radius_m: float, most: int) -> list[Floats]:
-    """Return the first of each group of places that are near each other."""
+    """Return the best of each group of places that are near each other; scores come first."""
     kept: list[Floats] = []
-    for one in found:
+    for one in sorted(found, key=lambda one: -one[0]):
         # the distance of two places of the walls, as root mean square
         if len(kept) < most and all(np.linalg.norm((one - other)[-4:] * [
                 radius_m, radius_m, 1.0, 1.0]) > _APART_M for other in kept):
