@@ -14,13 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from cliploc_ros import command
 from cliploc_ros.cli import check_map
-from cliploc_ros.cli.options import (
-    FOLDERS,
-    add_layer_options,
-    add_source_options,
-    folder_of,
-    layer_options,
-)
+from cliploc_ros.cli.options import add_layer_options, add_source_options, folder_of, layer_options
 from cliploc_ros.command import option
 from cliploc_ros.errors import CliplocError, MappingError, OptionsError, misspelt_classes
 
@@ -28,12 +22,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from cliploc_ros.offline.datasets.frames import Frames
     from cliploc_ros.offline.datasets.map_recording import MapRecording
     from cliploc_ros.offline.mapping.make_map import MadeMap
     from cliploc_ros.offline.mapping.options import MappingOptions
     from cliploc_ros.offline.mapping.posed_detections import PosedDetections
-    from cliploc_ros.offline.recording.joining import Placing
 
 # Options of the check after a build: with fewer views, it takes seconds instead of a minute.
 _QUICK = ('--positions', '25', '--headings', '6', '--frames', '30')
@@ -150,29 +142,27 @@ def build(options: argparse.Namespace) -> int:
         raise
     _write_report(options.report, asdict(made.report) | ({} if made.keyframes is None else {
         'keyframes': [fate._asdict() for fate in made.keyframes.fates]}))
-    notes, refusal = [labeller.note, note], ''
-    if options.align_grid is not None:
-        placing, text, refusal = _align(options, made, recording, frames)
-        made, recording = made.moved(placing), recording.moved(*placing)
-        notes.append(text)
-    path, is_poor = _write(options, made, name, recording, notes, begin, refusal)
+    made, recording, text, refusal = _aligned(options, made, recording, frames)
+    path, is_poor = _write(options, made, name, recording, [labeller.note, note, text], begin)
     try:
         if options.check:
             check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]),
                             _ADVICE_SHOWN)
     except CliplocError as error:  # the map is kept
         print(f'note: not checked: {error}')
-    print(refusal or 'refused: the map explains too few of the boxes of its classes: '
-          f'{options.out} is not written; look at {path.name}; check the camera first, then '
-          'stamps, then poses, then the objects' if is_poor else f'to correct it: studio {path}')
+    if refusal is not None:
+        raise refusal
+    print(f'refused: the map explains too few of the boxes of its classes: {options.out} is not '
+          f'written; look at {path.name}; check the camera first, then stamps, then poses, then '
+          'the objects' if is_poor else f'to correct it: studio {path}')
     return int(is_poor)
 
 
 def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: 'MapRecording',
-           notes: Sequence[str], begin: float, refusal: str) -> tuple[Path, bool]:
+           notes: Sequence[str], begin: float) -> tuple[Path, bool]:
     """Write a map, and print its report, and how long the run took since its begin.
 
-    Return its path, which is another one if the map is poor or refused, and whether it is.
+    Return its path, which is another one if the map is poor, and whether it is.
     """
     from cliploc_ros.core.geometry.transforms import quaternion_from_transform
     from cliploc_ros.offline.datasets.poses import mount_from_numbers
@@ -191,9 +181,8 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
         numbers = [*mount[:3, 3], *quaternion_from_transform(mount)]
         lines.append('corrected mount: --mount ' + ' '.join(
             f'{number:.5f}' for number in numbers))
-    is_poor = refusal != '' or (
-        isinstance(made.report, MappingReport) and made.report.landmarks > 0
-        and made.report.explained_of_classes < LEAST_EXPLAINED)
+    is_poor = isinstance(made.report, MappingReport) and made.report.landmarks > 0 and (
+        made.report.explained_of_classes < LEAST_EXPLAINED)
     path = options.out.with_stem(f'{options.out.stem}.refused') if is_poor else options.out
     written = write_made_map(path, made, head, recording, options.update)
     print('\n'.join([*lines, *(f'note: {text}' for text in notes if text),
@@ -204,50 +193,51 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
 
 def _align_finished(options: argparse.Namespace) -> int:
     """Move a finished map into the frame of a grid; return the exit code."""
+    from cliploc_ros.cli.options import FOLDERS
     from cliploc_ros.offline.datasets.map_recording import load_recording
     from cliploc_ros.offline.mapping.make_map import read_made_map, write_made_map
 
     command.check_output(options.out)
     if any(getattr(options, name) for name in ('bag', *FOLDERS, 'observations', 'add')):
-        raise OptionsError('--align-grid with --update is for a finished map, without recording: '
-                           'update it first')
-    made, recording = read_made_map(options.update), load_recording(options.update)
-    placing, text, refusal = _align(options, made, recording, None)
-    if not refusal:
-        write_made_map(options.out, made.moved(placing), [f'{options.update.name}: {text}'],
-                       recording and recording.moved(*placing), options.update)
-    print(refusal or f'{text}\nwrote {options.out}')
-    return int(refusal != '')
+        raise OptionsError('--align-grid with --update is for a finished map, without recording')
+    made, recording, text, refusal = _aligned(options, read_made_map(options.update),
+                                              load_recording(options.update))
+    if refusal is not None:
+        raise refusal
+    write_made_map(options.out, made, [f'{options.update.name} {text}'], recording, options.update)
+    print(f'{text}\nwrote {options.out}')
+    return 0
 
 
-def _align(options: argparse.Namespace, made: 'MadeMap', recording: 'MapRecording | None',
-           frames: 'Frames | None') -> 'tuple[Placing, str, str]':
-    """Find where a map lies in a grid, and write a picture.
+def _aligned(options: argparse.Namespace, made: 'MadeMap', recording: Any, frames: Any = None
+             ) -> 'tuple[MadeMap, Any, str, MappingError | None]':
+    """Move a map and its recording into the frame of the grid that the command line names.
 
-    Return where, how well it fits, and why this was refused, '' if it was not.
+    Return both, how well they fit, and why they were not moved, None if they were or no grid is
+    named. A map that was not moved will be written to another file.
     """
-    import numpy as np
-
     from cliploc_ros.cli.sources import has_unit
     from cliploc_ros.core.map.grid_file import read_grid
     from cliploc_ros.files.storage import write_file
-    from cliploc_ros.offline.mapping import grid_alignment
+    from cliploc_ros.offline.mapping.grid_alignment import align
     from cliploc_ros.offline.page import jpeg_of
-    from cliploc_ros.offline.recording.joining import Placing
 
-    if made.layer is None:
-        raise MappingError(f'--align-grid needs the points of keyframes: {made.note or "none"}')
-    with command.StageBar() as bar:
-        found = grid_alignment.align(
-            made.layer, np.empty((0, 3)) if frames is None else grid_alignment.points_of_depth(
-                frames), read_grid(options.align_grid),
-            recording is not None and not has_unit(recording),
-            recording is not None and recording.image != '', bar.show)
+    if options.align_grid is None:
+        return made, recording, '', None
     picture = options.out.with_suffix('.align.jpg')
-    write_file(picture, lambda place: place.write_bytes(jpeg_of(found.picture)))
-    if found.placing is None:
-        return Placing(), '', f'refused: {found.text}; look at {picture.name}'
-    return found.placing, f'aligned: {found.text}: {picture.name}', ''
+    try:
+        with command.StageBar() as bar:
+            placing, text, image = align(
+                made.layer, frames, read_grid(options.align_grid), not has_unit(recording),
+                recording is not None and recording.image != '', bar.show)
+        write_file(picture, lambda file: file.write_bytes(jpeg_of(image)))
+        if placing is None:
+            raise MappingError(f'{options.align_grid}: {text}; look at {picture}')
+    except MappingError as error:
+        options.out = options.out.with_stem(f'{options.out.stem}.refused')
+        return made, recording, '', error
+    return (made.moved(placing), recording and recording.moved(*placing),
+            f'aligned with {options.align_grid}: {text}', None)
 
 
 def _refuse_conflicts(options: argparse.Namespace, is_several: bool) -> None:

@@ -154,10 +154,11 @@ def recording_of(options: argparse.Namespace, file: Path, scale: float,
                         scale=scale, rotation=rotation.tolist(), **topics)
 
 
-def has_unit(recording: MapRecording) -> bool:
+def has_unit(recording: MapRecording | None) -> bool:
     """Return whether the unit of the poses of a map's recording was known or given."""
-    layout = recording.source and find_layout(recording.source, recording.layout)
-    return (not layout or layout.key not in ('colmap', 'nerf') or recording.scale != 1.0
+    layout = recording and recording.source and find_layout(recording.source, recording.layout)
+    return (recording is None or not layout or layout.key not in ('colmap', 'nerf')
+            or recording.scale != 1.0
             or not recording.placing.keys().isdisjoint(('scale', 'known_distance')))
 
 

@@ -9,11 +9,15 @@ matching", 2009), then the best ones by least squares on a likelihood field (Thr
 How well a wrong placing fits depends on the place. It is measured: the mirrored map has walls of
 the same lengths and distances, but fits by chance only. A placing must fit better than the
 mirrored map does, and than all other placings.
+
+Places in the plane are complex numbers: a placing is `turn * places + shift`, and the length of
+`turn` is the scale.
 """
 
 from collections.abc import Iterator, Sequence
-from functools import cached_property
-from typing import Any, NamedTuple
+from itertools import product
+from operator import itemgetter
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +28,6 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.depth import points_in_color
 from cliploc_ros.core.geometry.grid import OccupancyGrid
-from cliploc_ros.core.geometry.transforms import move_poses
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.datasets.frames import Frames
@@ -32,284 +35,202 @@ from cliploc_ros.offline.mapping.building import Progress
 from cliploc_ros.offline.mapping.tilt import MOST_TILT_DEG, find_tilt
 from cliploc_ros.offline.recording.joining import Placing
 
-Floats = NDArray[np.float64]
-# The lowest level of this height [m] with this share of the points is the floor. A kitchen's has
-# .06, seen from a table.
+# The floor is the lowest level [m] with this share of the points. Seen from a table, a kitchen's
+# has .06.
 _LEVEL_M, _LEAST_SHARE = 0.1, 0.03
-# Heights above the floor [m] of the slice, and the heights that a wall fills: this many of .1 m
-# above a cell [m]. More than the last number do not count more.
+# The slice [m], the side of its columns [m], the layers of .1 m that a wall fills in a column, and
+# the number beyond which more of them do not count more.
 _SLICE_M, _COLUMN_M, _TALL, _TALLEST = (0.1, 2.0), 0.1, 3, 8
-_LEAST_CELLS = 100
-# Cells of the coarse search, and the deviations of a wall from the grid, coarse to fine [m]. A
-# cell that is known to be free counts against a wall.
-_COARSE_M, _SIGMAS_M, _FREE = 0.2, (0.2, 0.1, 0.05), 0.5
-_SIGMA_M = 0.1
-_LEAST_SCORE = 0.15
-_TRIED, _TRIED_EACH = 10, 3  # placings that are refined: of one scale, or of each of several
-# Placings further apart (root mean square of the walls) are different [m].
-_APART_M = 0.5
-# A placing must fit better than all others, and than the mirrored map, by this factor; measured
-# on 4 places, see studies/README.md. A scale that is off by more is named.
-_BETTER, _WRONG_SCALE, _STRETCHED = 1.3, 0.05, 1.1
-_SCALE_STEP, _LESS = 0.04, 0.7
-# Images whose depth is used, and the step of their pixels.
-_IMAGES, _PIXELS = 200, 8
-_PICTURE_PX = 1000
-# Heights of cameras above the floor [m], which limit an unknown scale.
-_HEIGHTS_M = (0.25, 1.9)
+_LEAST_COLUMNS = 100
+# Cells of the coarse search, and deviations of walls from the grid: to refine, and to judge [m]. A
+# wall on a free cell counts against a placing.
+_COARSE_M, _SIGMAS_M, _SIGMA_M, _FREE = 0.2, (0.2, 0.1, 0.05), 0.1, 0.5
+_TRIED = 10  # places that are refined; fewer of each scale, if there are several
+_APART_M = 0.5  # Distance of the walls (root mean square) at different placings.
+#: A placing must fit better by this factor, and to this share, and no other scale by _STRETCHED.
+#: Measured on four places, see studies/README.md.
+BETTER, LEAST_SCORE, _STRETCHED = 1.3, 0.15, 1.1
+# Heights of cameras above the floor [m], which limit an unknown scale; its steps.
+_HEIGHTS_M, _SCALE_STEP = (0.25, 1.9), 0.04
 _OCCUPIED = 65  # as map_server has it [%]
+_IMAGES, _PIXELS = 200, 8  # images whose depth is used, and the step of their pixels
+_PICTURE_PX, _COLORS = 1000, ((60, 90, 230), (230, 60, 30))
+
+#: Score, turn and shift of a placing.
+Fit = tuple[float, complex, complex]
+#: Where a map lies in a grid, None if that is unknown; how well it fits; and a picture (h, w, 3).
+Alignment = tuple[Placing | None, str, NDArray[np.uint8]]
 
 
-class Fit(NamedTuple):
-    """A placing of the walls in the grid's own axes, and how well it fits."""
-
-    #: Score relative to the best one at another place, or of the mirrored map
-    better: float
-    score: float  #: Share of the walls on occupied cells, less _FREE of those on free cells
-    #: (4,): cosine and sine of the yaw, times the scale; position of the middle of the walls [m]
-    place: Floats
-    stretched: float = 1.0  #: How much larger the walls would fit best
-
-
-class Walls(NamedTuple):
-    """The wall-like cells of a map, seen from above, about their middle."""
-
-    places: Floats  #: (n, 2) [m]
-    weights: Floats  #: (n,): their sum is 1
-    middle: Floats  #: (2,): in the map [m]
-    floor_m: float  #: Height of the floor in the map
-
-    @property
-    def radius_m(self) -> float:
-        """Return the root mean square of the distances from the middle."""
-        return float(np.sqrt(self.weights @ (self.places**2).sum(axis=1)))
-
-    def at(self, place: Floats) -> Floats:
-        """Return the walls (n, 2) at a place (4,)."""
-        cos, sin, *middle = place
-        return self.places @ np.array([[cos, sin], [-sin, cos]]) + middle
-
-
-def find_walls(points: Floats, unit_m: float = 1.0) -> Walls:
-    """Find the walls among points (n, 3) whose z axis points up; unit_m: length of their unit.
-
-    MappingError: there are too few.
-    """
-    heights = points[:, 2] * unit_m
-    levels, counts = np.unique(np.floor(heights / (0.5 * _LEVEL_M)), return_counts=True)
-    pairs = counts + np.append(counts[1:] * (np.diff(levels) == 1.0), 0)
-    first = int(np.argmax(pairs >= _LEAST_SHARE * len(points)))
-    first += int(np.argmax(pairs[first:first + 3]))
-    level = heights / (0.5 * _LEVEL_M) - levels[first]
-    floor_m = float(np.median(heights[(level >= 0.0) & (level < 2.0)]))
-    low, high = _SLICE_M
-    inside = (heights > floor_m + low) & (heights < floor_m + high)
-    cells = np.floor(np.column_stack([points[inside, :2] * (unit_m / _COLUMN_M),
-                                      (heights[inside] - floor_m) / 0.1]))
-    column = np.unique(cells[:, :2], axis=0, return_inverse=True)[1].ravel()
-    heights = np.unique(np.column_stack([column, cells[:, 2]]), axis=0)
-    tall = np.bincount(heights[:, 0].astype(np.int64))
-    if (count := int((tall >= _TALL).sum())) < _LEAST_CELLS:
-        raise MappingError(f'the map has {count} cells of walls from {low:g} to {high:g} m '
-                           f'above the floor, expected {_LEAST_CELLS} or more: give depth, or '
-                           'more images of walls and furniture')
-    places = np.column_stack([np.bincount(column, points[inside, axis]) / np.bincount(column)
-                              for axis in range(2)])[tall >= _TALL]
-    weights = np.minimum(tall[tall >= _TALL], _TALLEST).astype(np.float64)
-    weights /= weights.sum()
-    middle = weights @ places
-    return Walls(places - middle, weights, middle, floor_m / unit_m)
-
-
-class _Field:
-    """How well each place of a grid explains a wall."""
-
-    def __init__(self, grid: OccupancyGrid) -> None:
-        self.cell_m = grid.resolution_m
-        self._free = (grid.cells >= 0).astype(np.float32)
-        self._distances = cv2.distanceTransform(np.uint8(grid.cells < _OCCUPIED), cv2.DIST_L2,
-                                                cv2.DIST_MASK_PRECISE) * np.float32(self.cell_m)
-
-    def distances(self, places: Floats, most: float) -> Floats:
-        """Return the distances (n,) of places (n, 2) to occupied cells [m], limited to `most`."""
-        return np.minimum(most, map_coordinates(self._distances, (places / self.cell_m - 0.5).T[
-            ::-1], order=1, mode='constant', cval=most))
-
-    def scores(self, places: Floats) -> Floats:
-        """Return the evidence (n,) at places (n, 2), -_FREE to 1."""
-        free = map_coordinates(self._free, (places / self.cell_m - 0.5).T[::-1], order=0)
-        return _evidence(self.distances(places, 9.0 * _SIGMA_M), free, _SIGMA_M)
-
-    @cached_property
-    def coarse(self) -> tuple[NDArray[np.float32], float]:
-        """Return the mean evidence of coarse cells, and their side [m]."""
-        step = max(1, round(_COARSE_M / self.cell_m))
-        evidence = _evidence(self._distances, self._free, _COARSE_M)
-        height, width = (step * -(-side // step) for side in evidence.shape)
-        evidence = cv2.copyMakeBorder(evidence, 0, height - evidence.shape[0], 0,
-                                      width - evidence.shape[1], cv2.BORDER_CONSTANT)
-        return cv2.resize(evidence, (width // step, height // step),
-                          interpolation=cv2.INTER_AREA), step * self.cell_m
-
-
-def _evidence(distances: Any, free: Any, sigma_m: float) -> Any:
-    return (np.exp(-0.5 * (distances / sigma_m)**2)
-            - _FREE * free * (distances > 2.0 * sigma_m))
-
-
-class Alignment(NamedTuple):
-    """Where a map lies in a grid."""
-
-    placing: Placing | None  #: Into the frame of the grid, with the floor at 0; None: unknown
-    text: str  #: How well it fits, and what was assumed
-    picture: NDArray[np.uint8]  #: (h, w, 3): the walls in the grid, blue at the second best place
-
-
-def align(layer: KeyframeLayer, points: Floats, grid: OccupancyGrid, is_scaled: bool,
+def align(layer: KeyframeLayer | None, frames: Frames | None, grid: OccupancyGrid, is_scaled: bool,
           of_robot: bool, progress: Progress = lambda *_: None) -> Alignment:
-    """Place a map in the frame of a grid by its points (n, 3), and those of its keyframes.
+    """Place a map in the frame of a grid by the points of its keyframes, and depth of its images.
 
-    `is_scaled`: the unit of the map is unknown. `of_robot`: see find_tilt. MappingError: the map
-    shows too few walls.
+    The floor gets the height 0. `is_scaled`: the unit of the map is unknown. `of_robot`: see
+    find_tilt. MappingError: the map shows too few walls.
     """
-    points = np.concatenate([points, *map(layer.points_in_map, range(len(layer)))])
+    if layer is None:
+        raise MappingError('`align_grid` needs the points of keyframes')
     tilt = find_tilt(layer.map_from_camera, of_robot)
-    level, assumed = np.eye(3), 'z is up'
-    if tilt is not None and tilt[1] > MOST_TILT_DEG:
-        level, assumed = tilt[0], f'levelled by {tilt[1]:.0f} degrees'
-    poses, unit_m = move_poses(layer.map_from_camera, 1.0, level), 1.0
-    if is_scaled:
-        low = float(np.percentile(points @ level[2], 2.0))
-        unit_m = 1.2 / max(1e-9, float(np.median(poses[:, 2, 3])) - low)
-    walls = find_walls(points @ level.T, unit_m)
-    heights = poses[:, 2, 3] - walls.floor_m
-    fits = place_walls(walls, grid, heights if is_scaled else None, progress)
-    best, picture = fits[0], draw(walls, grid, fits)
-    fit = (f'{best.score:.2f} of the walls fit, {best.score / best.better:.2f} at another place '
-           'or mirrored')
-    if not (best.better > _BETTER and best.score > _LEAST_SCORE):
-        return Alignment(None, f'{fit}; expected {_BETTER} times as much: is it the grid of this '
-                         'floor, not mirrored, with the right resolution? Else map more walls',
-                         picture)
-    if not is_scaled and abs(np.log(best.stretched)) > _WRONG_SCALE:
-        return Alignment(None, f"its walls are {best.stretched:.2f} times as long in the grid: "
-                         "correct the grid's resolution or the scale of the map", picture)
-    cos, sin, *middle = best.place
-    scale, turned = float(np.hypot(cos, sin)), grid.frame_from_grid[:3, :3]
-    turn = turned @ Rotation.from_euler('z', np.arctan2(sin, cos)).as_matrix()
-    shift = (grid.frame_from_grid[:3, 3] + turned @ [*middle, 0.0]
-             - scale * turn @ [*walls.middle, walls.floor_m])
-    shift[2] = -scale * walls.floor_m
-    return Alignment(Placing(scale, turn @ level, shift),
-                     f'{fit}; {assumed}; the lowest dense level, {walls.floor_m:.2f} m, is the '
-                     f'floor and z 0 now' + f'; a unit is {scale:.4g} m' * is_scaled, picture)
+    level, tilt_deg = tilt if tilt is not None and tilt[1] > MOST_TILT_DEG else (np.eye(3), 0.0)
+    points = np.concatenate([*map(layer.points_in_map, range(len(layer))), *_points_of_depth(
+        frames)]) @ level.T
+    height = np.median(layer.map_from_camera[:, :3, 3] @ level[2])
+    unit_m = 1.2 / (height - np.percentile(points[:, 2], 2)) if is_scaled else 1.0
+    walls, weights, floor = find_walls(points * unit_m)
+    middle = weights @ walls
+    better, stretched, fits = (matcher := Matcher(grid, walls - middle, weights)).match(
+        np.array(_HEIGHTS_M) / (height * unit_m - floor) if is_scaled else None, progress)
+    score, turn, shift = fits[0]
+    picture, scale = matcher.draw(grid, fits), float(abs(turn) * unit_m)
+    text = f'{score:.2f} of the walls fit, {score / better:.2f} at another place or mirrored'
+    if better < BETTER or score < LEAST_SCORE:
+        return None, (f'{text}; expected {BETTER} times as many: is it the grid of this floor, '
+                      'not mirrored, with the right resolution? Else map more walls'), picture
+    if stretched != 1.0:
+        return None, (f'its walls are {stretched:.2f} times as long in the grid: correct the '
+                      'resolution of the grid or the scale of the map'), picture
+    turned, corner = grid.frame_from_grid[:3, :3], shift - turn * middle
+    place = turned @ [corner.real, corner.imag, 0.0] + grid.frame_from_grid[:3, 3]
+    place[2] = -abs(turn) * floor
+    rotation = turned @ Rotation.from_euler('z', np.angle(turn)).as_matrix() @ level
+    return Placing(scale, rotation, place), (
+        f'{text}; z was {tilt_deg:.0f} degrees off the vertical; the floor is the lowest dense '
+        f'level, {floor / unit_m:.2f}, and z 0 now; a unit is {scale:.4g} m'), picture
 
 
-def place_walls(walls: Walls, grid: OccupancyGrid, heights: Floats | None = None,
-                progress: Progress = lambda *_: None) -> list[Fit]:
-    """Return the best placings of walls in a grid, at most two, distinct, the best one first.
-
-    The scale is free, if `heights` has the heights of the cameras above the floor.
-    """
-    field, scales, fits = _Field(grid), np.ones(1), list[list[Floats]]()
-    if heights is not None:
-        least, most = np.array(_HEIGHTS_M) / np.median(heights)
-        scales = np.geomspace(least, most, 2 + int(np.log(most / least) / _SCALE_STEP))
-    sides = walls, walls._replace(places=walls.places * [1.0, -1.0])
-    for row, scale in enumerate(scales):
-        for column, side in enumerate(sides):
-            rough = list[Floats]()
-            for share, some in _search(side, field, scale):
-                rough += some
-                progress('align with the grid', (row + 0.5 * (column + share)) / len(scales))
-            fits.append([_refined(side, field, one[1:]) for one in _distinct(
-                rough, walls.radius_m, _TRIED if len(scales) == 1 else _TRIED_EACH)])
-    # the best of the mirrored map at similar scales
-    chances = maximum_filter1d([max(fit[0] for fit in some) for some in fits[1::2]], 5)
-    best = _distinct([
-        np.append(fit[0] / max(chance, _LEAST_SCORE), fit)
-        for some, chance in zip(fits[::2], chances, strict=True) for fit in some],
-        walls.radius_m, 2)
-    better = min([best[0][0], *(best[0][0] / other[0] for other in best[1:])])
-    near = _LESS if heights is None else 1.0 - _SCALE_STEP
-    score, *place = max((_refined(walls, field, best[0][2:] * [factor, factor, 1.0, 1.0])
-                         for factor in np.geomspace(near, 1.0 / near, 17)), key=lambda fit: fit[0])
-    stretched = float(np.hypot(*place[:2]) / np.hypot(*best[0][2:4]))
-    if heights is None:  # the unit is kept
-        stretched = stretched if score > _STRETCHED * best[0][1] else 1.0
-        _, score, *place = best[0]
-    return [Fit(better, score, np.array(place), stretched),
-            *(Fit(1.0, other[1], other[2:]) for other in best[1:])]
-
-
-def _search(walls: Walls, field: _Field, scale: float) -> Iterator[tuple[float, list[Floats]]]:
-    """Try all places of walls; yield the share of yaws done, and (5,) scores with places."""
-    evidence, cell_m = field.coarse
-    yaws = np.arange(0.0, 2.0 * np.pi, 0.75 * cell_m / (scale * walls.radius_m))
-    for row, yaw in enumerate(yaws):
-        turn = scale * np.array([np.cos(yaw), np.sin(yaw)])
-        places = walls.at(np.append(turn, [0.0, 0.0])) / cell_m
-        corner = np.floor(places.min(axis=0)) - 1
-        columns, rows = np.round(places - corner).astype(np.int64).T
-        picture = np.zeros((rows.max() + 2, columns.max() + 2), dtype=np.float32)
-        np.add.at(picture, (rows, columns), walls.weights)
-        height, width = (side // 2 for side in picture.shape)
-        scores = cv2.matchTemplate(cv2.copyMakeBorder(
-            evidence, height, height, width, width, cv2.BORDER_CONSTANT), picture, cv2.TM_CCORR)
-        peaks = np.where(scores == cv2.dilate(scores, np.ones((3, 3))), scores, -1.0).ravel()
-        best = np.argpartition(-peaks, min(_TRIED, peaks.size - 1))[:_TRIED]
-        at = np.column_stack(np.unravel_index(best, scores.shape))[:, ::-1] - [width, height]
-        yield (row + 1) / len(yaws), [
-            np.concatenate([[score], turn, (place - corner + 0.5) * cell_m])
-            for score, place in zip(peaks[best], at, strict=True)]
-
-
-def _refined(walls: Walls, field: _Field, place: Floats) -> Floats:
-    """Refine yaw and position by least squares; return (5,) the score and the place."""
-    def moved(step: Floats) -> Floats:
-        turn = np.exp(1j * step[2]) * complex(*place[:2])
-        return np.array([turn.real, turn.imag, *place[2:] + step[:2]])
-
-    step, weights = np.zeros(3), np.sqrt(walls.weights)
-    for sigma_m in _SIGMAS_M:
-        step = least_squares(lambda step, most: weights * field.distances(
-            walls.at(moved(step)), most), step, diff_step=1e-3, max_nfev=20,
-                             x_scale=[1.0, 1.0, 1.0 / walls.radius_m], args=(3.0 * sigma_m,)).x
-    found = moved(step)
-    return np.append(walls.weights @ field.scores(walls.at(found)), found)
-
-
-def _distinct(found: list[Floats], radius_m: float, most: int) -> list[Floats]:
-    """Return the best of each group of places that are near each other; scores come first."""
-    kept: list[Floats] = []
-    for one in sorted(found, key=lambda one: -one[0]):
-        # the distance of two places of the walls, as root mean square
-        if len(kept) < most and all(np.linalg.norm((one - other)[-4:] * [
-                radius_m, radius_m, 1.0, 1.0]) > _APART_M for other in kept):
-            kept.append(one)
-    return kept
-
-
-def points_of_depth(frames: Frames) -> Floats:
-    """Return points (n, 3) of the depth of images spread over a recording, in their map [m]."""
-    step, found = 1 + frames.count // _IMAGES, [np.empty((0, 3))]
-    for raw in frames.read_raw(lambda place, _, pose: pose is not None and place % step == 0):
-        if raw.depth is not None and raw.map_from_camera is not None:
+def _points_of_depth(frames: Frames | None) -> Iterator[NDArray[np.float64]]:
+    """Yield points (n, 3) of depth images that are spread over a recording [m]."""
+    step = 1 if frames is None else 1 + frames.count // _IMAGES
+    for raw in () if frames is None else frames.read_raw(
+            lambda place, _, pose: pose is not None and place % step == 0):
+        if raw.depth is not None and (pose := raw.map_from_camera) is not None:
             pixels, depths = points_in_color(raw.depth(), camera := raw.color()[1], _PIXELS)
             rays = np.column_stack([camera.normalize_points(pixels.T), np.ones(len(depths))])
-            points = rays * depths[:, None] @ raw.map_from_camera[:3, :3].T
-            found.append((points + raw.map_from_camera[:3, 3])[np.isfinite(points).all(axis=1)])
-    return np.concatenate(found)
+            points = rays * depths[:, None] @ pose[:3, :3].T + pose[:3, 3]
+            yield points[np.isfinite(points).all(axis=1)]
 
 
-def draw(walls: Walls, grid: OccupancyGrid, fits: Sequence[Fit]) -> NDArray[np.uint8]:
-    """Draw a grid (h, w, 3), y up, with the walls at the best place, and blue at the second."""
-    grey = np.select([grid.cells < 0, grid.cells < _OCCUPIED], [160, 255], 0).astype(np.uint8)
-    large = max(1, _PICTURE_PX // max(grey.shape))
-    picture = np.repeat(grey.repeat(large, 0).repeat(large, 1)[..., None], 3, axis=2)
-    for fit, color in zip(reversed(fits), ((60, 90, 230), (230, 60, 30))[2 - len(fits):],
-                          strict=True):
-        pixels = (walls.at(fit.place) * (large / grid.resolution_m)).astype(np.int64)
-        for column, row in pixels[((pixels >= 0) & (pixels < picture.shape[1::-1])).all(axis=1)]:
-            picture[row:row + 2, column:column + 2] = color
-    return picture[::-1]
+def find_walls(points: NDArray[np.float64]) -> tuple[Any, NDArray[np.float64], float]:
+    """Find the walls among points (n, 3), z up [m]; MappingError: there are too few.
+
+    Return their places (n,) as complex numbers, weights (n,) of sum 1, and the floor's height.
+    """
+    levels, counts = np.unique(np.floor(points[:, 2] / _LEVEL_M), return_counts=True)
+    level = levels[np.argmax(counts >= _LEAST_SHARE * len(points))] + 0.5
+    floor = float(np.median(points[np.abs(points[:, 2] / _LEVEL_M - level) < 1.0, 2]))
+    points = points[(points[:, 2] > floor + _SLICE_M[0]) & (points[:, 2] < floor + _SLICE_M[1])]
+    cells = np.floor(points / _COLUMN_M)
+    column = np.unique(cells[:, :2], axis=0, return_inverse=True)[1].ravel()
+    layers = np.unique(np.column_stack([column, cells[:, 2]]), axis=0)[:, 0].astype(np.int64)
+    is_wall = (tall := np.bincount(layers)) >= _TALL
+    if is_wall.sum() < _LEAST_COLUMNS:
+        raise MappingError(f'the map shows {is_wall.sum()} columns of walls, expected '
+                           f'{_LEAST_COLUMNS} or more: give depth, or more images of walls')
+    x, y = (np.bincount(column, points[:, axis]) / np.bincount(column) for axis in range(2))
+    weights = np.minimum(tall[is_wall], _TALLEST)
+    return (x + 1j * y)[is_wall], weights / weights.sum(), floor
+
+
+class Matcher:
+    """Fits walls (n,), about their middle, with weights (n,) into a grid."""
+
+    def __init__(self, grid: OccupancyGrid, walls: Any, weights: NDArray[np.float64]) -> None:
+        self._walls, self._weights, self._cell_m = walls, weights, grid.resolution_m
+        self._radius_m = np.sqrt(weights @ np.abs(walls)**2)
+        self._distances = self._cell_m * cv2.distanceTransform(
+            np.uint8(grid.cells < _OCCUPIED), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        self._evidence, coarse = ((np.exp(-0.5 * (self._distances / sigma_m)**2) - _FREE * (
+            (grid.cells >= 0) & (self._distances > 2.0 * sigma_m))).astype(np.float32)
+            for sigma_m in (_SIGMA_M, _COARSE_M))
+        step = max(1, round(_COARSE_M / self._cell_m))
+        shape = tuple(max(1, side // step) for side in coarse.shape)
+        self._coarse, self._coarse_m = cv2.resize(
+            coarse[:shape[0] * step, :shape[1] * step], shape[::-1],
+            interpolation=cv2.INTER_AREA), step * self._cell_m
+
+    def match(self, limits: NDArray[np.float64] | None, progress: Progress
+              ) -> tuple[float, float, list[Fit]]:
+        """Return how much better the best placing fits, at what other scale, and the best two.
+
+        `limits` (2,): of an unknown scale.
+        """
+        scales = np.ones(1) if limits is None else np.geomspace(
+            limits[0], limits[1], 2 + int(np.log(limits[1] / limits[0]) / _SCALE_STEP))
+        fits, sides = list[list[Fit]](), (self._walls, self._walls.conj())
+        for row, (scale, walls) in enumerate(product(scales, sides)):
+            rough = list[Fit]()
+            for share, some in self._search(walls, scale):
+                progress('align with the grid', (row + share) / (2 * len(scales)))
+                rough += some
+            fits.append([self._refined(walls, fit) for fit in self._distinct(
+                rough, _TRIED if limits is None else 3)])
+        # how well the mirrored map fits, at similar scales
+        chances = maximum_filter1d([max(some)[0] for some in fits[1::2]], 5)
+        best = self._distinct([
+            (fit[0] / max(chance, LEAST_SCORE), *fit[1:])
+            for some, chance in zip(fits[::2], chances, strict=True) for fit in some], 2)
+        near = 0.7 if limits is None else 1.0 - _SCALE_STEP
+        own, *others = (self._refined(self._walls, (0.0, best[0][1] * factor, best[0][2]))
+                        for factor in (1.0, *np.geomspace(near, 1.0 / near, 17)))
+        better = best[0][0] / max([1.0, *(fit[0] for fit in best[1:])])
+        other = max(others, key=itemgetter(0))
+        if limits is not None:
+            return better, 1.0, [other, *best[1:]]
+        return better, abs(other[1]) if other[0] > _STRETCHED * own[0] else 1.0, [own, *best[1:]]
+
+    def _search(self, walls: Any, scale: float) -> Iterator[tuple[float, list[Fit]]]:
+        """Yield the share of the yaws that is done, and the best places on coarse cells there."""
+        step = 0.75 * self._coarse_m / (scale * self._radius_m)
+        for yaw in np.arange(0.0, 2.0 * np.pi, step):
+            places = np.round((turn := scale * np.exp(1j * yaw)) * walls / self._coarse_m)
+            columns, rows = (part.astype(np.int64) for part in (places.real, places.imag))
+            left, low = columns.min(), rows.min()
+            picture = np.zeros((rows.max() - low + 1, columns.max() - left + 1), np.float32)
+            np.add.at(picture, (rows - low, columns - left), self._weights)
+            height, width = (side // 2 + 1 for side in picture.shape)
+            scores = cv2.matchTemplate(cv2.copyMakeBorder(
+                self._coarse, height, height, width, width, cv2.BORDER_CONSTANT), picture,
+                cv2.TM_CCORR)
+            scores[scores < cv2.dilate(scores, np.ones((3, 3)))] = -1.0
+            best = np.argpartition(-scores.ravel(), min(_TRIED, scores.size - 1))[:_TRIED]
+            y, x = np.unravel_index(best, scores.shape)
+            shifts = self._coarse_m * (x - width - left + 0.5 + 1j * (y - height - low + 0.5))
+            yield yaw / (2.0 * np.pi), [(score, turn, shift) for score, shift in zip(
+                scores[y, x], shifts, strict=True)]
+
+    def _refined(self, walls: Any, fit: Fit) -> Fit:
+        """Refine yaw and position of a placing by least squares, and score it."""
+        def moved(step: NDArray[np.float64]) -> Any:
+            return fit[1] * np.exp(1j * step[2]), fit[2] + step[0] + 1j * step[1]
+
+        def at(values: Any, step: NDArray[np.float64], outside: float) -> Any:
+            places = (turn := moved(step))[0] * walls + turn[1]
+            return map_coordinates(values, np.array([places.imag, places.real]) / self._cell_m
+                                   - 0.5, order=1, cval=outside)
+
+        step, weights = np.zeros(3), np.sqrt(self._weights)
+        for sigma_m in _SIGMAS_M:
+            step = least_squares(lambda step, most: weights * np.minimum(
+                most, at(self._distances, step, most)), step, diff_step=1e-3, max_nfev=20,
+                x_scale=[1.0, 1.0, 1.0 / self._radius_m], args=(3.0 * sigma_m,)).x
+        return float(self._weights @ at(self._evidence, step, 0.0)), *moved(step)
+
+    def _distinct(self, fits: Sequence[Fit], most: int) -> list[Fit]:
+        """Return the best fit of each place."""
+        kept = list[Fit]()
+        for fit in sorted(fits, key=lambda fit: -fit[0]):
+            if len(kept) < most and all(np.hypot(self._radius_m * abs(fit[1] - other[1]), abs(
+                    fit[2] - other[2])) > _APART_M for other in kept):
+                kept.append(fit)
+        return kept
+
+    def draw(self, grid: OccupancyGrid, fits: Sequence[Fit]) -> NDArray[np.uint8]:
+        """Draw a grid, y up, with the walls at the best place in red, at the second in blue."""
+        grey = np.select([grid.cells < 0, grid.cells < _OCCUPIED], [160, 255], 0).astype(np.uint8)
+        large = max(1, _PICTURE_PX // max(grey.shape))
+        picture = np.repeat(grey.repeat(large, 0).repeat(large, 1)[..., None], 3, axis=2)
+        for (_, turn, shift), color in zip(fits[::-1], _COLORS[-len(fits):], strict=True):
+            for place in (turn * self._walls + shift) * (large / self._cell_m):
+                cv2.circle(picture, (int(place.real), int(place.imag)), 1, color, -1)
+        return picture[::-1]
