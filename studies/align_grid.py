@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import DepthFormat, FolderOptions, Frames
-from cliploc_ros.offline.mapping.grid_alignment import Matcher, find_walls
+from cliploc_ros.offline.mapping.grid_alignment import BETTER, LEAST_SCORE, Matcher, find_walls
 from cliploc_ros.offline.recording.keyframe_layer import build_layer
 from demo.world.make_demo_world import SEED
 from demo.world.room import make_room
@@ -137,7 +137,7 @@ def run(options: argparse.Namespace) -> int:
             for which, grid in tries:
                 better, score, stretched, metres, degrees, scale = judge(
                     points, grid, rng, heights[name] if is_scaled else None)
-                accepted = better >= 1.3 and score >= 0.15 and stretched == 1.0
+                accepted = better >= BETTER and score >= LEAST_SCORE and stretched == 1.0
                 is_right = which == 'own' and metres < _NEAR_M and degrees < _NEAR_DEG
                 print(f'{name},{which},{"unknown" if is_scaled else "m"},{better:.2f},{score:.2f},'
                       f'{stretched:.2f},{metres:.3f},{degrees:.2f},{scale:.3f},'

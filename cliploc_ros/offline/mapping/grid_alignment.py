@@ -96,7 +96,8 @@ def align(layer: KeyframeLayer | None, frames: Frames | None, grid: OccupancyGri
     rotation = turned @ Rotation.from_euler('z', np.angle(turn)).as_matrix() @ level
     return Placing(scale, rotation, place), (
         f'{text}; z was {tilt_deg:.0f} degrees off the vertical; the floor is the lowest dense '
-        f'level, {floor / unit_m:.2f}, and z 0 now; a unit is {scale:.4g} m'), picture
+        f'level, {floor / unit_m:.2f}, and z 0 now{f"; a unit is {scale:.4g} m" * is_scaled}'
+        ), picture
 
 
 def _points_of_depth(frames: Frames | None) -> Iterator[NDArray[np.float64]]:
