@@ -32,9 +32,11 @@ from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.errors import MappingError
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.mapping.building import Progress
-from cliploc_ros.offline.mapping.tilt import MOST_TILT_DEG, find_tilt
+from cliploc_ros.offline.mapping.tilt import find_tilt
 from cliploc_ros.offline.recording.joining import Placing
 
+# z that is further off the vertical of hand-held cameras is not up.
+_TILT_DEG = 20.0
 # The floor is the lowest level [m] with this share of the points. Seen from a table, a kitchen's
 # has .06.
 _LEVEL_M, _LEAST_SHARE = 0.1, 0.03
@@ -66,13 +68,13 @@ def align(layer: KeyframeLayer | None, frames: Frames | None, grid: OccupancyGri
           of_robot: bool, progress: Progress = lambda *_: None) -> Alignment:
     """Place a map in the frame of a grid by the points of its keyframes, and depth of its images.
 
-    The floor gets the height 0. `is_scaled`: the unit of the map is unknown. `of_robot`: see
-    find_tilt. MappingError: the map shows too few walls.
+    The floor gets the height 0. `is_scaled`: the unit of the map is unknown. `of_robot`: z is up.
+    MappingError: the map shows too few walls.
     """
     if layer is None:
         raise MappingError('`align_grid` needs the points of keyframes')
-    tilt = find_tilt(layer.map_from_camera, of_robot)
-    level, tilt_deg = tilt if tilt is not None and tilt[1] > MOST_TILT_DEG else (np.eye(3), 0.0)
+    tilt = None if of_robot else find_tilt(layer.map_from_camera)
+    level, tilt_deg = tilt if tilt is not None and tilt[1] > _TILT_DEG else (np.eye(3), 0.0)
     points = np.concatenate([*map(layer.points_in_map, range(len(layer))), *_points_of_depth(
         frames)]) @ level.T
     height = np.median(layer.map_from_camera[:, :3, 3] @ level[2])
@@ -95,9 +97,9 @@ def align(layer: KeyframeLayer | None, frames: Frames | None, grid: OccupancyGri
     place[2] = -abs(turn) * floor
     rotation = turned @ Rotation.from_euler('z', np.angle(turn)).as_matrix() @ level
     return Placing(scale, rotation, place), (
-        f'{text}; z was {tilt_deg:.0f} degrees off the vertical; the floor is the lowest dense '
-        f'level, {floor / unit_m:.2f}, and z 0 now{f"; a unit is {scale:.4g} m" * is_scaled}'
-        ), picture
+        f'{text}; {f"z was turned up by {tilt_deg:.0f} degrees" if tilt_deg else "z is up"}; the '
+        f'floor is the lowest dense level, {floor / unit_m:.2f}, and z 0 now'
+        f'{f"; a unit is {scale:.4g} m" * is_scaled}'), picture
 
 
 def _points_of_depth(frames: Frames | None) -> Iterator[NDArray[np.float64]]:

@@ -12,8 +12,8 @@ from cliploc_ros.errors import DatasetError
 _LEAST_SPREAD = np.sin(np.radians(8.0)) ** 2
 _MOST_SHARE = 0.25
 _LEAST_UPRIGHT = 0.5
-#: Accuracy of a vertical that is estimated from the tilt of hand-held cameras.
-MOST_TILT_DEG = 5.0
+# Accuracy of a vertical that is estimated from the tilt of hand-held cameras.
+_MOST_TILT_DEG = 5.0
 # Images tilted by more show a camera that is mounted upside down, or poses whose z points down.
 _UPSIDE_DOWN_DEG = 135.0
 
@@ -70,7 +70,7 @@ def tilt_note(poses: NDArray[np.float64], of_robot: bool = False) -> str:
     The mount of a robot's camera explains the tilt, see find_tilt.
     """
     found = find_tilt(poses, of_robot)
-    if found is None or found[1] < MOST_TILT_DEG:
+    if found is None or found[1] < _MOST_TILT_DEG:
         return ''
     if of_robot or found[1] > _UPSIDE_DOWN_DEG:
         return (f'by the poses, the cameras are tilted by {found[1]:.0f} degrees: right if they '
