@@ -21,7 +21,7 @@ from cliploc_ros.core.geometry.grid import OccupancyGrid
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.datasets.folders import read_folder
 from cliploc_ros.offline.datasets.frames import DepthFormat, FolderOptions, Frames
-from cliploc_ros.offline.mapping.grid_alignment import BETTER, LEAST_SCORE, Matcher, find_walls
+from cliploc_ros.offline.recording.grid_alignment import BETTER, LEAST_SCORE, Matcher, find_walls
 from cliploc_ros.offline.recording.keyframe_layer import build_layer
 from demo.world.make_demo_world import SEED
 from demo.world.room import make_room
@@ -51,12 +51,12 @@ def grid_of(parts: Sequence[tuple[Floats, Floats]], floor: float) -> OccupancyGr
         int)
     free, count = np.zeros((rows, columns), np.uint8), np.zeros((rows, columns))
     for place, points in hits:
-        cells = np.unique(((points - corner) / _CELL_M).astype(int), axis=0)
+        cells = ((points - corner) / _CELL_M).astype(int)
         cells = cells[((cells >= 0) & (cells < (columns, rows))).all(axis=1)]
-        start = ((place[:2] - corner) / _CELL_M).astype(int).tolist()
-        for cell in cells.tolist():
-            cv2.line(free, start, cell, 1)
         np.add.at(count, (cells[:, 1], cells[:, 0]), 1)
+        start = ((place[:2] - corner) / _CELL_M).astype(int).tolist()
+        for cell in np.unique(cells, axis=0).tolist():
+            cv2.line(free, start, cell, 1)
     cells = np.select([count >= 3, free > 0], [100, 0], -1).astype(np.int8)
     return grid_at(cells, corner)
 

@@ -219,8 +219,8 @@ def _aligned(options: argparse.Namespace, made: 'MadeMap', recording: Any, frame
     from cliploc_ros.cli.sources import has_unit
     from cliploc_ros.core.map.grid_file import read_grid
     from cliploc_ros.files.storage import write_file
-    from cliploc_ros.offline.mapping.grid_alignment import align
     from cliploc_ros.offline.page import jpeg_of
+    from cliploc_ros.offline.recording.grid_alignment import align
 
     if options.align_grid is None:
         return made, recording, '', None

@@ -51,7 +51,7 @@ _TRIED = 10  # places that are refined; fewer of each scale, if there are severa
 _APART_M = 0.5  # Distance of the walls (root mean square) at different placings.
 #: A placing must fit better by this factor, and to this share, and no other scale by _STRETCHED.
 #: Measured on four places, see studies/README.md.
-BETTER, LEAST_SCORE, _STRETCHED = 1.3, 0.15, 1.1
+BETTER, LEAST_SCORE, _STRETCHED = 1.3, 0.15, 1.03
 # Heights of cameras above the floor [m], which limit an unknown scale; its steps.
 _HEIGHTS_M, _SCALE_STEP = (0.25, 1.9), 0.04
 _OCCUPIED = 65  # as map_server has it [%]
@@ -173,9 +173,9 @@ class Matcher:
         best = self._distinct([
             (fit[0] / max(chance, LEAST_SCORE), *fit[1:])
             for some, chance in zip(fits[::2], chances, strict=True) for fit in some], 2)
-        near = 0.7 if limits is None else 1.0 - _SCALE_STEP
+        near = 0.8 if limits is None else 1.0 - _SCALE_STEP
         own, *others = (self._refined(self._walls, (0.0, best[0][1] * factor, best[0][2]))
-                        for factor in (1.0, *np.geomspace(near, 1.0 / near, 17)))
+                        for factor in (1.0, *np.geomspace(near, 1.0 / near, 23)))
         better = best[0][0] / max([1.0, *(fit[0] for fit in best[1:])])
         other = max(others, key=itemgetter(0))
         if limits is not None:

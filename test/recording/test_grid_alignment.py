@@ -15,8 +15,8 @@ from cliploc_ros.cli import build_map
 from cliploc_ros.core.geometry.transforms import make_transform, pose_error
 from cliploc_ros.core.map.grid_file import read_grid
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
-from cliploc_ros.offline.mapping.grid_alignment import align
 from cliploc_ros.offline.mapping.make_map import read_made_map, write_made_map
+from cliploc_ros.offline.recording.grid_alignment import align
 from cliploc_ros.offline.recording.joining import Placing
 
 # Walls and a cabinet, corner by corner [m]; an oblong hall fits in two ways.
