@@ -110,12 +110,14 @@ def build(options: argparse.Namespace) -> int:
     update, name = options.update, ', '.join(sources.source_of(own).name for own in recordings)
     command.check_output(options.out)
     layer, note = layer_options(recordings[0])
-    _refuse_conflicts(options, len(recordings) > 1 or options.add is not None)
+    is_several = len(recordings) > 1 or options.add is not None
+    _refuse_conflicts(options, is_several)
     if options.add is not None:
         options.frame_id = LandmarkMap.from_file(options.add).frame_id
     mapping = _mapping_options(options, f'build_map {name}')
     detections, recording, frames, joined = sources.read_recordings(
         options, recordings, partial(_placed, mapping=mapping), layer)
+    together = detections if is_several else None
     _tell_misspelt(mapping.moving_classes, detections.class_names)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
@@ -142,8 +144,8 @@ def build(options: argparse.Namespace) -> int:
         raise
     _write_report(options.report, asdict(made.report) | ({} if made.keyframes is None else {
         'keyframes': [fate._asdict() for fate in made.keyframes.fates]}))
-    made, recording, text, refusal = _aligned(options, made, recording, frames)
-    path, is_poor = _write(options, made, name, recording, [labeller.note, note, text], begin)
+    made, recorded, text, refusal = _aligned(options, made, (recording, together), frames)
+    path, is_poor = _write(options, made, name, recorded, [labeller.note, note, text], begin)
     try:
         if options.check:
             check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]),
@@ -158,8 +160,9 @@ def build(options: argparse.Namespace) -> int:
     return int(is_poor)
 
 
-def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: 'MapRecording',
-           notes: Sequence[str], begin: float) -> tuple[Path, bool]:
+def _write(options: argparse.Namespace, made: 'MadeMap', name: str,
+           recorded: 'tuple[MapRecording, PosedDetections | None]', notes: Sequence[str],
+           begin: float) -> tuple[Path, bool]:
     """Write a map, and print its report, and how long the run took since its begin.
 
     Return its path, which is another one if the map is poor, and whether it is.
@@ -179,12 +182,11 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
         if options.mount is not None:
             mount = mount_from_numbers(options.mount) @ mount
         numbers = [*mount[:3, 3], *quaternion_from_transform(mount)]
-        lines.append('corrected mount: --mount ' + ' '.join(
-            f'{number:.5f}' for number in numbers))
+        lines.append('corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers))
     is_poor = isinstance(made.report, MappingReport) and made.report.landmarks > 0 and (
         made.report.explained_of_classes < LEAST_EXPLAINED)
     path = options.out.with_stem(f'{options.out.stem}.refused') if is_poor else options.out
-    written = write_made_map(path, made, head, recording, options.update)
+    written = write_made_map(path, made, head, recorded[0], options.update, recorded[1])
     print('\n'.join([*lines, *(f'note: {text}' for text in notes if text),
                      '; '.join([f'wrote {path} in {time.monotonic() - begin:.0f} s', *written])]),
           flush=True)
@@ -200,18 +202,19 @@ def _align_finished(options: argparse.Namespace) -> int:
     command.check_output(options.out)
     if any(getattr(options, name) for name in ('bag', *FOLDERS, 'observations', 'add')):
         raise OptionsError('--align-grid with --update is for a finished map, without recording')
-    made, recording, text, refusal = _aligned(options, read_made_map(options.update),
-                                              load_recording(options.update))
+    made, recorded, text, refusal = _aligned(options, read_made_map(options.update), (
+        load_recording(options.update), None))
     if refusal is not None:
         raise refusal
-    write_made_map(options.out, made, [f'{options.update.name} {text}'], recording, options.update)
+    write_made_map(options.out, made, [f'{options.update.name} {text}'], recorded[0],
+                   options.update)
     print(f'{text}\nwrote {options.out}')
     return 0
 
 
-def _aligned(options: argparse.Namespace, made: 'MadeMap', recording: Any, frames: Any = None
+def _aligned(options: argparse.Namespace, made: 'MadeMap', recorded: Any, frames: Any = None
              ) -> 'tuple[MadeMap, Any, str, MappingError | None]':
-    """Move a map and its recording into the frame of the grid that the command line names.
+    """Move a map and what was recorded into the frame of the grid that the command line names.
 
     Return both, how well they fit, and why they were not moved, None if they were or no grid is
     named. A map that was not moved will be written to another file.
@@ -223,20 +226,20 @@ def _aligned(options: argparse.Namespace, made: 'MadeMap', recording: Any, frame
     from cliploc_ros.offline.recording.grid_alignment import align
 
     if options.align_grid is None:
-        return made, recording, '', None
+        return made, recorded, '', None
     picture = options.out.with_suffix('.align.jpg')
     try:
         with command.StageBar() as bar:
             placing, text, image = align(
-                made.layer, frames, read_grid(options.align_grid), not has_unit(recording),
-                recording is not None and recording.image != '', bar.show)
+                made.layer, frames, read_grid(options.align_grid), not has_unit(recorded[0]),
+                recorded[0] is not None and recorded[0].image != '', bar.show)
         write_file(picture, lambda file: file.write_bytes(jpeg_of(image)))
         if placing is None:
             raise MappingError(f'{options.align_grid}: {text}; look at {picture}')
     except MappingError as error:
         options.out = options.out.with_stem(f'{options.out.stem}.refused')
-        return made, recording, '', error
-    return (made.moved(placing), recording and recording.moved(*placing),
+        return made, recorded, '', error
+    return (made.moved(placing), [part and part.moved(*placing) for part in recorded],
             f'aligned with {options.align_grid}: {text}', None)
 
 

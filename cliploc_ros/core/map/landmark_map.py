@@ -156,6 +156,7 @@ class LandmarkMap:
     #: Optional fields of each landmark; empty if the map has none
     details: tuple[LandmarkDetails, ...] = ()
     map_set: MapSet = NO_SET  #: Identity that the files next to the map must share
+    nav2_map: str = ''  #: File of Nav2's grid of this place, from the folder of the map
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -169,7 +170,7 @@ class LandmarkMap:
         return LandmarkMap(
             self.frame_id, pick(self.landmark_ids), pick(self.labels), pick(self.class_ids),
             self.centers[rows], self.semi_axes[rows], self.quats_xyzw[rows],
-            pick(self.details) if self.details else ())
+            pick(self.details) if self.details else (), nav2_map=self.nav2_map)
 
     def moved(self, scale: float, rotation: NDArray[np.float64], shift: NDArray[np.float64]
               ) -> 'LandmarkMap':
@@ -193,7 +194,7 @@ class LandmarkMap:
             np.concatenate([self.semi_axes, other.semi_axes]),
             np.concatenate([self.quats_xyzw, other.quats_xyzw]),
             self.every_detail + other.every_detail if self.details or other.details else (),
-            self.map_set)
+            self.map_set, self.nav2_map)
 
     def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
         """Return the map with the labels and classes of parts added to their whole landmarks.
@@ -337,7 +338,10 @@ class LandmarkMap:
         finish_set(Path(path), map_set.digest)
         tree = parse_parameters(text, path)
         found = tree[find_map_node(tree, path)]['ros__parameters']['map']
-        return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set)
+        nav2_map = checked_text(found['nav2_map'], f'{path}: map: nav2_map') \
+            if 'nav2_map' in found else ''
+        return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set,
+                       nav2_map=nav2_map)
 
     @staticmethod
     def empty(frame_id: str) -> 'LandmarkMap':
@@ -355,7 +359,7 @@ class LandmarkMap:
             The tree is invalid; the message names the source, the landmark and the field to
             correct.
         """
-        _check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map')
+        _check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map', ('nav2_map',))
         frame_id = checked_text(tree['frame_id'], f'{source}: map: frame_id')
         landmarks = tree['landmarks']
         if not isinstance(landmarks, Mapping):
