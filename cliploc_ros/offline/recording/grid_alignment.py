@@ -235,5 +235,5 @@ class Matcher:
         picture = np.repeat(grey.repeat(large, 0).repeat(large, 1)[..., None], 3, axis=2)
         for (_, turn, shift), color in zip(fits[::-1], _COLORS[-len(fits):], strict=True):
             for place in (turn * self._walls + shift) * (large / self._cell_m):
-                cv2.circle(picture, (int(place.real), int(place.imag)), 1, color, -1)
+                cv2.circle(picture, (int(place.real), int(place.imag)), large // 2, color, -1)
         return picture[::-1]
