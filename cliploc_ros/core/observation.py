@@ -66,6 +66,15 @@ class Detections:
         return self.select(np.sort(best))
 
 
+@dataclass(frozen=True)
+class SeenTags:
+    """The tags that an image shows."""
+
+    names: tuple[str, ...]  #: n names, FAMILY_ID, such as tag36h11_12
+    #: (n, 4, 2): corners in the distorted image, top left of the tag first, then clockwise [px]
+    corners_px: NDArray[np.float64]
+
+
 def check_planar(covariance: NDArray[np.float64]) -> None:
     """Raise OptionsError unless this is a covariance (3, 3) of x, y and yaw."""
     if not np.isfinite(covariance).all() or not np.linalg.eigvalsh(covariance).min() > 0.0:
@@ -127,6 +136,7 @@ class Observation:
     #: (3,): the z axis of base_frame, a unit vector in the camera's optical coordinate frame; None
     #: without a base_frame
     base_up_in_camera: NDArray[np.float64] | None = None
+    tags: SeenTags | None = None  #: None if nobody looked for tags
 
     @property
     def similarity_rows(self) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import is_rigid
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings, Similarities
-from cliploc_ros.core.observation import Detections, Observation, Region
+from cliploc_ros.core.observation import Detections, Observation, Region, SeenTags
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import CliplocError, DatasetError
 from cliploc_ros.files.arrays import Arrays, Field, Offsets, Schema
@@ -194,10 +194,16 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
         known[name], *shape, nan=name == 'depths') for name, shape in (
             ('up_in_camera', (3,)), ('odom_from_camera', (4, 4)), ('depths', (count,)),
             ('base_up_in_camera', (3,))))
+    tags = known.get('tags')
+    if tags is not None:
+        names = tuple(tags['names'])
+        _expect(all(isinstance(name, str) for name in names), 'tags')
+        tags = SeenTags(names, _numbers(np.reshape(tags['corners_px'], (-1, 4, 2)),
+                                        len(names), 4, 2))
     return Observation(
         Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
         similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,
-        float(_numbers(known['odom_way_m'])), compared, depths, region, base_up)
+        float(_numbers(known['odom_way_m'])), compared, depths, region, base_up, tags)
 
 
 def _decoded(image_png: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:

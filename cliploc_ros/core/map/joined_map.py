@@ -107,7 +107,9 @@ def join_maps(maps: Sequence[LandmarkMap], sources: Sequence[str]) -> LandmarkMa
         first, begin = first + len(each), float(high[0] + shift[0]) + gap
     whole = reduce(LandmarkMap.with_more, [
         replace(each, centers=each.centers + shift, landmark_ids=tuple(
-            f'{each.frame_id}/{name}' for name in each.landmark_ids)) for each, _, shift in parts])
+            f'{each.frame_id}/{name}' for name in each.landmark_ids), tags=tuple(
+                replace(tag, center=tuple(tag.center + shift)) for tag in each.tags))
+        for each, _, shift in parts])
     return JoinedMap(**{field.name: getattr(whole, field.name) for field in fields(LandmarkMap)},
                      parts=tuple(parts))
 

@@ -2,17 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Optional fields of a landmark in the map file."""
 
+import math
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from cliploc_ros.errors import MapError
+from cliploc_ros.errors import MapError, did_you_mean
 
 #: Minimum share of a landmark's boxes for a class to yield candidates. Chosen.
 LEAST_CLASS_SHARE = 0.1
 _MAX_TEXT_LENGTH = 1000
+_MAX_COORDINATE_M = 1e7
+_MAX_QUATERNION_NORM_ERROR = 0.01
 #: Labels that describe one landmark, with their weights.
 WeightedLabels = tuple[tuple[str, float], ...]
 
@@ -148,3 +151,48 @@ def _number(value: Any, where: str) -> float:
     if not 0.0 <= value <= sys.float_info.max:  # an int may be larger than any float
         raise MapError(f'{where}: {value} must be finite and not negative')
     return float(value)
+
+
+def check_id(name: Any, where: str) -> None:
+    """Raise MapError unless a landmark or tag has a name; a dot would split a ROS parameter."""
+    if not isinstance(name, str) or not name or '.' in name:
+        raise MapError(f'{where}: the id must be text without dots')
+
+
+def checked_place(fields: Mapping[str, Any], where: str
+                  ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return center and orientation among the fields; MapError: one is invalid."""
+    center = checked_numbers(fields['center'], 3, f'{where}: center')
+    if max(map(abs, center)) > _MAX_COORDINATE_M:
+        raise MapError(f'{where}: center: {center} is beyond {_MAX_COORDINATE_M:g} m')
+    quat_xyzw = checked_numbers(fields['orientation'], 4, f'{where}: orientation')
+    if abs(math.hypot(*quat_xyzw) - 1.0) > _MAX_QUATERNION_NORM_ERROR:
+        raise MapError(f'{where}: orientation: the quaternion {quat_xyzw} has norm '
+                       f'{math.hypot(*quat_xyzw):.3g}, expected 1')
+    return center, quat_xyzw
+
+
+def check_keys(tree: Any, expected: tuple[str, ...], where: str,
+               optional: tuple[str, ...] = ()) -> None:
+    """Raise MapError if fields are missing, unknown, or no mapping."""
+    if not isinstance(tree, Mapping):
+        raise MapError(f'{where}: expected the fields {", ".join(expected)}')
+    known = tuple(dict.fromkeys(expected + optional))
+    unknown = [str(key) for key in tree if key not in known]
+    if unknown:
+        named = ', '.join(f'{key}{did_you_mean(key, known)}' for key in unknown[:5])
+        raise MapError(f'{where}: unknown field: {named} (known: {", ".join(known)})')
+    missing = [key for key in expected if key not in tree]
+    if missing:
+        raise MapError(f'{where}: missing field: {", ".join(missing)}')
+
+
+def checked_numbers(value: Any, count: int, where: str) -> tuple[float, ...]:
+    """Return a number of finite numbers; MapError: the value is something else."""
+    values = tuple(value) if isinstance(value, list | tuple) or hasattr(value, 'tolist') else ()
+    numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+    if len(values) != count or not numeric:
+        raise MapError(f'{where}: must be {count} numbers, not {value!r:.60}')
+    if not all(abs(v) <= sys.float_info.max for v in values):  # ints may be larger
+        raise MapError(f'{where}: {value!r:.60} has values that are not finite')
+    return tuple(map(float, values))

@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map: ellipsoidal landmarks with labels in natural language, and their index by class."""
 
-import math
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,13 +21,18 @@ from cliploc_ros.core.map.landmark_details import (
     OPTIONAL_FIELDS,
     LandmarkDetails,
     WeightedLabels,
+    check_id,
+    check_keys,
+    checked_numbers,
+    checked_place,
     checked_text,
     join_details,
     read_details,
 )
 from cliploc_ros.core.map.pairs import LandmarkPairs, make_pairs
 from cliploc_ros.core.map.parameter_file import NO_SET, MapSet, parse_parameters, read_text, set_of
-from cliploc_ros.errors import MapError, did_you_mean
+from cliploc_ros.core.map.tags import Tag, read_tags
+from cliploc_ros.errors import MapError
 from cliploc_ros.files.storage import finish_set
 
 _UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -40,8 +43,6 @@ _FIELDS = ('label', 'class_id', 'center', 'semi_axes', 'orientation')
 DEFAULT_SIGMA_M = 0.02
 # Squares and fourth powers of lengths in this range neither underflow nor overflow.
 _SEMI_AXIS_RANGE_M = (1e-4, 1e4)
-_MAX_COORDINATE_M = 1e7
-_MAX_QUATERNION_NORM_ERROR = 0.01
 # Distance between two classes in the tree that has the class as a fourth coordinate.
 _CLASS_DISTANCE_M = 10.0
 # To find duplicates, each landmark is compared with this number of nearest neighbours of its class
@@ -155,6 +156,7 @@ class LandmarkMap:
     #: Optional fields of each landmark; empty if the map has none
     details: tuple[LandmarkDetails, ...] = ()
     map_set: MapSet = NO_SET  #: Identity that the files next to the map must share
+    tags: tuple[Tag, ...] = ()  #: Fiducials, which name themselves
 
     def __len__(self) -> int:
         """Return the number of landmarks."""
@@ -178,7 +180,7 @@ class LandmarkMap:
             np.concatenate([self.semi_axes, other.semi_axes]),
             np.concatenate([self.quats_xyzw, other.quats_xyzw]),
             self.every_detail + other.every_detail if self.details or other.details else (),
-            self.map_set)
+            self.map_set, self.tags + other.tags)
 
     def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
         """Return the map with the labels and classes of parts added to their whole landmarks.
@@ -332,7 +334,7 @@ class LandmarkMap:
 
     @staticmethod
     def from_mapping(tree: Any, source: str) -> 'LandmarkMap':
-        """Build a map from a tree with the keys frame_id and landmarks.
+        """Build a map from a tree with the keys frame_id and landmarks, and optionally tags.
 
         Raises
         ------
@@ -340,14 +342,14 @@ class LandmarkMap:
             The tree is invalid; the message names the source, the landmark and the field to
             correct.
         """
-        _check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map')
+        check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map', ('tags',))
         frame_id = checked_text(tree['frame_id'], f'{source}: map: frame_id')
-        landmarks = tree['landmarks']
+        landmarks, tags = tree['landmarks'], read_tags(tree.get('tags') or {}, source)
         if not isinstance(landmarks, Mapping):
             raise MapError(f'{source}: map: landmarks: the map is empty; write {{}} for a map of '
                            'keyframes alone')
         if not landmarks:
-            return LandmarkMap.empty(frame_id)
+            return replace(LandmarkMap.empty(frame_id), tags=tags)
         rows = [_landmark(landmark_id, fields, source)
                 for landmark_id, fields in landmarks.items()]
         labels, class_ids, centers, semi_axes, quats, details = zip(*rows, strict=True)
@@ -356,7 +358,7 @@ class LandmarkMap:
         return LandmarkMap(frame_id, tuple(map(str, landmarks)), labels, class_ids,
                            np.array(centers), np.array(semi_axes), quats_xyzw,
                            details if any(detail != LandmarkDetails() for detail in details)
-                           else ())
+                           else (), tags=tags)
 
 
 def find_map_node(tree: Mapping[str, Any], path: str | os.PathLike[str]) -> str:
@@ -373,49 +375,17 @@ def find_map_node(tree: Mapping[str, Any], path: str | os.PathLike[str]) -> str:
 def _landmark(landmark_id: Any, fields: Any, source: str) -> tuple[Any, ...]:
     """Validate a landmark; return its fields in the order of _FIELDS, and its details."""
     where = f"{source}: landmark '{landmark_id}'"
-    if not isinstance(landmark_id, str) or not landmark_id or '.' in landmark_id:
-        # a dot would split the name of a ROS parameter
-        raise MapError(f'{where}: the id must be text without dots')
+    check_id(landmark_id, where)
     labelled = isinstance(fields, Mapping) and 'labels' in fields
-    _check_keys(fields, _FIELDS[1:] if labelled else _FIELDS, where, _FIELDS[:1] + OPTIONAL_FIELDS)
+    check_keys(fields, _FIELDS[1:] if labelled else _FIELDS, where, _FIELDS[:1] + OPTIONAL_FIELDS)
     details = read_details(fields, where)
     heaviest_label = max(details.labels, key=lambda pair: pair[1])[0] if details.labels else ''
     label = fields.get('label', heaviest_label)
-    semi_axes = _numbers(fields['semi_axes'], 3, f'{where}: semi_axes')
+    semi_axes = checked_numbers(fields['semi_axes'], 3, f'{where}: semi_axes')
     low, high = _SEMI_AXIS_RANGE_M
     if not all(low <= axis <= high for axis in semi_axes):
         raise MapError(f'{where}: semi_axes: {semi_axes} must be between {low:g} and {high:g} m')
-    center = _numbers(fields['center'], 3, f'{where}: center')
-    if max(map(abs, center)) > _MAX_COORDINATE_M:
-        raise MapError(f'{where}: center: {center} is beyond {_MAX_COORDINATE_M:g} m')
-    quat_xyzw = _numbers(fields['orientation'], 4, f'{where}: orientation')
-    if abs(math.hypot(*quat_xyzw) - 1.0) > _MAX_QUATERNION_NORM_ERROR:
-        raise MapError(f'{where}: orientation: the quaternion {quat_xyzw} has norm '
-                       f'{math.hypot(*quat_xyzw):.3g}, expected 1')
+    center, quat_xyzw = checked_place(fields, where)
     return (checked_text(label, f'{where}: label'),
             checked_text(fields['class_id'], f'{where}: class_id'), center, semi_axes, quat_xyzw,
             details)
-
-
-def _check_keys(tree: Any, expected: tuple[str, ...], where: str,
-                optional: tuple[str, ...] = ()) -> None:
-    if not isinstance(tree, Mapping):
-        raise MapError(f'{where}: expected the fields {", ".join(expected)}')
-    known = tuple(dict.fromkeys(expected + optional))
-    unknown = [str(key) for key in tree if key not in known]
-    if unknown:
-        named = ', '.join(f'{key}{did_you_mean(key, known)}' for key in unknown[:5])
-        raise MapError(f'{where}: unknown field: {named} (known: {", ".join(known)})')
-    missing = [key for key in expected if key not in tree]
-    if missing:
-        raise MapError(f'{where}: missing field: {", ".join(missing)}')
-
-
-def _numbers(value: Any, count: int, where: str) -> tuple[float, ...]:
-    values = tuple(value) if isinstance(value, list | tuple) or hasattr(value, 'tolist') else ()
-    numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
-    if len(values) != count or not numeric:
-        raise MapError(f'{where}: must be {count} numbers, not {value!r:.60}')
-    if not all(abs(v) <= sys.float_info.max for v in values):  # ints may be larger
-        raise MapError(f'{where}: {value!r:.60} has values that are not finite')
-    return tuple(map(float, values))
