@@ -40,10 +40,12 @@ def detail_of(found: Relocalization, frame_id: str, figures: Mapping[str, Any] |
         return found.reason
     assert found.map_from_camera is not None and found.covariance is not None
     evidence, points, depth = found.evidence, found.recognized, found.depth
-    by = [f'{evidence.inliers} landmarks'] if evidence and found.source != 'keyframes' else []
+    by = [f'{evidence.inliers} landmarks'] if evidence and (
+        found.source not in ('keyframes', 'tags')) else []
     by += [f'{points.inliers} keyframe points{points.recorded and f" of {points.recorded}"}'
            ] if points and found.source != 'objects' else []
     by += [f'depth of {depth.objects} objects'] if depth and depth.is_passed else []
+    by += [', '.join(evidence.tags.names)] if evidence and evidence.tags else []
     by += ['the prior'] if evidence and evidence.prior else []
     images = len(found.frame_matches)
     of = figures or figures_of_pose(found.map_from_camera, found.covariance, 2)

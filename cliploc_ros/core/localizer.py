@@ -41,6 +41,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Case, Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, TimeBudget
 from cliploc_ros.core.search.frame_search import SearchedFrame
+from cliploc_ros.core.tag_detection import detect_tags
 from cliploc_ros.units import NS_PER_S
 
 # These are time limits and therefore not in calibration.yaml. The confidence that a pose from a
@@ -251,6 +252,7 @@ class Localizer:
         OptionsError
             See Relocalizer.relocalize. The localizer then drops this instant.
         """
+        query = self.with_tags(query)
         if self.depth_scale.is_wrong:
             query = replace(query, frames=tuple(replace(frame, depths=None)
                                                 for frame in query.frames))
@@ -274,6 +276,17 @@ class Localizer:
                 frame.detections.class_ids)).sum()) for frame in query.frames], [
                     len(frame_match) for frame_match in found.frame_matches[-len(query.frames):]])
         return found
+
+    def with_tags(self, query: Query) -> Query:
+        """Return a query with the tags in its images, if the map has tags; known tags stay."""
+        families = dict.fromkeys(tag.family for tag in self._relocalizer.landmark_map.tags)
+        if not families or not query.images:
+            return query
+        first = len(query.frames) - len(query.images)  # offline, neighbours have no image
+        return replace(query, frames=query.frames[:first] + tuple(
+            frame if frame.tags is not None else replace(
+                frame, tags=detect_tags(image, frame.camera, families))
+            for frame, image in zip(query.frames[first:], query.images, strict=True)))
 
     def recognizer(self, query: Query, deadline: float = math.inf,
                    begin_stage: Callable[[str], None] = lambda stage: None

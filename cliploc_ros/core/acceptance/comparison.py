@@ -28,6 +28,8 @@ from cliploc_ros.core.acceptance.confidence import (
     confidences,
     objects_utility,
     points_utility,
+    tagged_objects_utility,
+    tags_utility,
     utilities,
 )
 from cliploc_ros.core.acceptance.contenders import Contender, JoinedFrames, join_frames, unrefined
@@ -38,6 +40,7 @@ from cliploc_ros.core.acceptance.verdict import Evidence, Rival
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import POSE_UNKNOWN, fuse, refined_covariance, shares_within
 from cliploc_ros.core.fit.finalists import Finalist, find_finalists, matches_of, meetings_of
+from cliploc_ros.core.fit.tag_pose import find_tag_places, sights_of
 from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE
@@ -88,7 +91,8 @@ class Comparison:
                  recognizer: ImageRecognizer | None = None) -> None:
         self._joined, self._looks, self._recognizer = joined, looks, recognizer
         self._last, self._none = joined.frames[-1].observation, joined.none_right
-        contenders, seen = list(met), None
+        tagged = self._tagged(met) if joined.landmark_map.tags else []
+        contenders, seen = sorted([*met, *tagged], key=_order) if tagged else list(met), None
         if recognizer is not None:
             guesses = contenders[:int(CALIBRATION.keyframes.guesses)]
             seen = recognizer.recognize([guess.pose for guess in guesses],
@@ -98,11 +102,9 @@ class Comparison:
                                    for place in seen.places]).reshape(-1, 4, 4)
                 contenders = [
                     contender if SAME_ANSWER.agreeing(contender.pose[None], places).any()
-                    else contender._replace(odds=contender.odds + CALIBRATION.keyframes.missed
-                                            * recognizer.coverage(contender.pose))
-                    for contender in contenders]
+                    else _missed(contender, recognizer) for contender in contenders]
             contenders += self.proposed(seen, contenders)
-            contenders.sort(key=lambda contender: (not contender.is_upright, -contender.rank))
+            contenders.sort(key=_order)
         #: The leading contender first; each source has at most one contender for each place
         self.contenders = contenders
         #: (m, 4, 4): map_from_camera of each contender
@@ -110,7 +112,7 @@ class Comparison:
         rows = np.arange(len(contenders))
         # A small group weakens the leading pose of objects. It does not choose between poses, and
         # takes nothing from points.
-        group = contenders[0].support.group if contenders and contenders[0].recognized is None \
+        group = contenders[0].support.group if contenders and contenders[0].is_of_objects \
             else 0.0
         #: (m,): probability of each contender; contenders that agree share one probability
         self.likely = self._confidences(rows, [contender.odds - group for contender in contenders])
@@ -120,25 +122,28 @@ class Comparison:
         agreeing = [contenders[row] for row in rows[self.leading]]
         #: The best contender at the leading place that the search of objects found
         self.by_objects = next((contender for contender in agreeing
-                                if contender.recognized is None), None)
+                                if contender.is_of_objects), None)
         self._by_keyframes = next((contender for contender in agreeing
                                    if contender.recognized is not None), None)
         #: The leading place if keyframes recognize it; else None
         self.place = self._by_keyframes.recognized if self._by_keyframes else None
+        self._by_tags = next((contender for contender in agreeing
+                              if contender.tagged is not None), None)
 
     @property
     def source(self) -> str:
-        """Return the source of the leading place: 'objects', 'keyframes' or 'both'."""
-        if self.by_objects is None:
-            return 'keyframes'
-        return 'objects' if self.place is None else 'both'
+        """Return the source of the leading place: 'objects', 'keyframes', 'tags' or 'both'."""
+        sources = [name for name, by in (
+            ('objects', self.by_objects), ('keyframes', self.place),
+            ('tags', self._by_tags)) if by]
+        return sources[0] if len(sources) == 1 else 'both'
 
     @property
     def by_boxes(self) -> Contender | None:
         """Return by_objects if the pose depends on its boxes; None if points determine it."""
-        is_sure = self.place is not None and (
-            self.place.inliers >= CALIBRATION.keyframes.good_covariance
-            or self._by_points >= self._joined.options.min_confidence)
+        is_sure = self._by_points >= self._joined.options.min_confidence or (
+            self.place is not None
+            and self.place.inliers >= CALIBRATION.keyframes.good_covariance)
         return None if is_sure else self.by_objects
 
     def _confidences(self, rows: NDArray[np.int64], odds: Sequence[float]
@@ -164,11 +169,42 @@ class Comparison:
             alone = self._none + points - contender.handicap
             agreeing = [other.odds for other in met
                         if SAME_ANSWER.agree(contender.pose, other.pose)]
+            named = [other.by_points + max(0.0, points) for other in met
+                     if SAME_ANSWER.agree(contender.pose, other.pose)]
             proposed.append(contender._replace(
-                recognized=place, by_points=alone,
+                recognized=place, by_points=max([alone, *named]),
                 odds=max([alone + max(0.0, objects),
                           *(odds + max(0.0, points) for odds in agreeing)])))
         return proposed
+
+    def _tagged(self, met: Sequence[Contender]) -> list[Contender]:
+        """Return the places that tags of the newest instant name, as contenders.
+
+        Tags add to the odds of a pose that objects found at the same place, as keyframes do.
+        """
+        joined, most = self._joined, CALIBRATION.attitude.vertical_sigmas
+        now = [row for row, instant in enumerate(joined.instants)
+               if instant == joined.instants[-1]]
+        constraint, landmark_map = constraint_of(self._last, joined.options), joined.landmark_map
+        places = [place for place in find_tag_places(sights_of(
+            landmark_map, [joined.frames[row] for row in now], joined.cameras[now]))
+            if constraint.allows(place.map_from_camera)]
+        found = joined.contenders([unrefined(place.map_from_camera) for place in places], [
+            constraint.tilt_error(place.map_from_camera, place.covariance) <= most
+            for place in places])
+        tagged = []
+        for contender, place in zip(found, places, strict=True):
+            expected = expect(landmark_map, self._last.camera, contender.pose, np.array(
+                [match.landmark for match in contender.matches[-1]], dtype=np.int64))
+            objects = tagged_objects_utility(
+                contender.support, int((expected.in_sight & ~expected.was_seen).sum()))
+            named = tags_utility(place)
+            alone = self._none + named + min(0.0, objects) - contender.handicap
+            tagged.append(contender._replace(
+                tagged=place, by_points=alone, odds=max([alone + max(0.0, objects), *(
+                    other.odds + max(0.0, named) for other in met
+                    if SAME_ANSWER.agree(contender.pose, other.pose))])))
+        return tagged
 
     def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pose (4, 4) of the leading place and its covariance (6, 6).
@@ -182,8 +218,15 @@ class Comparison:
             terms = CALIBRATION.keyframes
             doubt = max(1.0, terms.good_covariance / self.place.inliers) ** terms.doubt_power
             by_points = self._by_keyframes.pose, doubt * self.place.covariance
-            if best is None:
-                return by_points
+        if self._by_tags is not None and self._by_tags.tagged is not None:
+            others = [contender for contender in self.contenders if contender.tagged]
+            others.sort(key=lambda contender: contender is not self._by_tags)
+            by_tags = self._by_tags.pose, self._by_tags.tagged.covariance + spread(
+                np.array([contender.pose for contender in others]),
+                np.array([contender.odds for contender in others]))
+            by_points = by_tags if by_points is None else fuse(*by_points, *by_tags)
+        if by_points is not None and best is None:
+            return by_points
         assert best is not None
         joined = self._joined
         finalist, covariance = best.finalist, POSE_UNKNOWN
@@ -194,7 +237,7 @@ class Comparison:
                 joined.options.mount_deviation, CALIBRATED)
         if finalist.information is not None:
             found_by_objects = [contender for contender in self.contenders
-                                if contender.recognized is None]
+                                if contender.is_of_objects]
             found_by_objects.sort(key=lambda contender: contender is not best)
             covariance = covariance + spread(
                 np.array([contender.pose for contender in found_by_objects]),
@@ -213,7 +256,7 @@ class Comparison:
             place=place_of(self._joined.landmark_map, self.poses[0]).position,
             twin=twin and twin.position, twin_map=twin.name if twin else '',
             # as in the paper, unrefined poses are not refused for an uncertain position
-            near=1.0 if self.place is None and best.finalist.information is None
+            near=1.0 if not (self.place or self._by_tags) and best.finalist.information is None
             else float(shares_within(
                 RIGHT_M, CALIBRATION.covariance.caution * covariance[None, :3, :3])[0]),
             deviation_m=math.sqrt(np.trace(covariance[:3, :3])), coverage=coverage,
@@ -224,7 +267,8 @@ class Comparison:
             else meetings_of(frames, best.finalist, best.matches),
             unexplained=best.support.unexplained, signs=self._signs(best), motion=self._motion(),
             not_mirrored=self._not_mirrored(by_points), uncontradicted=self._uncontradicted(),
-            recognized=self.place, prior=self.contenders[0].prior,
+            recognized=self.place, tags=self._by_tags and self._by_tags.tagged,
+            prior=self.contenders[0].prior,
             tilt_deg=tilt_deg(self.poses[0], self._last.base_up_in_camera),
             earlier=self._looks.earlier(self._last, self.poses[0]), crops_left=0
             if self._last.compared is None
@@ -302,17 +346,19 @@ class Comparison:
             return None
         row = others[np.argmax(self.likely[others])]
         place = place_of(self._joined.landmark_map, self.poses[row])
-        same_source = self.by_objects if self.contenders[row].recognized is None else self.place
+        same_source = self.by_objects if self.contenders[row].is_of_objects else \
+            self._by_tags if self.contenders[row].tagged else self.place
         return Rival(min(float(self.likely[row]), 1.0 - float(self.likely[0])), place.position,
-                     place.name, same_source is None, not self.contenders[row].is_upright)
+                     place.name, same_source is None, not self.contenders[row].is_upright,
+                     self.contenders[row].tagged)
 
     @cached_property
     def _by_points(self) -> float:
         """Return the probability of the leading place without the evidence of objects for it."""
-        if self.place is None:
+        if self.place is None and self._by_tags is None:
             return 0.0
         rows = np.array([row for row, contender in enumerate(self.contenders)
-                         if contender.recognized is not None or not self.leading[row]])
+                         if not contender.is_of_objects or not self.leading[row]])
         near = self.leading[rows]
         found = self._confidences(rows, [
             self.contenders[row].by_points if is_near else self.contenders[row].odds
@@ -345,7 +391,8 @@ class Comparison:
             return 1.0, None
         rows = inside[others - 1]
         rivals = joined.contenders([places[row - 1] for row in others], [True] * len(others))
-        leads = self._leads_of_points(poses[others], copies[rows])
+        leads = self._leads_of_points(poses[others], copies[rows]) \
+            + self._leads_of_tags(poses[others])
         for number, (rival, row) in enumerate(zip(rivals, rows, strict=True)):
             if row < len(twins):
                 by_objects = lead_over_twin(best.support, rival.support, float(alike.shares[row]),
@@ -355,6 +402,16 @@ class Comparison:
             leads[number] += best.prior - rival.prior + by_objects
         chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
         return chance, place_of(landmark_map, poses[others][int(np.argmin(leads))])
+
+    def _leads_of_tags(self, twins: NDArray[np.float64]) -> NDArray[np.float64] | float:
+        """Return the log odds (m,) by which tags prefer the leading place to each twin."""
+        if self._by_tags is None:
+            return 0.0
+        agrees = SAME_ANSWER.agreeing(twins, self.poses)
+        utilities_of = np.array([0.0 if contender.tagged is None else max(
+            0.0, tags_utility(contender.tagged)) for contender in self.contenders])
+        return np.maximum(0.0, utilities_of[self.leading].max()
+                          - (agrees * utilities_of).max(axis=1))
 
     def _leads_of_points(self, twins: NDArray[np.float64], are_rooms: NDArray[np.bool_]
                          ) -> NDArray[np.float64]:
@@ -377,6 +434,16 @@ class Comparison:
         leads = np.maximum(0.0, known * max(0.0, points_utility(self.place)) - theirs)
         is_sure = 1.0 / (1.0 + np.exp(-leads)) >= self._joined.options.min_confidence
         return np.where(is_sure, np.inf, leads)
+
+
+def _order(contender: Contender) -> tuple[bool, float]:
+    return not contender.is_upright, -contender.rank
+
+
+def _missed(contender: Contender, recognizer: ImageRecognizer) -> Contender:
+    """Return a contender that keyframes cover but do not recognize, with lower odds."""
+    odds = CALIBRATION.keyframes.missed * recognizer.coverage(contender.pose)
+    return contender._replace(odds=contender.odds + odds, by_points=contender.by_points + odds)
 
 
 def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.finalists import Match
+from cliploc_ros.core.fit.tag_pose import TagPlace
 from cliploc_ros.core.geometry.depth import depth_errors, depth_odds
 from cliploc_ros.core.geometry.ellipsoid import box_ious, project_ellipsoids
 from cliploc_ros.core.geometry.transforms import SAME_ANSWER, invert_transform
@@ -322,6 +323,28 @@ def objects_utility(support: Support) -> float:
     terms = CALIBRATION.keyframes
     return (terms.explained * min(terms.most_objects, support.inliers)
             + terms.unexplained * min(terms.most_objects, support.unexplained))
+
+
+def tags_utility(place: TagPlace) -> float:
+    """Return the log odds of a place by its tags, against tags that are not where the map says.
+
+    The corners of a tag, in all cameras, are one piece of evidence, that of its name.
+    """
+    terms = CALIBRATION.tags
+    return min(terms.most, terms.one + terms.more * (len(place.names) - 1)
+               + terms.others * len(place.others)) - place.misfit
+
+
+def tagged_objects_utility(support: Support, missing: int) -> float:
+    """Return the log odds of a pose that tags propose, from its objects alone.
+
+    Tags are moved, copied and shown on screens. Objects that the pose does not explain therefore
+    count against it, more if mapped objects are missing (a number) in view.
+    """
+    terms = CALIBRATION.tags
+    unexplained = min(terms.most_objects, support.unexplained)
+    return (terms.explained * min(terms.most_objects, support.inliers)
+            + terms.unexplained * unexplained + terms.missing * min(unexplained, missing))
 
 
 def tilt_handicaps(map_from_cameras: NDArray[np.float64], deviation_deg: float

@@ -15,6 +15,7 @@ from cliploc_ros.core.acceptance import confidence
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.finalists import Finalist, Match, instants_of, matches_of
 from cliploc_ros.core.fit.refinement import refine_rig
+from cliploc_ros.core.fit.tag_pose import TagPlace
 from cliploc_ros.core.fit.verification import Rig, cameras_from_last, make_rig
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.keyframes.places import RecognizedPlace
@@ -41,8 +42,14 @@ class Contender(NamedTuple):
     prior: float = 0.0
     #: The place that keyframes recognize, if they propose the pose
     recognized: RecognizedPlace | None = None
-    #: Log odds of a pose that keyframes propose, without the evidence of objects for it
+    #: Log odds of a pose that keyframes or tags propose, without the evidence of objects for it
     by_points: float = -math.inf
+    tagged: TagPlace | None = None  #: The place that tags name, if they propose the pose
+
+    @property
+    def is_of_objects(self) -> bool:
+        """Return whether the search of objects found the pose."""
+        return self.recognized is None and self.tagged is None
 
     @property
     def landmarks(self) -> NDArray[np.int64]:

@@ -12,6 +12,7 @@ import numpy as np
 from cliploc_ros.core.acceptance.genuine import Motion, Signs, chance_genuine
 from cliploc_ros.core.acceptance.looks import EarlierLook
 from cliploc_ros.core.calibration import CALIBRATION
+from cliploc_ros.core.fit.tag_pose import TagPlace
 from cliploc_ros.core.keyframes.places import RecognizedPlace
 from cliploc_ros.core.options import RelocalizerOptions
 
@@ -89,6 +90,7 @@ class Rival:
     #: Whether keyframes propose one of the two poses and objects the other
     is_other_source: bool = False
     is_tilted: bool = False  #: Whether the pose contradicts the known vertical
+    tags: TagPlace | None = None  #: The place that tags name, if they propose the pose
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,7 @@ class Evidence:
     #: Probability that keyframes are wrong if they recognize only other places
     uncontradicted: float = 1.0
     recognized: RecognizedPlace | None = None  #: The place that keyframes recognize at the pose
+    tags: TagPlace | None = None  #: The place that tags name at the pose
     prior: float = 0.0  #: Log odds, at most 0, of the pose given the prior region
     #: Probability that odometry links all frames, see cliploc_ros.core.acceptance.links
     linked: float = 1.0
@@ -275,6 +278,9 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
             f' (the second in {evidence.twin_map})')
         cause = (f'{_point(evidence.place)} and {_point(evidence.twin)} m look alike{second}; '
                 'turn the camera to objects that differ')
+    elif (weakest in ('likely', 'uncontradicted') and (
+            contradiction := _of_tags(evidence, ambiguous)) is not None):
+        kind, cause = contradiction
     elif weakest in _ADVICE and (weakest != 'genuine' or evidence.recognized is not None):
         kind, sentence = _ADVICE[weakest]
         cause = sentence.format(evidence)
@@ -295,6 +301,22 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
             f'ambiguous: another pose{where} has probability {rival.likely:.2g}; turn the camera '
             'to objects that differ')
     return Refusal(kind, f'{compared}; {cause}')
+
+
+def _of_tags(evidence: Evidence, ambiguous: bool) -> Refusal | None:
+    """Return the refusal of a pose that tags name or contradict; None without such tags."""
+    ours, rival = evidence.tags, evidence.rival
+    theirs = rival.tags if rival is not None and ambiguous else None
+    if ours is not None and theirs is not None and ours.names == theirs.names:
+        return Refusal(RefusalKind.AMBIGUOUS, (
+            f'{", ".join(ours.names)} fits two poses; move nearer, or {_LOOK_ABOUT}'))
+    tags = ours or theirs
+    if tags is None:
+        return None
+    others = ', '.join(tags.others) if tags.others else 'objects or keyframes'
+    return Refusal(RefusalKind.CONTRADICTION, (
+        f'{", ".join(tags.names)} and {others} disagree: a tag that was moved or copied, has '
+        f'another size, or is on a screen or robot? {_LOOK_ABOUT}'))
 
 
 def _points(evidence: Evidence) -> str:

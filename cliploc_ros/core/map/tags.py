@@ -58,8 +58,8 @@ def read_tags(tree: Any, source: str) -> tuple[Tag, ...]:
     names: dict[str, str] = {}
     for tag in tags:
         if tag.name in names:
-            raise MapError(f"{source}: tag '{tag.tag_id}': '{names[tag.name]}' has the same family "
-                           'and id: give each tag of a place its own id')
+            raise MapError(f"{source}: tag '{tag.tag_id}': family and id are those of "
+                           f"'{names[tag.name]}': give each tag of a place its own id")
         names[tag.name] = tag.tag_id
     return tags
 

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find printed tags in an image, with OpenCV's aruco and corners from fits to the edges.
 
-The corners of aruco are those of a contour, off by half a pixel and more. As in AprilTag 3 (Krogius
-et al., "Flexible Layouts for Fiducial Tags", 2019), each edge of the black square is therefore
-found again where the brightness changes across it, and lines through these places meet in the
-corners. Lines are fitted on the plane z = 1, where no lens bends them.
+The corners of aruco are those of a contour, off by half a pixel and more. As in AprilTag 3
+(Krogius et al., "Flexible Layouts for Fiducial Tags", 2019), each edge of the black square is
+therefore found again where the brightness changes across it, and lines through these places meet
+in the corners. Lines are fitted on the plane z = 1, where no lens bends them.
 """
 
 from collections.abc import Iterable
@@ -68,8 +68,8 @@ def _finder(family: str, least_rate: float) -> tuple[Any, int]:
     """Return a function that finds the tags of a family, and the modules along their side."""
     aruco = getattr(cv2, 'aruco', None)
     if aruco is None:
-        raise ModelError("tags of the map are not used: this OpenCV has no aruco: install Ubuntu's "
-                         'python3-opencv, or a newer opencv-python-headless')
+        raise ModelError('tags of the map need aruco, which this OpenCV lacks: install '
+                         'python3-opencv of Ubuntu, or a newer opencv-python-headless')
     dictionary = aruco.getPredefinedDictionary(getattr(
         aruco, f'DICT_APRILTAG_{family[3:]}' if family[:3] == 'tag' else family))
     is_old = not hasattr(aruco, 'ArucoDetector')  # before OpenCV 4.7
@@ -92,7 +92,8 @@ def _refined(gray: NDArray[np.uint8], camera: Camera, corners: NDArray[np.float6
         # the normal points out of the square, as corners go clockwise: from black to white
         normals = edges[..., ::-1] * (1.0, -1.0) / sides
         is_last = number == _PASSES - 1
-        reach = np.clip((_LAST_REACH if is_last else _REACH) * sides.min(axis=1, keepdims=True) / modules, *_REACH_PX)
+        reach = np.clip((_LAST_REACH if is_last else _REACH)
+                        * sides.min(axis=1, keepdims=True) / modules, *_REACH_PX)
         places = corners[:, :, None] + _ALONG[:, None] * edges[:, :, None]
         samples = places[:, :, :, None] + (reach * normals)[:, :, None, None] * _ACROSS[:, None]
         values = _sampled(gray, samples)
