@@ -75,6 +75,9 @@ class SeenTags:
     corners_px: NDArray[np.float64]
 
 
+NO_TAGS = SeenTags((), np.empty((0, 4, 2)))
+
+
 def check_planar(covariance: NDArray[np.float64]) -> None:
     """Raise OptionsError unless this is a covariance (3, 3) of x, y and yaw."""
     if not np.isfinite(covariance).all() or not np.linalg.eigvalsh(covariance).min() > 0.0:

@@ -19,7 +19,8 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
 _UNIT_TOLERANCE = 0.01
-DETECTION_TYPES = ('vision_msgs', 'yolo_msgs')
+DETECTION_TYPES, TAG_TYPES = ('vision_msgs', 'yolo_msgs', 'none'), (
+    'image', 'apriltag_msgs', 'none')
 
 
 def stamp_ns(stamp: Time) -> int:
@@ -77,15 +78,26 @@ def pose_with_covariance_msg(header: Header, parent_from_child: NDArray[np.float
 def detection_type(package: str) -> tuple[type, Callable[[Any], vision.Detection2DArray]]:
     """Return the detection message of a package, and its conversion to Detection2DArray.
 
-    The package is `vision_msgs` or `yolo_msgs`. OptionsError: it is not installed.
+    The package is `vision_msgs` or `yolo_msgs`; 'none' stands for vision_msgs. OptionsError: it is
+    not installed.
     """
-    if package == 'vision_msgs':
+    if package != 'yolo_msgs':
         return vision.Detection2DArray, lambda msg: msg
     try:
         return importlib.import_module('yolo_msgs.msg').DetectionArray, from_yolo_msg
     except ImportError as error:
         raise OptionsError('detections_type: yolo_msgs is not installed: build yolo_ros in this '
                            'workspace and source it, or set vision_msgs') from error
+
+
+def tags_type() -> type:
+    """Return the message type of the topic tags; OptionsError: apriltag_msgs is not installed."""
+    try:
+        found: type = importlib.import_module('apriltag_msgs.msg').AprilTagDetectionArray
+    except ImportError as error:
+        raise OptionsError('tags_type: apriltag_msgs is not installed: install apriltag_ros, or '
+                           'set image') from error
+    return found
 
 
 def from_yolo_msg(msg: Any) -> vision.Detection2DArray:

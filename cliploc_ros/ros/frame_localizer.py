@@ -28,12 +28,12 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
 from cliploc_ros.core.map.joined_map import join_maps, parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import Observation
+from cliploc_ros.core.observation import NO_TAGS, Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch, WatchReport
-from cliploc_ros.errors import CliplocError, MapError, ModelError
+from cliploc_ros.errors import CliplocError, MapError, ModelError, counted
 from cliploc_ros.files.storage import read_file, resolve_cache_dir
 from cliploc_ros.models.protocols import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
@@ -116,7 +116,9 @@ class FrameLocalizer:
             f'{len(self.frame_ids)} maps, frames {frames}'
         keyframes = '' if self.keyframes is None else \
             f'{len(self.keyframes.localizer.layer)} keyframes, '
-        return (f'{len(self.landmark_map)} landmarks in {where}, {keyframes}'
+        tags = len(self.landmark_map.tags)
+        return (f'{len(self.landmark_map)} landmarks{f" and {counted(tags, "tag")}" * bool(tags)} '
+                f'in {where}, {keyframes}'
                 f'matching {self._options.matching}, algorithm {self._options.algorithm}')
 
     def localize(self, frame: Frame, parameters: RelocalizerParameters, known: KnownBefore,
@@ -183,7 +185,7 @@ class FrameLocalizer:
                            f"{', '.join(self.frame_ids)}: correct the map's frame_id")
         options = parameters.options()
         localizer = self._localizer_for(options)
-        query = self.instants.query(frame, parameters, KnownBefore(state))
+        query = localizer.with_tags(self.instants.query(frame, parameters, KnownBefore(state)))
         observation = localizer.with_free_crops(query, 0, self.observer) \
             if can_do_without_crops(options) else by_classes(query.newest, len(self.landmark_map))
         pose = map_from_camera.copy()
@@ -276,7 +278,11 @@ class Instants:
             raise
         self._faults[frame.camera] = faults
         detections = given.usable(camera.width, camera.height, parameters.max_detections)
-        self._detector.add(given, detections)
+        if parameters.detections_type != 'none':
+            self._detector.add(given, detections)
+        tags = None
+        if parameters.tags_type != 'image':
+            tags = NO_TAGS if frame.tags is None else messages.tags_from_msg(frame.tags)
         place, odom_from_camera = state.place, None
         if not by_odometry:
             odom_from_camera = invert_transform(state.camera_from_base)
@@ -299,7 +305,7 @@ class Instants:
             up_in_camera=state.up_in_camera, depths=depths,
             odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m,
             base_up_in_camera=state.camera_from_base[:3, 2]
-            if parameters.base_frame not in ('', image_frame) else None)
+            if parameters.base_frame not in ('', image_frame) else None, tags=tags)
 
 
 def _run_of(state: RobotState) -> int | None:
@@ -335,8 +341,8 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
     landmark_map, map_hash = load_map(node, files)
     relocalizer = Relocalizer(landmark_map, options)  # errors show before the slow steps
     keyframes = load_keyframes(parameters, landmark_map)
-    if not len(landmark_map) and keyframes is None:
-        raise MapError('the map has neither landmarks nor keyframes next to it: rebuild it')
+    if not len(landmark_map) and keyframes is None and not landmark_map.tags:
+        raise MapError('the map has neither landmarks, tags nor keyframes next to it: rebuild it')
     observer = None
     if options.needs_similarities and len(landmark_map):
         from cliploc_ros.models.clip_encoder import embed_map, load_encoder_for_map

@@ -185,20 +185,16 @@ class Comparison:
         joined, most = self._joined, CALIBRATION.attitude.vertical_sigmas
         now = [row for row, instant in enumerate(joined.instants)
                if instant == joined.instants[-1]]
-        constraint, landmark_map = constraint_of(self._last, joined.options), joined.landmark_map
+        constraint = constraint_of(self._last, joined.options)
         places = [place for place in find_tag_places(sights_of(
-            landmark_map, [joined.frames[row] for row in now], joined.cameras[now]))
+            joined.landmark_map, [joined.frames[row] for row in now], joined.cameras[now]))
             if constraint.allows(place.map_from_camera)]
         found = joined.contenders([unrefined(place.map_from_camera) for place in places], [
             constraint.tilt_error(place.map_from_camera, place.covariance) <= most
             for place in places])
         tagged = []
         for contender, place in zip(found, places, strict=True):
-            expected = expect(landmark_map, self._last.camera, contender.pose, np.array(
-                [match.landmark for match in contender.matches[-1]], dtype=np.int64))
-            objects = tagged_objects_utility(
-                contender.support, int((expected.in_sight & ~expected.was_seen).sum()))
-            named = tags_utility(place)
+            objects, named = tagged_objects_utility(contender.support), tags_utility(place)
             alone = self._none + named + min(0.0, objects) - contender.handicap
             tagged.append(contender._replace(
                 tagged=place, by_points=alone, odds=max([alone + max(0.0, objects), *(

@@ -335,16 +335,13 @@ def tags_utility(place: TagPlace) -> float:
                + terms.others * len(place.others)) - place.misfit
 
 
-def tagged_objects_utility(support: Support, missing: int) -> float:
+def tagged_objects_utility(support: Support) -> float:
     """Return the log odds of a pose that tags propose, from its objects alone.
 
     Tags are moved, copied and shown on screens. Objects that the pose does not explain therefore
-    count against it, more if mapped objects are missing (a number) in view.
+    count more than in the choice between poses of objects.
     """
-    terms = CALIBRATION.tags
-    unexplained = min(terms.most_objects, support.unexplained)
-    return (terms.explained * min(terms.most_objects, support.inliers)
-            + terms.unexplained * unexplained + terms.missing * min(unexplained, missing))
+    return float(utilities([support])[0]) + CALIBRATION.tags.unexplained * support.unexplained
 
 
 def tilt_handicaps(map_from_cameras: NDArray[np.float64], deviation_deg: float

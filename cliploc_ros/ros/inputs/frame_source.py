@@ -18,7 +18,7 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import detection_type, of_camera, stamp_ns
+from cliploc_ros.ros.conversions import detection_type, of_camera, stamp_ns, tags_type
 from cliploc_ros.ros.inputs.stamps import ExactPairing, MessageStamps, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, Rates
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -59,6 +59,7 @@ class Frame:
     #: Depth within depth_tolerance_s of the image; None without depth
     depth: Image | CompressedImage | None = None
     depth_camera_info: CameraInfo | None = None  #: For unregistered depth
+    tags: Any = None  #: AprilTagDetectionArray with `tags_type: apriltag_msgs`; else None
     camera: str = ''  #: Name of the camera; empty for a single camera
     beside: tuple['Frame', ...] = ()  #: Frames of other cameras at this instant
     left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame at this instant
@@ -100,11 +101,16 @@ class FrameSource:
         self._linger_s, self._on_frame = linger_s, on_frame
         self._package = parameters.detections_type
         self._detections_type, self._converted = detection_type('vision_msgs')
+        self._tags_type: type = Detection2DArray  # until the source opens
         is_raw, depth = parameters.image_transport == 'raw', parameters.depth_transport
         self._image_type = Image if is_raw else CompressedImage
         self._depth_type = Image if depth == 'raw' else CompressedImage
         topics = {'image': 'image' if is_raw else 'image/compressed',
-                  'camera_info': 'camera_info', 'detections': 'detections'}
+                  'camera_info': 'camera_info'}
+        if self._package != 'none':
+            topics['detections'] = 'detections'
+        if parameters.tags_type == 'apriltag_msgs':
+            topics['tags'] = 'tags'
         if depth != 'none':
             topics |= {'depth': 'depth' if depth == 'raw' else 'depth/compressedDepth',
                        'depth_camera_info': 'depth_camera_info'}
@@ -117,9 +123,10 @@ class FrameSource:
         self.lag_s, self.nearest_lag_s = math.nan, math.inf
         self._depth_tolerance_ns = round(parameters.depth_tolerance_s * NS_PER_S)
         self._depths: deque[Image | CompressedImage] = deque()
-        self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
-                                      'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING,
-                                     'image', 'detections')
+        self._pairing = ExactPairing({
+            'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20, 'detections': _MAX_DETECTIONS_BYTES,
+            **({'tags': _MAX_DETECTIONS_BYTES} if 'tags' in topics else {})}, _MAX_WAITING,
+            'image', 'detections')
         self._stamps = {'image': MessageStamps(), 'detections': MessageStamps()}
         self._static_info: CameraInfo | None = None
         self._unsure: Frame | None = None
@@ -143,6 +150,8 @@ class FrameSource:
         """
         with self._changed:
             self._detections_type, self._converted = detection_type(self._package)
+            if 'tags' in self.topics:
+                self._tags_type = tags_type()
             self.closed = ''
             if self._linger_s == math.inf:
                 self._wanted_until = math.inf
@@ -247,6 +256,7 @@ class FrameSource:
         return {'image': (self._image_type, qos.IMAGE),
                 'camera_info': (CameraInfo, qos.CAMERA_INFO),
                 'detections': (self._detections_type, qos.DETECTIONS_IN),
+                'tags': (self._tags_type, qos.DETECTIONS_IN),
                 'depth': (self._depth_type, qos.IMAGE),
                 'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
 
@@ -293,17 +303,21 @@ class FrameSource:
         """Return the frame that a message completes, once its stamps are reliable; else None."""
         at_ns = stamp_ns(msg.header.stamp)
         size = {'image': lambda: len(msg.data), 'camera_info': lambda: 1000,
-                'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
+                'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections)),
+                'tags': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
         if name == 'camera_info':
             # camera_info without a stamp is valid for all images
             self._static_info = msg if stamp_problem(msg.header.stamp) else None
             if self._static_info is not None:
                 return None
-        elif not self._is_named(name, msg, received_at):
+        elif name != 'tags' and not self._is_named(name, msg, received_at):
             self._unsure = None
             return None
         if name == 'image' and self._static_info is not None:
             self._pairing.add('camera_info', at_ns, (self._static_info, received_at), 0)
+        if name == 'image' and self._package == 'none':
+            self._pairing.add('detections', at_ns, (
+                Detection2DArray(header=msg.header), received_at), 0)
         complete = self._pairing.add(name, at_ns, (msg, received_at), size)
         if complete is not None:
             (image, image_at), (detections, detected_at) = (
@@ -314,7 +328,8 @@ class FrameSource:
                     (depth for depth in self._depths
                      if abs(stamp_ns(depth.header.stamp) - at_ns) <= self._depth_tolerance_ns),
                     key=lambda depth: abs(stamp_ns(depth.header.stamp) - at_ns), default=None),
-                self._depth_camera, self._camera, image_topic=self._resolved('image'))
+                self._depth_camera, complete.get('tags', (None,))[0], self._camera,
+                image_topic=self._resolved('image'))
         frame = self._unsure
         # the next images may have the same stamp; wait until stamps are known to differ
         if frame is None or not (self._stamps['image'].are_own or all(
