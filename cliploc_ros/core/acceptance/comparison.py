@@ -18,6 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,10 +41,10 @@ from cliploc_ros.core.acceptance.verdict import Evidence, Rival
 from cliploc_ros.core.calibration import CALIBRATION
 from cliploc_ros.core.fit.covariance import POSE_UNKNOWN, fuse, refined_covariance, shares_within
 from cliploc_ros.core.fit.finalists import Finalist, find_finalists, matches_of, meetings_of
-from cliploc_ros.core.fit.tag_pose import find_tag_places, sights_of
+from cliploc_ros.core.fit.tag_pose import find_tag_places
 from cliploc_ros.core.fit.verification import verify_rig
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE
+from cliploc_ros.core.geometry.transforms import RIGHT_M, SAME_ANSWER, SAME_PLACE, move_covariance
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.keyframes.places import Recognition
 from cliploc_ros.core.map.joined_map import Place, place_of
@@ -163,44 +164,52 @@ class Comparison:
         found = self._joined.contenders(
             [unrefined(place.map_from_camera) for place in seen.places],
             [place.tilt_error <= most for place in seen.places])
-        proposed = []
-        for contender, place in zip(found, seen.places, strict=True):
-            points, objects = points_utility(place), objects_utility(contender.support)
-            alone = self._none + points - contender.handicap
-            agreeing = [other.odds for other in met
-                        if SAME_ANSWER.agree(contender.pose, other.pose)]
-            named = [other.by_points + max(0.0, points) for other in met
-                     if SAME_ANSWER.agree(contender.pose, other.pose)]
-            proposed.append(contender._replace(
-                recognized=place, by_points=max([alone, *named]),
-                odds=max([alone + max(0.0, objects),
-                          *(odds + max(0.0, points) for odds in agreeing)])))
-        return proposed
+        return [self._named(contender, met, points_utility(place), objects_utility(
+            contender.support), recognized=place) for contender, place in zip(
+                found, seen.places, strict=True)]
+
+    def _named(self, contender: Contender, met: Sequence[Contender], utility: float,
+               objects: float, against: float = 0.0, **source: Any) -> Contender:
+        """Return a contender of keyframes or tags with its odds.
+
+        The evidence of objects for it does not count where objects have no say, that against it
+        does. A pose that others found at the same place adds its own odds.
+        """
+        alone = self._none + utility + against - contender.handicap
+        near = [other for other in met if SAME_ANSWER.agree(contender.pose, other.pose)]
+        return contender._replace(
+            by_points=max([alone, *(other.by_points + max(0.0, utility) for other in near)]),
+            odds=max([alone + max(0.0, objects),
+                      *(other.odds + max(0.0, utility) for other in near)]), **source)
 
     def _tagged(self, met: Sequence[Contender]) -> list[Contender]:
-        """Return the places that tags of the newest instant name, as contenders.
+        """Return the places that tags of the newest instant name, one for each place.
 
         Tags add to the odds of a pose that objects found at the same place, as keyframes do.
         """
         joined, most = self._joined, CALIBRATION.attitude.vertical_sigmas
-        now = [row for row, instant in enumerate(joined.instants)
-               if instant == joined.instants[-1]]
+        found = list[Contender]()
         constraint = constraint_of(self._last, joined.options)
-        places = [place for place in find_tag_places(sights_of(
-            joined.landmark_map, [joined.frames[row] for row in now], joined.cameras[now]))
-            if constraint.allows(place.map_from_camera)]
-        found = joined.contenders([unrefined(place.map_from_camera) for place in places], [
-            constraint.tilt_error(place.map_from_camera, place.covariance) <= most
-            for place in places])
-        tagged = []
-        for contender, place in zip(found, places, strict=True):
-            objects, named = tagged_objects_utility(contender.support), tags_utility(place)
-            alone = self._none + named + min(0.0, objects) - contender.handicap
-            tagged.append(contender._replace(
-                tagged=place, by_points=alone, odds=max([alone + max(0.0, objects), *(
-                    other.odds + max(0.0, named) for other in met
-                    if SAME_ANSWER.agree(contender.pose, other.pose))])))
-        return tagged
+        for frame, camera, instant in zip(joined.frames, joined.cameras, joined.instants,
+                                          strict=True):
+            for place in find_tag_places(joined.landmark_map.tags, frame.observation) if (
+                    instant == joined.instants[-1]) else ():
+                pose = place.map_from_camera @ camera
+                place = place._replace(map_from_camera=pose, covariance=move_covariance(
+                    place.covariance, pose[:3, 3] - place.map_from_camera[:3, 3]))
+                contender, = joined.contenders([unrefined(pose)], [
+                    constraint.tilt_error(pose, place.covariance) <= most])
+                objects = tagged_objects_utility(contender.support)
+                if constraint.allows(pose):
+                    found.append(self._named(contender, met, tags_utility(place), objects,
+                                             min(0.0, objects), tagged=place))
+        found.sort(key=_order)
+        poses = np.array([contender.pose for contender in found]).reshape(-1, 4, 4)
+        odds, rows = np.array([contender.odds for contender in found]), np.arange(len(found))
+        # flips near each other make a pose uncertain
+        return [found[row]._replace(spread=spread(poses[order], odds[order]))
+                for row in SAME_ANSWER.distinct(poses)
+                for order in [np.r_[row, np.delete(rows, row)]]]
 
     def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pose (4, 4) of the leading place and its covariance (6, 6).
@@ -215,11 +224,8 @@ class Comparison:
             doubt = max(1.0, terms.good_covariance / self.place.inliers) ** terms.doubt_power
             by_points = self._by_keyframes.pose, doubt * self.place.covariance
         if self._by_tags is not None and self._by_tags.tagged is not None:
-            others = [contender for contender in self.contenders if contender.tagged]
-            others.sort(key=lambda contender: contender is not self._by_tags)
-            by_tags = self._by_tags.pose, self._by_tags.tagged.covariance + spread(
-                np.array([contender.pose for contender in others]),
-                np.array([contender.odds for contender in others]))
+            by_tags = self._by_tags.pose, (self._by_tags.tagged.covariance
+                                           + self._by_tags.spread)
             by_points = by_tags if by_points is None else fuse(*by_points, *by_tags)
         if by_points is not None and best is None:
             return by_points

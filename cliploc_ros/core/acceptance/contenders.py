@@ -45,6 +45,8 @@ class Contender(NamedTuple):
     #: Log odds of a pose that keyframes or tags propose, without the evidence of objects for it
     by_points: float = -math.inf
     tagged: TagPlace | None = None  #: The place that tags name, if they propose the pose
+    #: (6, 6): mean square of its differences to other poses there that tags propose
+    spread: NDArray[np.float64] | float = 0.0
 
     @property
     def is_of_objects(self) -> bool:

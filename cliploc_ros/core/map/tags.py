@@ -19,8 +19,8 @@ FAMILIES = {'tag16h5': 30, 'tag25h9': 35, 'tag36h10': 2320, 'tag36h11': 587,
             **{f'DICT_{side}X{side}_{count}': count for side in (4, 5, 6, 7)
                for count in (50, 100, 250, 1000)}, 'DICT_ARUCO_ORIGINAL': 1024}
 _SIZE_RANGE_M = (1e-3, 1e2)
-# Corners in units of the size, in the order of the detection: top left, then clockwise.
-_CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+#: Corners (4, 3) of a tag of size 1, in the order of the detection: top left, then clockwise.
+SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Tag:
     @property
     def corners(self) -> NDArray[np.float64]:
         """Return the corners (4, 3) in the map: top left, then clockwise [m]."""
-        return self.size * _CORNERS @ self.map_from_tag[:3, :3].T + self.map_from_tag[:3, 3]
+        return self.size * SQUARE @ self.map_from_tag[:3, :3].T + self.map_from_tag[:3, 3]
 
 
 def read_tags(tree: Any, source: str) -> tuple[Tag, ...]:
