@@ -199,7 +199,7 @@ class Comparison:
                     place.covariance, pose[:3, 3] - place.map_from_camera[:3, 3]))
                 contender, = joined.contenders([unrefined(pose)], [
                     constraint.tilt_error(pose, place.covariance) <= most])
-                objects = tagged_objects_utility(contender.support)
+                objects = tagged_objects_utility(contender.support, joined.compared)
                 if constraint.allows(pose):
                     found.append(self._named(contender, met, tags_utility(place), objects,
                                              min(0.0, objects), tagged=place))

@@ -335,12 +335,14 @@ def tags_utility(place: TagPlace) -> float:
                + terms.others * len(place.others)) - place.misfit
 
 
-def tagged_objects_utility(support: Support) -> float:
+def tagged_objects_utility(support: Support, frames: Sequence[ComparedFrame]) -> float:
     """Return the log odds of a pose that tags propose, from its objects alone.
 
     Tags are moved, copied and shown on screens. Objects that the pose does not explain therefore
     count more than in the choice between poses of objects.
     """
+    if not support.inliers:  # such a support does not count them
+        support = Support(unexplained=float(np.mean([frame.are_own.sum() for frame in frames])))
     return float(utilities([support])[0]) + CALIBRATION.tags.unexplained * support.unexplained
 
 
