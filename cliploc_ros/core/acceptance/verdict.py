@@ -242,8 +242,8 @@ def _too_little(evidence: Evidence, options: RelocalizerOptions) -> Refusal | No
     elif options.algorithm not in ('auto', 'bf') and options.iterations < least:
         return Refusal(kind, f'iterations {options.iterations} < {least}, too few to '
                              f'find rivals; set iterations to {least} or more')
-    if evidence.inliers >= options.min_inliers:
-        return None
+    if evidence.inliers >= options.min_inliers or evidence.tags is not None:
+        return None  # a tag names the place, and few objects may tell which of its poses is right
     return Refusal(RefusalKind.TOO_FEW_OBJECTS,
                    f'{evidence.inliers} objects matched < {options.min_inliers}'
                    f'{_points(evidence)}; {_LOOK_ABOUT}')

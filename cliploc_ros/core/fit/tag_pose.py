@@ -94,10 +94,12 @@ def sights_of(tags: Sequence[Tag], seen: Observation) -> list[Sight]:
 
 def flips(sight: Sight) -> list[NDArray[np.float64]]:
     """Return the poses (4, 4), camera_from_map, that the corners of one tag allow; best first."""
+    # OpenCV returns wrong rotations near 180 degrees, which is a tag upright in the image: its axes
+    # are turned about x, so that it is at 0 degrees, and its corners are in another order
     _, turns, shifts, _ = cv2.solvePnPGeneric(
-        sight.tag.size * SQUARE, sight.bearings[:, None], np.eye(3), None,
+        sight.tag.size * SQUARE, np.ascontiguousarray(sight.bearings[::-1, None]), np.eye(3), None,
         flags=cv2.SOLVEPNP_IPPE_SQUARE)
-    return [make_transform(cv2.Rodrigues(turn)[0], shift.ravel())
+    return [make_transform(cv2.Rodrigues(turn)[0] * (1.0, -1.0, -1.0), shift.ravel())
             @ invert_transform(sight.tag.map_from_tag)
             for turn, shift in zip(turns, shifts, strict=True) if np.isfinite([turn, shift]).all()]
 

@@ -15,6 +15,7 @@ the same map, few objects fit.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
@@ -23,9 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cliploc_ros.core.acceptance.confidence import points_utility, utilities
+from cliploc_ros.core.acceptance.confidence import points_utility, tags_utility, utilities
 from cliploc_ros.core.acceptance.contenders import Contender, JoinedFrames, join_frames, unrefined
 from cliploc_ros.core.calibration import CALIBRATION, Calibration
+from cliploc_ros.core.fit.tag_pose import find_tag_places
 from cliploc_ros.core.fit.verification import scores_of
 from cliploc_ros.core.geometry.transforms import (
     SAME_ANSWER,
@@ -70,11 +72,24 @@ class Alignment(NamedTuple):
         terms = CALIBRATION.keyframes
         seen = recognizer.recognize([given], constraint_of(self.joined.frames[0].observation,
                                                            self.joined.options))
-        here, elsewhere = (max([0.0] + [
-            points_utility(place) for place in seen.places
-            if SAME_ANSWER.agree(place.map_from_camera, given) == near]) for near in (True, False))
+        here, elsewhere = _here_and_elsewhere(
+            [(place.map_from_camera, points_utility(place)) for place in seen.places], given)
         missed = 0.0 if here or not seen.is_complete else terms.missed * recognizer.coverage(given)
         return here - elsewhere + missed
+
+    def by_tags(self, given: NDArray[np.float64]) -> float:
+        """Return the log odds that the given pose (4, 4) is right, from tags."""
+        here, elsewhere = _here_and_elsewhere([
+            (place.map_from_camera, tags_utility(place)) for place in find_tag_places(
+                self.joined.landmark_map.tags, self.joined.frames[0].observation)], given)
+        return here - elsewhere
+
+
+def _here_and_elsewhere(places: Sequence[tuple[NDArray[np.float64], float]],
+                        given: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the greatest log odds, at least 0, of the poses at a given pose, and elsewhere."""
+    return (max([0.0, *(odds for pose, odds in places if SAME_ANSWER.agree(pose, given))]),
+            max([0.0, *(odds for pose, odds in places if not SAME_ANSWER.agree(pose, given))]))
 
 
 def look_at(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions

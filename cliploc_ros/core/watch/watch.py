@@ -205,6 +205,10 @@ class Watch:
             by_points = alignment.by_keyframes(recognizer, given)
             is_full |= by_points < CALIBRATION.watch.elsewhere
             odds += by_points
+        if observation.tags is not None:
+            by_tags = alignment.by_tags(given)
+            is_full |= by_tags < CALIBRATION.watch.elsewhere
+            odds += by_tags
         if odds == 0.0:
             return evidence
         self._count += 1
