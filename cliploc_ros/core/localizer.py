@@ -41,7 +41,6 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Case, Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, TimeBudget
 from cliploc_ros.core.search.frame_search import SearchedFrame
-from cliploc_ros.core.tag_detection import detect_tags
 from cliploc_ros.units import NS_PER_S
 
 # These are time limits and therefore not in calibration.yaml. The confidence that a pose from a
@@ -282,6 +281,7 @@ class Localizer:
         families = dict.fromkeys(tag.family for tag in self._relocalizer.landmark_map.tags)
         if not families or not query.images:
             return query
+        from cliploc_ros.core.tag_detection import detect_tags
         first = len(query.frames) - len(query.images)  # offline, neighbours have no image
         return replace(query, frames=query.frames[:first] + tuple(
             frame if frame.tags is not None else replace(

@@ -28,7 +28,7 @@ _FINE = 1000.0
 _FIRSTS = 4  # number of tags that are the first of a pose: those largest in view
 
 
-class Sight(NamedTuple):
+class TagSight(NamedTuple):
     """A tag of the map in an image."""
 
     tag: Tag
@@ -77,9 +77,9 @@ def find_tag_places(tags: Sequence[Tag], seen: Observation) -> list[TagPlace]:
     return sorted(places, key=lambda place: (-len(place.names), place.misfit))
 
 
-def sights_of(tags: Sequence[Tag], seen: Observation) -> list[Sight]:
+def sights_of(tags: Sequence[Tag], seen: Observation) -> list[TagSight]:
     """Return the tags of a map in an image, those largest in view first."""
-    sights, camera = list[Sight](), seen.camera
+    sights, camera = list[TagSight](), seen.camera
     found = seen.tags or NO_TAGS
     for name, pixels in zip(found.names, found.corners_px, strict=True):
         own = [tag for tag in tags if tag.name == name]
@@ -88,17 +88,17 @@ def sights_of(tags: Sequence[Tag], seen: Observation) -> list[Sight]:
             side, flat = (float(np.linalg.norm(
                 corners - np.roll(corners, 1, axis=0), axis=1).mean())
                 for corners in (pixels, bearings))
-            sights += [Sight(tag, bearings, side / flat, side) for tag in own]
+            sights += [TagSight(tag, bearings, side / flat, side) for tag in own]
     return sorted(sights, key=lambda sight: -sight.side_px)
 
 
-def flips(sight: Sight) -> list[NDArray[np.float64]]:
+def flips(sight: TagSight) -> list[NDArray[np.float64]]:
     """Return the poses (4, 4), camera_from_map, that the corners of one tag allow; best first."""
     # OpenCV returns wrong rotations near 180 degrees, which is a tag upright in the image: its axes
     # are turned about x, so that it is at 0 degrees, and its corners are in another order
     _, turns, shifts, _ = cv2.solvePnPGeneric(
-        sight.tag.size * SQUARE, np.ascontiguousarray(sight.bearings[::-1, None]), np.eye(3), None,
-        flags=cv2.SOLVEPNP_IPPE_SQUARE)
+        sight.tag.size * SQUARE, np.ascontiguousarray(sight.bearings[::-1, None]), np.eye(3),
+        None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
     return [make_transform(cv2.Rodrigues(turn)[0] * (1.0, -1.0, -1.0), shift.ravel())
             @ invert_transform(sight.tag.map_from_tag)
             for turn, shift in zip(turns, shifts, strict=True) if np.isfinite([turn, shift]).all()]
@@ -112,7 +112,7 @@ class _Fit(NamedTuple):
     covariance: NDArray[np.float64]
 
 
-def _joined(start: NDArray[np.float64], first: int, sights: Sequence[Sight]
+def _joined(start: NDArray[np.float64], first: int, sights: Sequence[TagSight]
             ) -> tuple[_Fit, tuple[int, ...]]:
     """Fit a pose to a sight, and to all others that agree; return their rows, too."""
     pose, kept = _refined(start, [sights[first]]), [first]
@@ -127,7 +127,7 @@ def _joined(start: NDArray[np.float64], first: int, sights: Sequence[Sight]
     return _fit(pose, [sights[row] for row in kept]), tuple(kept)
 
 
-def _refined(camera_from_map: NDArray[np.float64], sights: Sequence[Sight]) -> NDArray[np.float64]:
+def _refined(camera_from_map: NDArray[np.float64], sights: Sequence[TagSight]) -> NDArray[np.float64]:
     """Refine a pose (4, 4) by OpenCV's Levenberg-Marquardt on the plane z = 1."""
     middle = np.mean([sight.tag.center for sight in sights], axis=0)
     points = np.concatenate([sight.tag.corners for sight in sights]) - middle
@@ -140,7 +140,7 @@ def _refined(camera_from_map: NDArray[np.float64], sights: Sequence[Sight]) -> N
     return make_transform(rotation, shift.ravel() - rotation @ middle)
 
 
-def _off(camera_from_map: NDArray[np.float64], sight: Sight
+def _off(camera_from_map: NDArray[np.float64], sight: TagSight
          ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """Return the root mean square distance of the corners [px], and all places in the camera.
 
@@ -152,7 +152,7 @@ def _off(camera_from_map: NDArray[np.float64], sight: Sight
     return sight.scale * float(np.sqrt(squares.mean())), inside, places
 
 
-def _fit(camera_from_map: NDArray[np.float64], sights: Sequence[Sight]) -> _Fit:
+def _fit(camera_from_map: NDArray[np.float64], sights: Sequence[TagSight]) -> _Fit:
     """Return a refined pose with cost and covariance."""
     cost, information, far_m = 0.0, 1e-6 * np.eye(6), 0.0
     for sight in sights:
