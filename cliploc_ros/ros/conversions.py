@@ -19,8 +19,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
 _UNIT_TOLERANCE = 0.01
-DETECTION_TYPES, TAG_TYPES = ('vision_msgs', 'yolo_msgs', 'none'), (
-    'image', 'apriltag_msgs', 'none')
+DETECTION_TYPES, TAG_TYPES = ('vision_msgs', 'yolo_msgs', 'none'), ('image', 'apriltag_msgs')
 
 
 def stamp_ns(stamp: Time) -> int:

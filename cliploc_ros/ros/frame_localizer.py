@@ -28,7 +28,7 @@ from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
 from cliploc_ros.core.map.joined_map import join_maps, parts_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.core.observation import NO_TAGS, Observation
+from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
@@ -280,9 +280,7 @@ class Instants:
         detections = given.usable(camera.width, camera.height, parameters.max_detections)
         if parameters.detections_type != 'none':
             self._detector.add(given, detections)
-        tags = None
-        if parameters.tags_type != 'image':
-            tags = NO_TAGS if frame.tags is None else messages.tags_from_msg(frame.tags)
+        tags = None if frame.tags is None else messages.tags_from_msg(frame.tags)
         place, odom_from_camera = state.place, None
         if not by_odometry:
             odom_from_camera = invert_transform(state.camera_from_base)

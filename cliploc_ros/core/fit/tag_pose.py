@@ -7,6 +7,7 @@ Bartoli, "Infinitesimal Plane-based Pose Estimation", 2014). Both are refined, a
 with all other tags that agree.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from cliploc_ros.core.observation import NO_TAGS, Observation
 _CORNER_PX, _BENT, _TAG_M, _TAG_RAD, _FOCAL = 0.5, 0.005, 0.01, np.radians(0.5), 0.005
 # Tags agree if their corners are off by at most these pixels and metres at the tag.
 _AGREE_PX, _AGREE_M = 2.0, 0.03
+_LEAST_AREA_PX = 9.0  # of a tag: less is no square
 # OpenCV stops at an absolute change of the cost: coordinates as large as pixels are fine enough.
 _FINE = 1000.0
 _FIRSTS = 4  # number of tags that are the first of a pose: those largest in view
@@ -35,16 +37,6 @@ class TagSight(NamedTuple):
     bearings: NDArray[np.float64]  #: (4, 2): its corners, on the plane z = 1
     scale: float  #: Pixels per unit of this plane there
     side_px: float  #: Mean length of its sides
-
-    @property
-    def most_px(self) -> float:
-        """Return the greatest distance of corners that agree."""
-        return _AGREE_PX + _AGREE_M * self.side_px / self.tag.size
-
-    def sigma_px(self, is_alone: bool) -> float:
-        """Return the deviation of a corner; the map matters only if there are other tags."""
-        return float(np.hypot(np.hypot(_CORNER_PX, _BENT * self.side_px),
-                              (not is_alone) * _TAG_M * self.side_px / self.tag.size))
 
 
 class TagPlace(NamedTuple):
@@ -66,14 +58,13 @@ def find_tag_places(tags: Sequence[Tag], seen: Observation) -> list[TagPlace]:
             continue
         for start in flips(sights[first]):
             fit, kept = _joined(start, first, sights)
-            if not any(SAME_MINIMUM.agree(fit.map_from_camera, other.map_from_camera)
-                       for other, _ in found):
+            if not any(SAME_MINIMUM.agree(fit[0], other) for (other, _, _), _ in found):
                 found.append((fit, kept))
-    best = {kept: min(fit.cost for fit, own in found if own == kept) for _, kept in found}
+    best = {kept: min(cost for (_, cost, _), own in found if own == kept) for _, kept in found}
     names = [sight.tag.name for sight in sights]
-    places = [TagPlace(fit.map_from_camera, fit.covariance, tuple(names[row] for row in kept),
-                       tuple({*names} - {names[row] for row in kept}),
-                       0.5 * (fit.cost - best[kept])) for fit, kept in found]
+    places = [TagPlace(pose, covariance, tuple(names[row] for row in kept),
+                       tuple(sorted({*names} - {names[row] for row in kept})),
+                       0.5 * (cost - best[kept])) for (pose, cost, covariance), kept in found]
     return sorted(places, key=lambda place: (-len(place.names), place.misfit))
 
 
@@ -84,7 +75,8 @@ def sights_of(tags: Sequence[Tag], seen: Observation) -> list[TagSight]:
     for name, pixels in zip(found.names, found.corners_px, strict=True):
         own = [tag for tag in tags if tag.name == name]
         bearings = camera.normalize_points(pixels)
-        if own and np.isfinite(bearings).all():
+        if own and np.isfinite(bearings).all() and cv2.contourArea(
+                pixels.astype(np.float32)) > _LEAST_AREA_PX:
             side, flat = (float(np.linalg.norm(
                 corners - np.roll(corners, 1, axis=0), axis=1).mean())
                 for corners in (pixels, bearings))
@@ -94,7 +86,7 @@ def sights_of(tags: Sequence[Tag], seen: Observation) -> list[TagSight]:
 
 def flips(sight: TagSight) -> list[NDArray[np.float64]]:
     """Return the poses (4, 4), camera_from_map, that the corners of one tag allow; best first."""
-    # OpenCV returns wrong rotations near 180 degrees, which is a tag upright in the image: its axes
+    # OpenCV returns wrong rotations near 180 degrees, as of a tag upright in the image: its axes
     # are turned about x, so that it is at 0 degrees, and its corners are in another order
     _, turns, shifts, _ = cv2.solvePnPGeneric(
         sight.tag.size * SQUARE, np.ascontiguousarray(sight.bearings[::-1, None]), np.eye(3),
@@ -104,12 +96,8 @@ def flips(sight: TagSight) -> list[NDArray[np.float64]]:
             for turn, shift in zip(turns, shifts, strict=True) if np.isfinite([turn, shift]).all()]
 
 
-class _Fit(NamedTuple):
-    """A least squares fit to the corners of sights."""
-
-    map_from_camera: NDArray[np.float64]
-    cost: float  #: Sum of squares of the distances in deviations
-    covariance: NDArray[np.float64]
+# A pose, the sum of squares of the distances of corners in deviations, and the covariance.
+_Fit = tuple[NDArray[np.float64], float, NDArray[np.float64]]
 
 
 def _joined(start: NDArray[np.float64], first: int, sights: Sequence[TagSight]
@@ -120,21 +108,21 @@ def _joined(start: NDArray[np.float64], first: int, sights: Sequence[TagSight]
     for row in rows[:_FIRSTS]:  # the second tag settles the pose, which then says which agree
         pair = _refined(pose, [sights[first], sights[row]])
         agree = [other for other, sight in enumerate(sights)
-                 if _off(pair, sight)[0] < sight.most_px]
+                 if _off(pair, sight)[0] < _AGREE_PX + _AGREE_M * sight.side_px / sight.tag.size]
         if first in agree and row in agree:
             pose, kept = _refined(pair, [sights[other] for other in agree]), agree
             break
     return _fit(pose, [sights[row] for row in kept]), tuple(kept)
 
 
-def _refined(camera_from_map: NDArray[np.float64], sights: Sequence[TagSight]) -> NDArray[np.float64]:
+def _refined(camera_from_map: NDArray[np.float64], sights: Sequence[TagSight]
+             ) -> NDArray[np.float64]:
     """Refine a pose (4, 4) by OpenCV's Levenberg-Marquardt on the plane z = 1."""
     middle = np.mean([sight.tag.center for sight in sights], axis=0)
     points = np.concatenate([sight.tag.corners for sight in sights]) - middle
     turn, shift = cv2.solvePnPRefineLM(
         points, _FINE * np.concatenate([sight.bearings for sight in sights]),
-        np.diag([_FINE, _FINE, 1.0]), None,
-        cv2.Rodrigues(camera_from_map[:3, :3])[0],
+        np.diag([_FINE, _FINE, 1.0]), None, cv2.Rodrigues(camera_from_map[:3, :3])[0],
         camera_from_map[:3, :3] @ middle[:, None] + camera_from_map[:3, 3:])
     rotation = cv2.Rodrigues(turn)[0]
     return make_transform(rotation, shift.ravel() - rotation @ middle)
@@ -157,7 +145,9 @@ def _fit(camera_from_map: NDArray[np.float64], sights: Sequence[TagSight]) -> _F
     cost, information, far_m = 0.0, 1e-6 * np.eye(6), 0.0
     for sight in sights:
         off, inside, places = _off(camera_from_map, sight)
-        sigma_px = sight.sigma_px(len(sights) == 1)
+        # the place of a single tag in the map moves all of its corners alike
+        sigma_px = math.hypot(_CORNER_PX, _BENT * sight.side_px, (
+            _TAG_M * sight.side_px / sight.tag.size if len(sights) > 1 else 0.0))
         cost += 4.0 * (off / sigma_px) ** 2
         far_m += float(np.linalg.norm(inside.mean(axis=0))) / len(sights)
         for (u, v), depth in zip(places.tolist(), inside[:, 2].tolist(), strict=True):
@@ -168,5 +158,5 @@ def _fit(camera_from_map: NDArray[np.float64], sights: Sequence[TagSight]) -> _F
     turn = np.kron(np.eye(2), -camera_from_map[:3, :3].T)
     of_map = [_TAG_M ** 2 + (_FOCAL * far_m) ** 2 + (_TAG_RAD * far_m) ** 2 / len(sights),
               _TAG_RAD ** 2 / len(sights)]
-    return _Fit(invert_transform(camera_from_map), cost,
-                turn @ np.linalg.inv(information) @ turn.T + np.diag(np.repeat(of_map, 3)))
+    return (invert_transform(camera_from_map), cost,
+            turn @ np.linalg.inv(information) @ turn.T + np.diag(np.repeat(of_map, 3)))

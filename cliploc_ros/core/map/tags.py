@@ -70,24 +70,14 @@ def _tag(tag_id: Any, fields: Any, source: str) -> Tag:
     check_id(tag_id, where)
     check_keys(fields, ('family', 'id', 'size', 'center', 'orientation'), where)
     family, number, size = fields['family'], fields['id'], fields['size']
-    check_family(family, where)
-    if isinstance(number, bool) or not isinstance(number, int) or not (
-            0 <= number < FAMILIES[family]):
-        raise MapError(f'{where}: id: {number!r} must be from 0 to {FAMILIES[family] - 1}')
-    check_size(size, where)
-    return Tag(tag_id, family, number, float(size), *checked_place(fields, where))
-
-
-def check_family(family: Any, where: str) -> None:
-    """Raise MapError unless the family is known."""
     if not isinstance(family, str) or family not in FAMILIES:
         raise MapError(f'{where}: family: {family!r}{did_you_mean(str(family), FAMILIES)} is none '
                        f'of {", ".join(FAMILIES)}')
-
-
-def check_size(size: Any, where: str) -> None:
-    """Raise MapError unless the size is plausible."""
+    if isinstance(number, bool) or not isinstance(number, int) or not (
+            0 <= number < FAMILIES[family]):
+        raise MapError(f'{where}: id: {number!r} must be from 0 to {FAMILIES[family] - 1}')
     if isinstance(size, bool) or not isinstance(size, int | float) or not (
             _SIZE_RANGE_M[0] <= size <= _SIZE_RANGE_M[1]):
         raise MapError(f'{where}: size: {size!r} must be between {_SIZE_RANGE_M[0]:g} and '
                        f'{_SIZE_RANGE_M[1]:g} m')
+    return Tag(tag_id, family, number, float(size), *checked_place(fields, where))

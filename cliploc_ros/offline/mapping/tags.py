@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.fit.tag_pose import TagSight, flips, sights_of
 from cliploc_ros.core.geometry.transforms import invert_transform, quaternion_from_transform
-from cliploc_ros.core.map.tags import SQUARE, Tag, check_family, check_size
+from cliploc_ros.core.map.tags import SQUARE, Tag, read_tags
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.errors import MapError, OptionsError, counted
 
@@ -58,9 +58,10 @@ def parse_sizes(texts: Iterable[str]) -> dict[str, float | None]:
     for text in texts:
         family, _, size = text.partition(':')
         try:
-            check_family(family, '--tags')
             sizes[family] = float(size) if size else None
-            check_size(sizes[family] or 1.0, '--tags')
+            read_tags({'one': {
+                'family': family, 'id': 0, 'size': float(size or 1.0), 'center': [0.0, 0.0, 0.0],
+                'orientation': [0.0, 0.0, 0.0, 1.0]}}, '--tags')
         except (MapError, ValueError) as error:
             raise OptionsError(f'--tags {text}: expected FAMILY:METRES as tag36h11:0.16, or a '
                                f'family of unknown size: {error}') from error

@@ -302,9 +302,8 @@ class FrameSource:
     def _completed(self, name: str, msg: Any, received_at: float) -> Frame | None:
         """Return the frame that a message completes, once its stamps are reliable; else None."""
         at_ns = stamp_ns(msg.header.stamp)
-        size = {'image': lambda: len(msg.data), 'camera_info': lambda: 1000,
-                'detections': lambda: _DETECTION_BYTES * (1 + len(msg.detections)),
-                'tags': lambda: _DETECTION_BYTES * (1 + len(msg.detections))}[name]()
+        size = len(msg.data) if name == 'image' else 1000 if name == 'camera_info' else (
+            _DETECTION_BYTES * (1 + len(msg.detections)))
         if name == 'camera_info':
             # camera_info without a stamp is valid for all images
             self._static_info = msg if stamp_problem(msg.header.stamp) else None
