@@ -332,7 +332,8 @@ class FrameSource:
         frame = self._unsure
         # the next images may have the same stamp; wait until stamps are known to differ
         if frame is None or not (self._stamps['image'].are_own or all(
-                stamp.is_repeated(frame.stamp_ns) for stamp in self._stamps.values())):
+                stamp.is_repeated(frame.stamp_ns) for name, stamp in self._stamps.items()
+                if name in self.topics)):
             return None
         self._unsure, self._arrived_at = None, (frame.received_at, frame.detected_at)
         return frame
