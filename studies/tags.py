@@ -58,9 +58,8 @@ def pattern_of(tag: Tag) -> tuple[Array, int]:
     name = f'DICT_APRILTAG_{tag.family[3:]}' if is_april else tag.family
     patterns = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
     modules = patterns.markerSize + 2
-    draw = getattr(cv2.aruco, 'generateImageMarker', None) or cv2.aruco.drawMarker
     picture = np.full((_TEXTURE_PX * (modules + 2),) * 2, 255, np.uint8)
-    inner = draw(patterns, tag.number, _TEXTURE_PX * modules)
+    inner = cv2.aruco.generateImageMarker(patterns, tag.number, _TEXTURE_PX * modules)
     picture[_TEXTURE_PX:-_TEXTURE_PX, _TEXTURE_PX:-_TEXTURE_PX] = np.rot90(inner, 2 * is_april)
     return picture, modules
 

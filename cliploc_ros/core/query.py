@@ -196,10 +196,8 @@ def _frame_of(about: Mapping[str, Any], crops: Iterator[NDArray[np.float32]]) ->
             ('base_up_in_camera', (3,))))
     tags = known.get('tags')
     if tags is not None:
-        names = tuple(tags['names'])
-        _expect(all(isinstance(name, str) for name in names), 'tags')
-        tags = SeenTags(names, _numbers(np.reshape(tags['corners_px'], (-1, 4, 2)),
-                                        len(names), 4, 2))
+        tags = SeenTags(names := tuple(map(str, tags['names'])), _numbers(np.reshape(
+            tags['corners_px'], (-1, 4, 2)), len(names), 4, 2))
     return Observation(
         Camera(**camera), Detections(boxes, class_ids, _numbers(seen['scores'], count)),
         similarities, _count(known['stamp_ns']), known['camera_name'], up, odom,

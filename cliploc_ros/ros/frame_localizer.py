@@ -33,7 +33,7 @@ from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.core.query import Query
 from cliploc_ros.core.relocalizer import Relocalization, Relocalizer, in_its_map
 from cliploc_ros.core.watch.watch import Watch, WatchReport
-from cliploc_ros.errors import CliplocError, MapError, ModelError, counted
+from cliploc_ros.errors import CliplocError, MapError, ModelError
 from cliploc_ros.files.storage import read_file, resolve_cache_dir
 from cliploc_ros.models.protocols import with_encoder
 from cliploc_ros.ros.inputs.frame_source import Frame
@@ -116,9 +116,7 @@ class FrameLocalizer:
             f'{len(self.frame_ids)} maps, frames {frames}'
         keyframes = '' if self.keyframes is None else \
             f'{len(self.keyframes.localizer.layer)} keyframes, '
-        tags = len(self.landmark_map.tags)
-        return (f'{len(self.landmark_map)} landmarks{f" and {counted(tags, "tag")}" * bool(tags)} '
-                f'in {where}, {keyframes}'
+        return (f'{len(self.landmark_map)} landmarks in {where}, {keyframes}'
                 f'matching {self._options.matching}, algorithm {self._options.algorithm}')
 
     def localize(self, frame: Frame, parameters: RelocalizerParameters, known: KnownBefore,

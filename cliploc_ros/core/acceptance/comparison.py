@@ -393,8 +393,10 @@ class Comparison:
             return 1.0, None
         rows = inside[others - 1]
         rivals = joined.contenders([places[row - 1] for row in others], [True] * len(others))
-        leads = self._leads_of_points(poses[others], copies[rows]) \
-            + self._leads_of_tags(poses[others])
+        leads = self._leads_of_points(poses[others], copies[rows])
+        if self._by_tags is not None and self._by_tags.tagged is not None:
+            # a twin with tags of its own is among the contenders
+            leads += max(0.0, tags_utility(self._by_tags.tagged))
         for number, (rival, row) in enumerate(zip(rivals, rows, strict=True)):
             if row < len(twins):
                 by_objects = lead_over_twin(best.support, rival.support, float(alike.shares[row]),
@@ -404,16 +406,6 @@ class Comparison:
             leads[number] += best.prior - rival.prior + by_objects
         chance = float(1.0 / (1.0 + np.exp(-np.clip(leads, -50.0, 50.0)).sum()))
         return chance, place_of(landmark_map, poses[others][int(np.argmin(leads))])
-
-    def _leads_of_tags(self, twins: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the log odds (m,) by which tags prefer the leading place to each twin."""
-        if self._by_tags is None:
-            return 0.0
-        agrees = SAME_ANSWER.agreeing(twins, self.poses)
-        utilities_of = np.array([0.0 if contender.tagged is None else max(
-            0.0, tags_utility(contender.tagged)) for contender in self.contenders])
-        return np.maximum(0.0, utilities_of[self.leading].max()
-                          - (agrees * utilities_of).max(axis=1))
 
     def _leads_of_points(self, twins: NDArray[np.float64], are_rooms: NDArray[np.bool_]
                          ) -> NDArray[np.float64]:

@@ -311,12 +311,10 @@ def _of_tags(evidence: Evidence, ambiguous: bool) -> Refusal | None:
         return Refusal(RefusalKind.AMBIGUOUS, (
             f'{", ".join(ours.names)} fits two poses; move nearer, or {_LOOK_ABOUT}'))
     tags = ours or theirs
-    if tags is None:
-        return None
-    others = ', '.join(tags.others) if tags.others else 'objects or keyframes'
-    return Refusal(RefusalKind.CONTRADICTION, (
-        f'{", ".join(tags.names)} and {others} disagree: a tag that was moved or copied, has '
-        f'another size, or is on a screen or robot? {_LOOK_ABOUT}'))
+    return tags and Refusal(RefusalKind.CONTRADICTION, (
+        f'{", ".join(tags.names)} and {", ".join(tags.others) or "objects or keyframes"} '
+        'disagree: a tag that was moved or copied, has another size, or is on a screen or robot? '
+        + _LOOK_ABOUT))
 
 
 def _points(evidence: Evidence) -> str:
