@@ -1,16 +1,14 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measure tags: ``python -m studies.tags images|accept|detections ...``.
+"""Measure tags: ``python -m studies.tags images|accept ...``.
 
 images FOLDER...: tags are painted into real images (12 to 200 px, blurred, tilted up to 75
 degrees): recall, corner error, processor time, false ids without tags, accepted flips; beside
 pupil-apriltags if it is installed. accept QUERIES MAP: tags in front of the cameras of recorded
-queries with real boxes: right, moved, of another size, boards. detections FILE CAMERAS: real
-detections with poses (npz and json of TagSLAM's tests), mapped from poses with errors.
+queries with real boxes: right, moved, of another size, boards.
 """
 
 import argparse
-import json
 import sys
 import time
 from collections import Counter, defaultdict
@@ -25,14 +23,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.command import run_command
-from cliploc_ros.core.fit.tag_pose import find_tag_places
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.transforms import (
     SAME_ANSWER,
     make_transform,
     pose_error,
     quaternion_from_transform,
-    transform_from_pose,
 )
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.tags import SQUARE, Tag
@@ -230,86 +226,21 @@ def study_acceptance(options: argparse.Namespace) -> int:
     return 0
 
 
-def recorded(file: Path) -> tuple[list[tuple[Observation, Array]], dict[str, Array]]:
-    """Return the frames of the first camera of a file of real detections, and TagSLAM's tags."""
-    arrays, about = np.load(file), json.loads(file.with_suffix('.json').read_text())
-    (name, given), *_ = about['cameras'].items()
-    model = {'radtan': 'plumb_bob'}.get(given['distortion_model'], given['distortion_model'])
-    lens = [float(value) for value in given['distortion_coeffs']]
-    lens += [0.0] * (len(lens) == 4 and model == 'plumb_bob')
-    (width, height), (fx, fy, cx, cy) = given['resolution'], given['intrinsics']
-    camera = Camera(width, height, fx, fy, cx, cy, model, tuple(lens))
-    mount = about['camera_poses'][name]['pose']
-    position, turn = ([float(mount[part][axis]) for axis in 'xyz']
-                      for part in ('position', 'rotation'))
-    rig_from_camera = make_transform(Rotation.from_rotvec(turn).as_matrix(), np.array(position))
-    rig = next(key for key in arrays.files if key.endswith('xyz_quat_xyzw'))
-    poses = {int(stamp): transform_from_pose(row[:3], row[3:]) @ rig_from_camera
-             for stamp, row in zip(arrays[rig.replace('xyz_quat_xyzw', 'stamps_ns')], arrays[rig],
-                                   strict=True)}
-    frames = []
-    for stamp in np.unique(arrays['stamps_ns'][arrays['cameras'] == 0]):
-        rows = np.nonzero((arrays['stamps_ns'] == stamp) & (arrays['cameras'] == 0))[0]
-        if int(stamp) in poses:
-            # AprilTag starts at the lower left corner and goes the other way round
-            frames.append((Observation(camera, _NOTHING, stamp_ns=int(stamp), tags=SeenTags(tuple(
-                f'{_FAMILY}_{number}' for number in arrays['tag_ids'][rows]),
-                arrays['corners_px'][rows][:, ::-1].astype(float))), poses[int(stamp)]))
-    links = {}
-    for key, numbers in about['last_tf'].items():
-        parent, child = key.split('>')
-        links[child] = parent, transform_from_pose(np.array(numbers[:3]), np.array(numbers[3:]))
-    tags = {}
-    for child in links:
-        place, at = np.eye(4), child
-        while at in links:
-            at, step = links[at]
-            place = step @ place
-        tags[child.replace('tag', _FAMILY)] = place
-    return frames, tags
-
-
-def study_detections(options: argparse.Namespace) -> int:
-    """Print how far mapped tags, and poses by them, are from TagSLAM's."""
-    from cliploc_ros.offline.mapping.tags import map_tags, seen_tags
-
-    rng = np.random.default_rng(options.seed)
-    for file in options.files:
-        frames, true = recorded(file)
-        noisy = [(frame, pose @ make_transform(Rotation.from_rotvec(rng.normal(
-            0.0, np.radians(0.5), 3)).as_matrix(), rng.normal(0.0, 0.02, 3)))
-            for frame, pose in frames]
-        for size in (options.size, None):
-            mapped = map_tags(seen_tags(noisy), {_FAMILY: size})
-            off = [pose_error(tag.map_from_tag, true[tag.name])[0] for tag in mapped.tags
-                   if tag.name in true]
-            poses = [pose_error(places[0].map_from_camera, pose)[0] for frame, pose in frames[::4]
-                     if (places := find_tag_places(mapped.tags, frame))]
-            print(f'{file.stem}, size {size or "unknown"}: {mapped.line()}\n  tags off by '
-                  f'{100 * np.median(off):.2f} cm, poses by {100 * np.median(poses):.2f} cm, '
-                  f'95 % {100 * np.percentile(poses, 95):.2f} cm', flush=True)
-    return 0
-
-
 def main(args: Sequence[str] | None = None) -> int:
     """Run a study; return the exit code."""
     parser = argparse.ArgumentParser(prog='studies.tags', description=__doc__)
     parser.add_argument('--seed', type=int, default=0)
     kinds = parser.add_subparsers(required=True)
-    for name, study in (('images', study_images), ('accept', study_acceptance),
-                        ('detections', study_detections)):
+    for name, study in (('images', study_images), ('accept', study_acceptance)):
         kind = kinds.add_parser(name)
         kind.set_defaults(study=study)
         if study is study_images:
             kind.add_argument('folders', type=Path, nargs='+')
             kind.add_argument('--images', type=int, default=300)
-        elif study is study_acceptance:
+        else:
             kind.add_argument('queries', type=Path)
             kind.add_argument('map', type=Path)
             kind.add_argument('--every', type=int, default=2)
-        else:
-            kind.add_argument('files', type=Path, nargs='+')
-            kind.add_argument('--size', type=float, default=_SIZE_M)
     options = parser.parse_args(args)
     return run_command(lambda: options.study(options))
 

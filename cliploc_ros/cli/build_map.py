@@ -37,7 +37,6 @@ examples:
   build_map --bag drive --cameras front left back --map-frame map --out office.yaml
   build_map --observations office.npz --out office.yaml --pose-noise 0.05 1
   build_map --colmap office --known-distance a.jpg b.jpg 1.5 --level --out office.yaml
-  build_map --bag drive --out office.yaml --tags tag36h11:0.16
   build_map --rgbd kitchen --level --out kitchen.yaml --no-keyframe-layer
   build_map --bag monday --bag tuesday --folder phone --out office.yaml
   build_map --bag today --map-frame map --update office.yaml --out office.yaml --report today.json
@@ -72,8 +71,6 @@ def make_parser() -> argparse.ArgumentParser:
     option(labels, '--vocabulary FILE', 'further phrases by class (YAML)')
     option(parser, '--object-size CLASS METRES', 'the longest extent of the objects of a class, '
            'which gives the scale of the poses')
-    option(parser, '--tags FAMILY:METRES', 'also map tags; the number is the side of their black '
-           'squares, which the poses give without it', str, nargs='+')
     add_layer_options(parser)
     poses = parser.add_argument_group('poses with errors')
     option(poses, '--joint', 'refine the poses together with the landmarks (default: if '
@@ -103,12 +100,10 @@ def build(options: argparse.Namespace) -> int:
     from cliploc_ros.cli import sources
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.offline.mapping import make_map
-    from cliploc_ros.offline.mapping.tags import parse_sizes
 
     begin = time.monotonic()
     recordings = sources.each_recording(options)
     update, name = options.update, ', '.join(sources.source_of(own).name for own in recordings)
-    sizes = parse_sizes(options.tags or ())
     command.check_output(options.out)
     layer, note = layer_options(recordings[0])
     _refuse_conflicts(options, len(recordings) > 1 or options.add is not None)
@@ -134,11 +129,7 @@ def build(options: argparse.Namespace) -> int:
                 made = make_map.make_map(detections, labeller, mapping, frames, joined or layer,
                                          bar.show)
             note = note or made.note
-            if options.tags is not None and frames is not None:
-                mapped = make_map.map_tags_of(frames, sizes)
-                made = replace(made, landmark_map=replace(made.landmark_map, tags=mapped.tags))
-                print(mapped.line(), flush=True)
-            elif options.add is not None:
+            if options.add is not None:
                 made = replace(made, landmark_map=replace(
                     made.landmark_map, tags=LandmarkMap.from_file(options.add).tags))
             if options.keyframe_layer and note:
@@ -201,8 +192,6 @@ def _refuse_conflicts(options: argparse.Namespace, is_several: bool) -> None:
     is_update, is_new = options.update is not None, options.add is options.update is None
     for is_wrong, text in (
             (is_update and is_several, '--update is for one recording: run it for each in turn'),
-            (options.tags and (is_several or is_update or options.observations is not None),
-             '--tags needs the images of one recording: build the map of it first, then --add'),
             (is_several and options.keyframe_images, '--keyframe-images is for one recording'),
             (options.level and not is_new, '--level is for new maps, not for --update or --add'),
             (options.object_size and (options.scale or options.known_distance or not is_new),

@@ -22,8 +22,6 @@ from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_em
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import load_removed, removed_path, write_landmarks, write_map
 from cliploc_ros.core.map.parameter_file import MapSet
-from cliploc_ros.core.observation import Detections, Observation
-from cliploc_ros.core.tag_detection import detect_tags
 from cliploc_ros.errors import MapError, MappingError, ModelError, counted
 from cliploc_ros.files.storage import WriteOfSet
 from cliploc_ros.models.onnx_clip import ClipWeights, names_onnx, resolve_clip_weights
@@ -37,7 +35,6 @@ from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of
 from cliploc_ros.offline.mapping.options import MappingOptions
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.mapping.systematic import MountCorrection
-from cliploc_ros.offline.mapping.tags import MappedTags, map_tags, seen_tags
 from cliploc_ros.offline.mapping.update.updating import UpdatedMap, UpdateReport
 from cliploc_ros.offline.mapping.update.updating import update_map as update_landmarks
 from cliploc_ros.offline.recording.joining import join_layers
@@ -196,15 +193,6 @@ def make_map(detections: PosedDetections, labeller: Labeller,
     if failure is not None and made.layer is None:
         raise failure
     return made
-
-
-def map_tags_of(frames: Frames, sizes: Mapping[str, float | None]) -> MappedTags:
-    """Map the tags in the images of a recording, of the families and sizes of parse_sizes."""
-    nothing = Detections(np.empty((0, 4)), (), np.empty(0))
-    return map_tags(seen_tags(
-        (Observation(seen.camera, nothing, tags=detect_tags(seen.image_rgb, seen.camera, sizes)),
-         seen.map_from_camera) for seen in frames.read() if seen.map_from_camera is not None),
-        sizes)
 
 
 def _with_layer(made: MadeMap, frames: Frames | None, layer: LayerOptions | KeyframeLayer | None
