@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from cliploc_ros.core.geometry import depth
 from cliploc_ros.core.geometry.camera import Camera
 from cliploc_ros.core.geometry.camera_faults import Fault, calibration_faults, check_faults
-from cliploc_ros.core.observation import Detections, SeenTags
+from cliploc_ros.core.observation import Detections
 from cliploc_ros.errors import CameraError, ImageError, OptionsError
 
 # Offsets of red, green and blue in each pixel, and the bytes per pixel.
@@ -326,20 +326,6 @@ def detections_from_msg(msg: Any, class_map: Mapping[str, str] | None = None) ->
     return Detections(
         np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1),
         tuple(classes), np.array(scores, dtype=np.float64))
-
-
-def tags_from_msg(msg: Any) -> SeenTags:
-    """Return the tags of an apriltag_msgs/AprilTagDetectionArray.
-
-    AprilTag starts at the lower left corner and goes the other way round; the centre of its first
-    pixel is at (.5, .5). A tag that is seen twice is left out: one is a copy.
-    """
-    names = [f'{tag.family}_{tag.id}' for tag in msg.detections]
-    corners = np.array([[(corner.x, corner.y) for corner in tag.corners]
-                        for tag in msg.detections]).reshape(-1, 4, 2)[:, ::-1] - 0.5
-    kept = [row for row, name in enumerate(names)
-            if names.count(name) == 1 and np.isfinite(corners[row]).all()]
-    return SeenTags(tuple(names[row] for row in kept), corners[kept])
 
 
 def parse_class_map(text: str) -> dict[str, str]:

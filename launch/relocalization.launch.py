@@ -28,7 +28,6 @@ NAMES = {
     'image': 'raw images of the camera driver; image/compressed is remapped accordingly',
     'camera_info': 'camera_info of the camera driver',
     'detections': 'detections from the detector to the relocalizer',
-    'tags': 'tags from apriltag_ros, with tags_type:=apriltag_msgs',
     'depth': 'depth of an RGB-D camera, with depth_transport; depth/compressedDepth is remapped '
              'accordingly',
     'depth_camera_info': 'camera_info of a depth camera that is not registered to the image',
@@ -40,7 +39,7 @@ NAMES = {
     'reinitialize_global_localization': "service of the relocalizer that Nav2's behaviour tree "
                                         'calls; AMCL has a service of this name, too',
 }
-_OF_CAMERA = ('image', 'camera_info', 'detections', 'tags', 'depth', 'depth_camera_info')
+_OF_CAMERA = ('image', 'camera_info', 'detections', 'depth', 'depth_camera_info')
 # An argument that is not given takes its value from the file `parameters`, else its default.
 DETECTOR_PARAMETERS = {
     'profile': 'detector and CLIP: accurate, balanced or fast',

@@ -5,8 +5,7 @@
 import cv2
 import numpy as np
 
-# Pixels of a module in the texture, and samples along each side of a pixel.
-_MODULE, _SAMPLES = 8, 2
+_MODULE = 8  # pixels of a module in the texture
 
 
 def texture_of(tag):
@@ -34,21 +33,16 @@ def paint_tag(image_rgb, tag, camera, map_from_camera):
     (left, top), (right, bottom) = (np.clip(
         edge, 0, (camera.width - 1, camera.height - 1)).astype(int)
         for edge in (pixels.min(axis=0) - 3, pixels.max(axis=0) + 4))
-    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
-    x = (np.arange(left, right)[:, None] + steps).ravel()
-    y = (np.arange(top, bottom)[:, None] + steps).ravel()
-    rays = np.c_[camera.normalize_points(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)),
-                 np.ones(len(x) * len(y))]
+    x, y = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
+    rays = np.c_[camera.normalize_points(np.stack([x, y], axis=-1).reshape(-1, 2)),
+                 np.ones(x.size)]
     rotation, shift = camera_from_tag[:3, :3], camera_from_tag[:3, 3]
-    normal = rotation[:, 2]
-    on_tag = (rays * ((normal @ shift) / (rays @ normal))[:, None] - shift) @ rotation
-    places = (on_tag[:, :2] * (1, -1) / (2 * half) + 0.5) * texture.shape[0] - 0.5
-    sampled = cv2.remap(texture, *places.reshape(len(y), len(x), 2).astype(np.float32).transpose(
-        2, 0, 1), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    inside = ((np.abs(on_tag[:, :2]) <= half).all(axis=1)).reshape(len(y), len(x), 1)
-    shape = bottom - top, _SAMPLES, right - left, _SAMPLES, 3
-    below = np.repeat(np.repeat(image_rgb[top:bottom, left:right], _SAMPLES, 0), _SAMPLES, 1)
+    depths = (rotation[:, 2] @ shift) / (rays @ rotation[:, 2])
+    on_tag = ((rays * depths[:, None] - shift) @ rotation)[:, :2]
+    places = (on_tag * (1, -1) / (2 * half) + 0.5) * texture.shape[0] - 0.5
+    sampled = cv2.remap(texture, *places.reshape(*x.shape, 2).astype(np.float32).transpose(
+        2, 0, 1), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    inside = (np.abs(on_tag) <= half).all(axis=1).reshape(x.shape)
     painted = image_rgb.copy()
-    painted[top:bottom, left:right] = np.where(inside, sampled[..., None], below).reshape(
-        shape).mean(axis=(1, 3))
-    return painted
+    painted[y[inside], x[inside]] = sampled[inside, None]
+    return cv2.GaussianBlur(painted, (0, 0), 0.6)

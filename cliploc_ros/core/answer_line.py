@@ -40,8 +40,8 @@ def detail_of(found: Relocalization, frame_id: str, figures: Mapping[str, Any] |
         return found.reason
     assert found.map_from_camera is not None and found.covariance is not None
     evidence, points, depth = found.evidence, found.recognized, found.depth
-    by = [f'{evidence.inliers} landmarks'] if evidence and (
-        found.source not in ('keyframes', 'tags')) else []
+    of_objects = found.source in ('objects', 'both')
+    by = [f'{evidence.inliers} landmarks'] if evidence and of_objects else []
     by += [f'{points.inliers} keyframe points{points.recorded and f" of {points.recorded}"}'
            ] if points and found.source != 'objects' else []
     by += [f'depth of {depth.objects} objects'] if depth and depth.is_passed else []

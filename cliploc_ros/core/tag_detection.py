@@ -24,8 +24,6 @@ from cliploc_ros.errors import ModelError
 _CORRECTED = {'tag25h9': 1, 'tag36h10': 2, 'tag36h11': 3}
 # Least perimeter of a tag: smaller ones cannot be read [px].
 _LEAST_PERIMETER_PX = 40.0
-_WINDOWS_PX = 5, 15
-_WRONG_BORDER = 0.2  # greatest share of white modules in the border: others are not decoded
 # Places along an edge, as shares of it, and across it, in units of the reach.
 _ALONG, _ACROSS = np.linspace(0.06, 0.94, 23), np.linspace(-1.0, 1.0, 17)
 # Reach across an edge: share of a module, the width of the black border, and its limits [px].
@@ -70,8 +68,7 @@ def _finder(family: str, least_rate: float) -> tuple[Any, int]:
     """Return a function that finds the tags of a family, and the modules along their side."""
     aruco = getattr(cv2, 'aruco', None)
     if aruco is None:
-        raise ModelError('tags of the map need aruco, which this OpenCV lacks: install '
-                         'python3-opencv of Ubuntu, or a newer opencv-python-headless')
+        raise ModelError('this OpenCV has no aruco, which finds tags: install python3-opencv')
     dictionary = aruco.getPredefinedDictionary(getattr(
         aruco, f'DICT_APRILTAG_{family[3:]}' if family[:3] == 'tag' else family))
     is_old = not hasattr(aruco, 'ArucoDetector')  # before OpenCV 4.7
@@ -79,8 +76,8 @@ def _finder(family: str, least_rate: float) -> tuple[Any, int]:
     dictionary.maxCorrectionBits = _CORRECTED.get(family, 0)
     options.errorCorrectionRate, options.minMarkerPerimeterRate = 1.0, least_rate
     # two windows of the threshold find as many tags as OpenCV's three, in 0.6 of the time
-    options.adaptiveThreshWinSizeMin, options.adaptiveThreshWinSizeMax = _WINDOWS_PX
-    options.maxErroneousBitsInBorderRate = _WRONG_BORDER
+    options.adaptiveThreshWinSizeMin, options.adaptiveThreshWinSizeMax = 5, 15
+    options.maxErroneousBitsInBorderRate = 0.2  # squares with a whiter border are not decoded
 
     def find(gray: NDArray[np.uint8]) -> tuple[Any, Any]:
         return (aruco.detectMarkers(gray, dictionary, parameters=options) if is_old else

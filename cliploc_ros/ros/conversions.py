@@ -19,7 +19,7 @@ from cliploc_ros.errors import OptionsError
 from cliploc_ros.units import NS_PER_S
 
 _UNIT_TOLERANCE = 0.01
-DETECTION_TYPES, TAG_TYPES = ('vision_msgs', 'yolo_msgs', 'none'), ('image', 'apriltag_msgs')
+DETECTION_TYPES = ('vision_msgs', 'yolo_msgs', 'none')
 
 
 def stamp_ns(stamp: Time) -> int:
@@ -93,15 +93,6 @@ def detection_type(package: str) -> tuple[type, Callable[[Any], vision.Detection
     except ImportError as error:
         raise OptionsError('detections_type: yolo_msgs is not installed: build yolo_ros in this '
                            'workspace and source it, or set vision_msgs') from error
-
-
-def tags_type() -> Any:
-    """Return the message type of the topic tags; OptionsError: apriltag_msgs is not installed."""
-    try:
-        return importlib.import_module('apriltag_msgs.msg').AprilTagDetectionArray
-    except ImportError as error:
-        raise OptionsError('tags_type: apriltag_msgs is not installed: install apriltag_ros, or '
-                           'set image') from error
 
 
 def from_yolo_msg(msg: Any) -> vision.Detection2DArray:

@@ -287,7 +287,6 @@ class Instants:
         detections = given.usable(camera.width, camera.height, parameters.max_detections)
         if parameters.detections_type != 'none':
             self._detector.add(given, detections)
-        tags = None if frame.tags is None else messages.tags_from_msg(frame.tags)
         place, odom_from_camera = state.place, None
         if not by_odometry:
             odom_from_camera = invert_transform(state.camera_from_base)
@@ -310,7 +309,7 @@ class Instants:
             up_in_camera=state.up_in_camera, depths=depths,
             odom_from_camera=odom_from_camera, odom_way_m=0.0 if place is None else place.way_m,
             base_up_in_camera=state.camera_from_base[:3, 2]
-            if parameters.base_frame not in ('', image_frame) else None, tags=tags)
+            if parameters.base_frame not in ('', image_frame) else None)
 
 
 def _run_of(state: RobotState) -> int | None:

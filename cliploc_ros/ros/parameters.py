@@ -16,7 +16,7 @@ from cliploc_ros.core.options import ALGORITHMS, COMPARED, CROPS, MATCHINGS, Rel
 from cliploc_ros.errors import MapError, OptionsError
 from cliploc_ros.messages import parse_class_map
 from cliploc_ros.models.protocols import PROFILE_NAMES
-from cliploc_ros.ros.conversions import DETECTION_TYPES, TAG_TYPES
+from cliploc_ros.ros.conversions import DETECTION_TYPES
 from cliploc_ros.ros.node.parameters import Parameters, parameter
 
 #: Value of localizer_pose that looks for the localizer
@@ -162,9 +162,6 @@ class RelocalizerParameters(CommonParameters):
     detections_type: str = parameter('vision_msgs',
         'Detection2DArray of vision_msgs, or DetectionArray of yolo_msgs (yolo_ros); none: no '
         'detector, keyframes and tags alone.', choices=DETECTION_TYPES, read_only=True)
-    tags_type: str = parameter('image',
-        'Where the tags of a map are found: in the image, or on the topic tags by apriltag_ros.',
-        choices=TAG_TYPES, read_only=True)
     sync_tolerance_s: float = parameter(0.05,
         'Images of several cameras whose stamps differ by less are localized together.', unit='s',
         low=0.0, high=1.0, read_only=True)

@@ -103,7 +103,10 @@ class Comparison:
                                    for place in seen.places]).reshape(-1, 4, 4)
                 contenders = [
                     contender if SAME_ANSWER.agreeing(contender.pose[None], places).any()
-                    else _missed(contender, recognizer) for contender in contenders]
+                    else contender._replace(
+                        odds=contender.odds + (missed := CALIBRATION.keyframes.missed
+                                               * recognizer.coverage(contender.pose)),
+                        by_points=contender.by_points + missed) for contender in contenders]
             contenders += self.proposed(seen, contenders)
             contenders.sort(key=_order)
         #: The leading contender first; each source has at most one contender for each place
@@ -436,12 +439,6 @@ class Comparison:
 
 def _order(contender: Contender) -> tuple[bool, float]:
     return not contender.is_upright, -contender.rank
-
-
-def _missed(contender: Contender, recognizer: ImageRecognizer) -> Contender:
-    """Return a contender that keyframes cover but do not recognize, with lower odds."""
-    odds = CALIBRATION.keyframes.missed * recognizer.coverage(contender.pose)
-    return contender._replace(odds=contender.odds + odds, by_points=contender.by_points + odds)
 
 
 def spread(poses: NDArray[np.float64], odds: NDArray[np.float64]) -> NDArray[np.float64]:

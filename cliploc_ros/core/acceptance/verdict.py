@@ -278,9 +278,8 @@ def _too_unlikely(evidence: Evidence, options: RelocalizerOptions) -> Refusal | 
             f' (the second in {evidence.twin_map})')
         cause = (f'{_point(evidence.place)} and {_point(evidence.twin)} m look alike{second}; '
                 'turn the camera to objects that differ')
-    elif (weakest in ('likely', 'uncontradicted') and (
-            contradiction := _of_tags(evidence, ambiguous)) is not None):
-        kind, cause = contradiction
+    elif weakest in ('likely', 'uncontradicted') and (of_tags := _of_tags(evidence, ambiguous)):
+        kind, cause = of_tags
     elif weakest in _ADVICE and (weakest != 'genuine' or evidence.recognized is not None):
         kind, sentence = _ADVICE[weakest]
         cause = sentence.format(evidence)

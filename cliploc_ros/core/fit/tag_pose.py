@@ -24,7 +24,6 @@ from cliploc_ros.core.observation import NO_TAGS, Observation
 _CORNER_PX, _BENT, _TAG_M, _TAG_RAD, _FOCAL = 0.5, 0.005, 0.01, np.radians(0.5), 0.005
 # Tags agree if their corners are off by at most these pixels and metres at the tag.
 _AGREE_PX, _AGREE_M = 2.0, 0.03
-_LEAST_AREA_PX = 9.0  # of a tag: less is no square
 # OpenCV stops at an absolute change of the cost: coordinates as large as pixels are fine enough.
 _FINE = 1000.0
 _FIRSTS = 4  # number of tags that are the first of a pose: those largest in view
@@ -76,7 +75,7 @@ def sights_of(tags: Sequence[Tag], seen: Observation) -> list[TagSight]:
         own = [tag for tag in tags if tag.name == name]
         bearings = camera.normalize_points(pixels)
         if own and np.isfinite(bearings).all() and cv2.contourArea(
-                pixels.astype(np.float32)) > _LEAST_AREA_PX:
+                pixels.astype(np.float32)) > 9.0:  # smaller ones are no squares
             side, flat = (float(np.linalg.norm(
                 corners - np.roll(corners, 1, axis=0), axis=1).mean())
                 for corners in (pixels, bearings))

@@ -159,8 +159,7 @@ def check_id(name: Any, where: str) -> None:
         raise MapError(f'{where}: the id must be text without dots')
 
 
-def checked_place(fields: Mapping[str, Any], where: str
-                  ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def checked_place(fields: Mapping[str, Any], where: str) -> tuple[tuple[float, ...], ...]:
     """Return center and orientation among the fields; MapError: one is invalid."""
     center = checked_numbers(fields['center'], 3, f'{where}: center')
     if max(map(abs, center)) > _MAX_COORDINATE_M:

@@ -5,6 +5,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from cliploc_ros.errors import MapError, did_you_mean
 FAMILIES = {'tag16h5': 30, 'tag25h9': 35, 'tag36h10': 2320, 'tag36h11': 587,
             **{f'DICT_{side}X{side}_{count}': count for side in (4, 5, 6, 7)
                for count in (50, 100, 250, 1000)}, 'DICT_ARUCO_ORIGINAL': 1024}
-_SIZE_RANGE_M = (1e-3, 1e2)
 #: Corners (4, 3) of a tag of size 1, in the order of the detection: top left, then clockwise.
 SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
@@ -55,12 +55,10 @@ def read_tags(tree: Any, source: str) -> tuple[Tag, ...]:
     if not isinstance(tree, Mapping):
         raise MapError(f'{source}: map: tags: expected tags by name, not {tree!r:.60}')
     tags = tuple(_tag(tag_id, fields, source) for tag_id, fields in tree.items())
-    names: dict[str, str] = {}
-    for tag in tags:
-        if tag.name in names:
-            raise MapError(f"{source}: tag '{tag.tag_id}': family and id are those of "
-                           f"'{names[tag.name]}': give each tag of a place its own id")
-        names[tag.name] = tag.tag_id
+    for tag, other in combinations(tags, 2):
+        if tag.name == other.name:
+            raise MapError(f"{source}: tag '{other.tag_id}': family and id are those of "
+                           f"'{tag.tag_id}': give each tag of a place its own id")
     return tags
 
 
@@ -76,8 +74,6 @@ def _tag(tag_id: Any, fields: Any, source: str) -> Tag:
     if isinstance(number, bool) or not isinstance(number, int) or not (
             0 <= number < FAMILIES[family]):
         raise MapError(f'{where}: id: {number!r} must be from 0 to {FAMILIES[family] - 1}')
-    if isinstance(size, bool) or not isinstance(size, int | float) or not (
-            _SIZE_RANGE_M[0] <= size <= _SIZE_RANGE_M[1]):
-        raise MapError(f'{where}: size: {size!r} must be between {_SIZE_RANGE_M[0]:g} and '
-                       f'{_SIZE_RANGE_M[1]:g} m')
+    if isinstance(size, bool) or not isinstance(size, int | float) or not 1e-3 <= size <= 1e2:
+        raise MapError(f'{where}: size: {size!r} must be between 0.001 and 100 m')
     return Tag(tag_id, family, number, float(size), *checked_place(fields, where))

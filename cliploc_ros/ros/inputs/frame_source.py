@@ -18,7 +18,7 @@ from vision_msgs.msg import Detection2DArray
 
 from cliploc_ros.errors import CliplocError, StoppedError
 from cliploc_ros.ros import qos
-from cliploc_ros.ros.conversions import detection_type, of_camera, stamp_ns, tags_type
+from cliploc_ros.ros.conversions import detection_type, of_camera, stamp_ns
 from cliploc_ros.ros.inputs.stamps import ExactPairing, MessageStamps, stamp_problem
 from cliploc_ros.ros.node.diagnostics import Health, Rates
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -63,7 +63,6 @@ class Frame:
     beside: tuple['Frame', ...] = ()  #: Frames of other cameras at this instant
     left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame at this instant
     image_topic: str = ''  #: Resolved name of the image topic
-    tags: Any = None  #: AprilTagDetectionArray with `tags_type: apriltag_msgs`; else None
 
     @property
     def stamp_ns(self) -> int:
@@ -108,8 +107,6 @@ class FrameSource:
                   'camera_info': 'camera_info'}
         if self._package != 'none':
             topics['detections'] = 'detections'
-        if parameters.tags_type == 'apriltag_msgs':
-            topics['tags'] = 'tags'
         if depth != 'none':
             topics |= {'depth': 'depth' if depth == 'raw' else 'depth/compressedDepth',
                        'depth_camera_info': 'depth_camera_info'}
@@ -122,10 +119,9 @@ class FrameSource:
         self.lag_s, self.nearest_lag_s = math.nan, math.inf
         self._depth_tolerance_ns = round(parameters.depth_tolerance_s * NS_PER_S)
         self._depths: deque[Image | CompressedImage] = deque()
-        self._pairing = ExactPairing({
-            'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20, 'detections': _MAX_DETECTIONS_BYTES,
-            **({'tags': _MAX_DETECTIONS_BYTES} if 'tags' in topics else {})}, _MAX_WAITING,
-            'image', 'detections')
+        self._pairing = ExactPairing({'image': _MAX_IMAGE_BYTES, 'camera_info': 2**20,
+                                      'detections': _MAX_DETECTIONS_BYTES}, _MAX_WAITING,
+                                     'image', 'detections')
         self._stamps = {'image': MessageStamps(), 'detections': MessageStamps()}
         self._static_info: CameraInfo | None = None
         self._unsure: Frame | None = None
@@ -149,8 +145,6 @@ class FrameSource:
         """
         with self._changed:
             self._detections_type, self._converted = detection_type(self._package)
-            if 'tags' in self.topics:
-                tags_type()
             self.closed = ''
             if self._linger_s == math.inf:
                 self._wanted_until = math.inf
@@ -255,7 +249,6 @@ class FrameSource:
         return {'image': (self._image_type, qos.IMAGE),
                 'camera_info': (CameraInfo, qos.CAMERA_INFO),
                 'detections': (self._detections_type, qos.DETECTIONS_IN),
-                'tags': (tags_type() if 'tags' in self.topics else type, qos.DETECTIONS_IN),
                 'depth': (self._depth_type, qos.IMAGE),
                 'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
 
@@ -308,7 +301,7 @@ class FrameSource:
             self._static_info = msg if stamp_problem(msg.header.stamp) else None
             if self._static_info is not None:
                 return None
-        elif name != 'tags' and not self._is_named(name, msg, received_at):
+        elif not self._is_named(name, msg, received_at):
             self._unsure = None
             return None
         if name == 'image' and self._static_info is not None:
@@ -326,8 +319,7 @@ class FrameSource:
                     (depth for depth in self._depths
                      if abs(stamp_ns(depth.header.stamp) - at_ns) <= self._depth_tolerance_ns),
                     key=lambda depth: abs(stamp_ns(depth.header.stamp) - at_ns), default=None),
-                self._depth_camera, self._camera, image_topic=self._resolved('image'),
-                tags=complete.get('tags', (None,))[0])
+                self._depth_camera, self._camera, image_topic=self._resolved('image'))
         frame = self._unsure
         # the next images may have the same stamp; wait until stamps are known to differ
         if frame is None or not (self._stamps['image'].are_own or all(
