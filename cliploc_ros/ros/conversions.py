@@ -89,14 +89,13 @@ def detection_type(package: str) -> tuple[type, Callable[[Any], vision.Detection
                            'workspace and source it, or set vision_msgs') from error
 
 
-def tags_type() -> type:
+def tags_type() -> Any:
     """Return the message type of the topic tags; OptionsError: apriltag_msgs is not installed."""
     try:
-        found: type = importlib.import_module('apriltag_msgs.msg').AprilTagDetectionArray
+        return importlib.import_module('apriltag_msgs.msg').AprilTagDetectionArray
     except ImportError as error:
         raise OptionsError('tags_type: apriltag_msgs is not installed: install apriltag_ros, or '
                            'set image') from error
-    return found
 
 
 def from_yolo_msg(msg: Any) -> vision.Detection2DArray:

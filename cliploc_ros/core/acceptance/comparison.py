@@ -226,6 +226,10 @@ class Comparison:
         if self._by_tags is not None and self._by_tags.tagged is not None:
             by_tags = self._by_tags.pose, (self._by_tags.tagged.covariance
                                            + self._by_tags.spread)
+            if self.by_objects and not SAME_PLACE.agree(by_tags[0], self.by_objects.pose):
+                # a tag of a wrong size or displaced by less than a metre
+                by_tags = by_tags[0], by_tags[1] + spread(
+                    np.array([by_tags[0], self.by_objects.pose]), np.zeros(2))
             by_points = by_tags if by_points is None else fuse(*by_points, *by_tags)
         if by_points is not None and best is None:
             return by_points

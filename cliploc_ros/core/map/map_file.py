@@ -107,15 +107,11 @@ def _lines(landmark_map: LandmarkMap) -> Iterator[str]:
         yield f'{_INDENT}orientation: {_floats(landmark_map.quats_xyzw[row])}'
         if landmark_map.details:
             yield from _detail_lines(landmark_map.details[row])
-    if landmark_map.tags:
-        yield '      tags:'
-    for tag in landmark_map.tags:
-        yield f'        {quoted(tag.tag_id)}:'
-        yield f'{_INDENT}family: {quoted(tag.family)}'
-        yield f'{_INDENT}id: {tag.number}'
-        yield f'{_INDENT}size: {tag.size:.5f}'
-        yield f'{_INDENT}center: {_floats(tag.center)}'
-        yield f'{_INDENT}orientation: {_floats(tag.quat_xyzw)}'
+    for number, tag in enumerate(landmark_map.tags):
+        yield from [*['      tags:'] * (number == 0), f'        {quoted(tag.tag_id)}:',
+                    f'{_INDENT}family: {quoted(tag.family)}', f'{_INDENT}id: {tag.number}',
+                    f'{_INDENT}size: {tag.size:.5f}', f'{_INDENT}center: {_floats(tag.center)}',
+                    f'{_INDENT}orientation: {_floats(tag.quat_xyzw)}']
 
 
 def _detail_lines(details: LandmarkDetails) -> Iterator[str]:

@@ -101,7 +101,6 @@ class FrameSource:
         self._linger_s, self._on_frame = linger_s, on_frame
         self._package = parameters.detections_type
         self._detections_type, self._converted = detection_type('vision_msgs')
-        self._tags_type: type = Detection2DArray  # until the source opens
         is_raw, depth = parameters.image_transport == 'raw', parameters.depth_transport
         self._image_type = Image if is_raw else CompressedImage
         self._depth_type = Image if depth == 'raw' else CompressedImage
@@ -151,7 +150,7 @@ class FrameSource:
         with self._changed:
             self._detections_type, self._converted = detection_type(self._package)
             if 'tags' in self.topics:
-                self._tags_type = tags_type()
+                tags_type()
             self.closed = ''
             if self._linger_s == math.inf:
                 self._wanted_until = math.inf
@@ -256,7 +255,7 @@ class FrameSource:
         return {'image': (self._image_type, qos.IMAGE),
                 'camera_info': (CameraInfo, qos.CAMERA_INFO),
                 'detections': (self._detections_type, qos.DETECTIONS_IN),
-                'tags': (self._tags_type, qos.DETECTIONS_IN),
+                'tags': (tags_type() if 'tags' in self.topics else type, qos.DETECTIONS_IN),
                 'depth': (self._depth_type, qos.IMAGE),
                 'depth_camera_info': (CameraInfo, qos.CAMERA_INFO)}
 
