@@ -20,7 +20,7 @@ from cliploc_ros.core.localizer import (
     repeat,
 )
 from cliploc_ros.core.map.similarities import CropSimilarities, LabelEmbeddings
-from cliploc_ros.core.observation import Detections, Observation, Region
+from cliploc_ros.core.observation import Detections, Observation, Region, SeenTags
 from cliploc_ros.core.options import NEVER, RelocalizerOptions
 from cliploc_ros.core.query import CASE, Case, Query, case_arrays, read_case
 from cliploc_ros.core.relocalizer import Relocalizer
@@ -119,7 +119,8 @@ def test_all_that_is_known_comes_back(tmp_path):
                   stamp_ns=7, region=region, base_up_in_camera=np.array([0.0, 0.0, 1.0]),
                   depths=np.where(np.arange(len(SEEN)) % 2, 1.0 / 3.0, np.nan),
                   similarities=CropSimilarities(np.eye(12, 16, dtype=np.float32)[:2], LABELS),
-                  compared=np.array([3, 1]), camera_name='front')
+                  compared=np.array([3, 1]), camera_name='front',
+                  tags=SeenTags(('tag36h11_1',), np.arange(8.0).reshape(1, 4, 2)))
     first = replace(first, run=3, limit=5, length_s=2.5, by_keyframes=False, rooms=(1, 1, 0))
     second = Query((Observation(CAMERA, SEEN.select(np.empty(0, np.int64))),), run=None)
     case = stored([first, second], RelocalizerOptions(height_range_m=(0.5, 2.0)),

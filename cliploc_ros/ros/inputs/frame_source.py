@@ -59,11 +59,11 @@ class Frame:
     #: Depth within depth_tolerance_s of the image; None without depth
     depth: Image | CompressedImage | None = None
     depth_camera_info: CameraInfo | None = None  #: For unregistered depth
-    tags: Any = None  #: AprilTagDetectionArray with `tags_type: apriltag_msgs`; else None
     camera: str = ''  #: Name of the camera; empty for a single camera
     beside: tuple['Frame', ...] = ()  #: Frames of other cameras at this instant
     left_out: tuple[str, ...] = ()  #: Names of the cameras without a frame at this instant
     image_topic: str = ''  #: Resolved name of the image topic
+    tags: Any = None  #: AprilTagDetectionArray with `tags_type: apriltag_msgs`; else None
 
     @property
     def stamp_ns(self) -> int:
@@ -326,8 +326,8 @@ class FrameSource:
                     (depth for depth in self._depths
                      if abs(stamp_ns(depth.header.stamp) - at_ns) <= self._depth_tolerance_ns),
                     key=lambda depth: abs(stamp_ns(depth.header.stamp) - at_ns), default=None),
-                self._depth_camera, complete.get('tags', (None,))[0], self._camera,
-                image_topic=self._resolved('image'))
+                self._depth_camera, self._camera, image_topic=self._resolved('image'),
+                tags=complete.get('tags', (None,))[0])
         frame = self._unsure
         # the next images may have the same stamp; wait until stamps are known to differ
         if frame is None or not (self._stamps['image'].are_own or all(
