@@ -115,3 +115,11 @@ class StoppedError(CliplocError):
 
 class TimeUpError(CliplocError):
     """A request's time is up before the work is done; the message names the work."""
+
+
+class HandOffError(CliplocError):
+    """The pose was not delivered to the localizer; the message says why."""
+
+
+class NoLocalizerError(HandOffError):
+    """No localizer takes poses, or Nav2's grid was not changed. Another frame would not help."""

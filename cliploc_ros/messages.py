@@ -84,8 +84,7 @@ def _decoded(msg: CompressedImageMessage) -> NDArray[np.uint8]:
     # 'rgb8; jpeg compressed bgr8': the last word is the encoding of the compressed pixels. With
     # rgb8, compressed_image_transport has swapped red and blue.
     _, _, packed = msg.format.partition('compressed')
-    is_red_first = packed.strip().startswith('rgb')
-    return np.ascontiguousarray(image if is_red_first else image[:, :, ::-1])
+    return np.ascontiguousarray(image if packed.strip().startswith('rgb') else image[:, :, ::-1])
 
 
 def _unpacked(data: bytes, flags: int, what: str) -> NDArray[Any] | None:

@@ -35,7 +35,7 @@ NAMES = {
     'odom': 'odometry, which shows motion; without it the robot is assumed to be at rest',
     'imu': 'IMU, the source of the vertical with gravity:=imu',
     'initialpose': 'the pose that AMCL subscribes to',
-    'amcl_pose': 'the pose that AMCL publishes; it confirms that AMCL has taken initialpose',
+    'amcl_pose': 'the pose of the localizer, with localizer_pose: amcl_pose; auto finds it',
     'request_nomotion_update': 'service of AMCL: process a scan while the robot is at rest',
     'reinitialize_global_localization': "service of the relocalizer that Nav2's behaviour tree "
                                         'calls; AMCL has a service of this name, too',

@@ -160,7 +160,8 @@ def write_map(room: LandmarkMap, path) -> None:
                       'orientation': room.quats_xyzw[i].tolist()}
         for i, landmark_id in enumerate(room.landmark_ids)}
     path.write_text(yaml.safe_dump({'/**': {'ros__parameters': {
-        'map': {'frame_id': room.frame_id, 'landmarks': landmarks}}}}))
+        'map': {'frame_id': room.frame_id, 'landmarks': landmarks} | (
+            {'nav2_map': room.nav2_map} if room.nav2_map else {})}}}))
 
 
 def write_bare_map(path, layer) -> None:

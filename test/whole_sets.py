@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 the cliploc_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A small map with all files next to it: embeddings, keyframes, and a record of its origin."""
+"""A small map with all files next to it: embeddings, keyframes, and records of its origin."""
 
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ from scene import CAMERA, ROOM, embeddings_of
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.offline.datasets.map_recording import MapRecording
 from cliploc_ros.offline.mapping.make_map import MadeMap, write_made_map
+from cliploc_ros.offline.mapping.posed_detections import PosedDetections
 from cliploc_ros.offline.recording.updating import UpdatedLayer
 
 
@@ -28,5 +29,7 @@ def made_map(number):
 
 def write_set(path, number):
     """Write the map of a number, and all files next to it."""
-    return write_made_map(path, made_map(number), ['a test'],
-                          MapRecording(path.with_name('seen.npz'), scale=1.0 + number))
+    seen = PosedDetections((CAMERA,), np.eye(4)[None], np.array([float(number)]), np.zeros(2, int),
+                           np.empty((0, 4)), (), np.empty(0, int), np.empty(0))
+    return write_made_map(path, made_map(number), ['a test'], MapRecording(
+        path.with_name('seen.npz'), scale=1.0 + number), together=seen)

@@ -111,12 +111,14 @@ def build(options: argparse.Namespace) -> int:
     sizes = parse_sizes(options.tags or ())
     command.check_output(options.out)
     layer, note = layer_options(recordings[0])
-    _refuse_conflicts(options, len(recordings) > 1 or options.add is not None)
+    is_several = len(recordings) > 1 or options.add is not None
+    _refuse_conflicts(options, is_several)
     if options.add is not None:
         options.frame_id = LandmarkMap.from_file(options.add).frame_id
     mapping = _mapping_options(options, f'build_map {name}')
     detections, recording, frames, joined = sources.read_recordings(
         options, recordings, partial(_placed, mapping=mapping), layer)
+    together = detections if is_several else None
     _tell_misspelt(mapping.moving_classes, detections.class_names)
     if options.every > 1:
         detections = detections.select_frames(range(0, len(detections), options.every))
@@ -150,7 +152,8 @@ def build(options: argparse.Namespace) -> int:
         raise
     _write_report(options.report, asdict(made.report) | ({} if made.keyframes is None else {
         'keyframes': [fate._asdict() for fate in made.keyframes.fates]}))
-    path, is_poor = _write(options, made, name, recording, [labeller.note, note], begin)
+    path, is_poor = _write(options, made, name, (recording, together), [labeller.note, note],
+                           begin)
     try:
         if options.check:
             check_map.check(check_map.make_parser().parse_args([str(path), *_QUICK]),
@@ -163,8 +166,9 @@ def build(options: argparse.Namespace) -> int:
     return int(is_poor)
 
 
-def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: 'MapRecording',
-           notes: Sequence[str], begin: float) -> tuple[Path, bool]:
+def _write(options: argparse.Namespace, made: 'MadeMap', name: str,
+           recorded: 'tuple[MapRecording, PosedDetections | None]', notes: Sequence[str],
+           begin: float) -> tuple[Path, bool]:
     """Write a map, and print its report, and how long the run took since its begin.
 
     Return its path, which is another one if the map is poor, and whether it is.
@@ -184,12 +188,11 @@ def _write(options: argparse.Namespace, made: 'MadeMap', name: str, recording: '
         if options.mount is not None:
             mount = mount_from_numbers(options.mount) @ mount
         numbers = [*mount[:3, 3], *quaternion_from_transform(mount)]
-        lines.append('corrected mount: --mount ' + ' '.join(
-            f'{number:.5f}' for number in numbers))
+        lines.append('corrected mount: --mount ' + ' '.join(f'{number:.5f}' for number in numbers))
     is_poor = isinstance(made.report, MappingReport) and made.report.landmarks > 0 and (
         made.report.explained_of_classes < LEAST_EXPLAINED)
     path = options.out.with_stem(f'{options.out.stem}.refused') if is_poor else options.out
-    written = write_made_map(path, made, head, recording, options.update)
+    written = write_made_map(path, made, head, recorded[0], options.update, recorded[1])
     print('\n'.join([*lines, *(f'note: {text}' for text in notes if text),
                      '; '.join([f'wrote {path} in {time.monotonic() - begin:.0f} s', *written])]),
           flush=True)

@@ -13,13 +13,11 @@ from cliploc_ros import command
 from cliploc_ros.cli.options import add_topic_options, add_use_option, read_layer
 from cliploc_ros.command import option
 from cliploc_ros.core.options import RelocalizerOptions
-from cliploc_ros.errors import CliplocError, OptionsError
+from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
 
 if TYPE_CHECKING:
-    from cliploc_ros.offline.datasets.images import Images
-    from cliploc_ros.offline.datasets.map_recording import MapRecording
-    from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+    pass
 
 _ADVICE_SHOWN = 8
 EPILOG = """\
@@ -84,6 +82,7 @@ def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
     The output has the verdict, at most this number of pieces of advice, and the page.
     """
     # Imported late, so that --help is fast.
+    from cliploc_ros.cli.sources import recorded
     from cliploc_ros.core.map.landmark_map import LandmarkMap
     from cliploc_ros.files.storage import make_folder
     from cliploc_ros.offline.datasets.map_recording import load_recording
@@ -92,7 +91,14 @@ def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
 
     landmark_map = LandmarkMap.from_file(options.map)
     recording = load_recording(options.map) if options.observations is None else None
-    detections, images = _read_recording(options, recording)
+    if recording is None and options.observations is None:
+        if options.images is not None:
+            raise OptionsError('--images needs --observations: no recording of this map is known')
+        print('no recording of this map is known: the map is checked by simulation only; give '
+              '--observations', flush=True)
+    detections, images = recorded(options, recording)
+    if detections is not None and options.every > 1:
+        detections = detections.select_frames(range(0, len(detections), options.every))
     check_options = CheckOptions(
         relocalizer=RelocalizerOptions(min_confidence=options.min_confidence),
         folds=options.folds, frames=options.frames, spacing_m=options.grid,
@@ -118,39 +124,6 @@ def check(options: argparse.Namespace, most: int = _ADVICE_SHOWN) -> int:
         for number, line in enumerate(report.advice[:most], start=1))]))
     print(f'wrote {out / CHECK}: open it for pictures, all advice and the faults of landmarks')
     return 0 if report.passed else 1
-
-
-def _read_recording(options: argparse.Namespace, recording: 'MapRecording | None'
-                    ) -> 'tuple[PosedDetections | None, Images | None]':
-    """Return the recording of the command line or of the map, and its images if they are found."""
-    from cliploc_ros.cli.sources import images_at
-    from cliploc_ros.offline.datasets.images import images_of_recording
-    from cliploc_ros.offline.datasets.observations import load_observations
-
-    if options.observations is not None:
-        detections = load_observations(options.observations)
-    elif recording is not None:
-        detections = recording.load()
-    elif options.images is not None:
-        raise OptionsError('--images needs --observations: no recording of this map is known')
-    else:
-        print('no recording of this map is known: the map is checked by simulation only; give '
-              '--observations', flush=True)
-        return None, None
-    images = None
-    try:
-        if options.images is not None:
-            images = images_at(options, options.images, detections.camera_names
-                               if options.cameras == [''] else options.cameras)
-        elif recording is not None:
-            images = images_of_recording(recording, detections.camera_names)
-    except CliplocError as error:
-        if options.images is not None:
-            raise
-        print(f'without images: {error}', flush=True)
-    if options.every > 1:
-        detections = detections.select_frames(range(0, len(detections), options.every))
-    return detections, images
 
 
 if __name__ == '__main__':

@@ -266,8 +266,8 @@ def _notes(options: argparse.Namespace, queries: 'Sequence[PosedQuery]',
         images = source_of(options).resolve()
         notes += [f'note: {file} was built from these images ({images}): results are optimistic'
                   for file in options.map
-                  if (recording := load_recording(file)) is not None
-                  and recording.source is not None and recording.source.resolve() == images]
+                  if (found := load_recording(file)) is not None and images in [
+                      part.source.resolve() for part in (found, *found.others) if part.source]]
     return notes
 
 

@@ -17,14 +17,14 @@ from cliploc_ros.core.geometry.depth import DepthCamera
 from cliploc_ros.core.geometry.transforms import make_transform
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
-from cliploc_ros.errors import DatasetError, MappingError, OptionsError
+from cliploc_ros.errors import CliplocError, DatasetError, MappingError, OptionsError
 from cliploc_ros.models import protocols
 from cliploc_ros.models.files import digest_file
 from cliploc_ros.offline.datasets import bag_frames, bag_poses, frames
 from cliploc_ros.offline.datasets.folders import find_layout, read_folder, rgbd_frames
-from cliploc_ros.offline.datasets.images import Images, open_images
+from cliploc_ros.offline.datasets.images import Images, images_of_recording, open_images
 from cliploc_ros.offline.datasets.map_recording import MapRecording, load_recording
-from cliploc_ros.offline.datasets.observations import load_observations, save_observations
+from cliploc_ros.offline.datasets.observations import load_observations
 from cliploc_ros.offline.datasets.parsing import naming
 from cliploc_ros.offline.datasets.poses import Poses, mount_from_numbers
 from cliploc_ros.offline.datasets.tum import read_tum_trajectory
@@ -87,19 +87,36 @@ def find_topics(options: argparse.Namespace, bag: Path | None) -> None:
         print(f'{bag}: {" and ".join(getattr(options, name) for name in open_topics)}', flush=True)
 
 
-def images_at(options: argparse.Namespace, path: Path, cameras: Sequence[str]) -> Images:
-    """Open the images of cameras in a folder or bag, with the topics of the command line.
+def recorded(options: argparse.Namespace, built_from: MapRecording | None
+             ) -> tuple[PosedDetections | None, Images | None]:
+    """Return the boxes and images that the command line names, by default those of a map.
 
-    DatasetError: the path is neither, or a topic that the command line does not name is ambiguous.
+    CliplocError: they cannot be used. Images of the map that cannot be read are left out.
     """
-    is_bag = path.exists() and find_layout(path) is None
-    find_topics(options, path if is_bag and [*cameras] == [''] else None)
-    return open_images(path, bag_frames.BagTopics(
-        options.image, options.camera_info, options.rectified), cameras)
+    detections, images = None, None
+    if options.observations is not None:
+        detections = load_observations(options.observations)
+    elif built_from is not None:
+        detections = built_from.load()
+    known = [''] if detections is None else list(detections.camera_names)
+    cameras = known if options.cameras == [''] else list(dict.fromkeys(options.cameras))
+    if unknown := [name for name in cameras if name not in known]:
+        raise OptionsError(f"--cameras: the observations have no camera '{unknown[0]}'; they have "
+                           f'{", ".join(filter(None, known)) or "one without a name"}')
+    if (path := options.images) is not None:
+        is_bag = path.exists() and find_layout(path) is None
+        find_topics(options, path if is_bag and cameras == [''] else None)
+        images = open_images(path, bag_frames.BagTopics(
+            options.image, options.camera_info, options.rectified), cameras)
+    elif built_from is not None and detections is not None:
+        try:
+            images = images_of_recording(built_from, cameras)
+        except CliplocError as error:
+            print(f'without images: {error}', flush=True)
+    return detections, images
 
 
-def read_source(options: argparse.Namespace
-                ) -> tuple[PosedDetections, Path, frames.Frames | None]:
+def read_source(options: argparse.Namespace) -> tuple[PosedDetections, Path, frames.Frames | None]:
     """Return the observations of a source, their file, and its images if there are any.
 
     CliplocError: the source, the networks or the options cannot be used.
@@ -206,6 +223,9 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
     if options.add is not None:
         if (recording := load_recording(options.add)) is None:
             raise OptionsError(f'--add {options.add}: its recording is missing: give all again')
+        if recording.is_update:
+            raise OptionsError(f'--add {options.add}: only boxes of its last update are known: '
+                               'build it of all recordings, and update it afterwards')
         layer = read_layer([options.add], LandmarkMap.from_file(options.add), None)
     else:
         first, *recordings = recordings
@@ -214,12 +234,14 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
         recording, layer = recording_of(first, file, scale, rotation), None
         images = images and frames.move_frames(images, scale, rotation)
         if not recordings:
-            return detections, recording, images, None
+            return (detections, replace(recording, is_update=options.update is not None), images,
+                    None)
         if images is not None and wanted is not None:
             layer = build_layer(images, LandmarkMap.empty(options.frame_id), wanted)
-    parts = [recording.load() if options.add else detections]
+    parts, others = [recording.load() if options.add else detections], [*recording.others]
+    cameras = recording.cameras or parts[0].camera_names
     for own in recordings:
-        (seen, _, images), placing = read_source(own), Placing()
+        (seen, file, images), placing = read_source(own), Placing()
         with naming(source_of(own), MappingError):
             if layer is not None and images is not None and wanted is not None:
                 layer, placing, note = add_layer(
@@ -230,13 +252,13 @@ def read_recordings(options: argparse.Namespace, recordings: Sequence[argparse.N
                 raise MappingError('no keyframes place it in the map: give `same_frame` if its '
                                    'poses are in the frame of the map')
         end_s = max(part.stamps_s[-1] for part in parts)
-        stamps_s = seen.stamps_s + max(0.0, end_s + _APART_S - seen.stamps_s[0])
-        parts.append(replace(seen.moved(*placing), stamps_s=stamps_s, stamps_ns=None))
-    joined = join_detections(parts)
-    file = options.out.with_suffix(f'.{len(joined)}.npz')
-    # its poses are those of the first recording
-    save_observations(file, joined.moved(1.0 / recording.scale, np.array(recording.rotation).T))
-    return joined, replace(recording, observations=file), None, layer
+        later_s = max(0.0, float(end_s + _APART_S - seen.stamps_s[0]))
+        parts.append(replace(seen.moved(*placing), stamps_s=seen.stamps_s + later_s,
+                             stamps_ns=None))
+        others.append(replace(recording_of(own, file, placing.scale, placing.rotation),
+                              later_s=later_s, cameras=seen.camera_names))
+    return (join_detections(parts), replace(recording, cameras=cameras, others=tuple(others)),
+            None, layer)
 
 
 def source_of(options: argparse.Namespace) -> Path:

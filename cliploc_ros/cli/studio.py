@@ -14,10 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from cliploc_ros.cli.options import add_topic_options, read_layer
 from cliploc_ros.command import needs_ros, option, program, run_main, within
-from cliploc_ros.errors import OptionsError
 
 if TYPE_CHECKING:
-    from cliploc_ros.offline.mapping.posed_detections import PosedDetections
     from cliploc_ros.offline.studio.studio import Studio
 
 _LOOPBACK = '127.0.0.1'
@@ -98,30 +96,21 @@ def serve(options: argparse.Namespace) -> int:
 
 def open_studio(options: argparse.Namespace) -> 'Studio':
     """Return the studio that the command line asks for."""
-    from cliploc_ros.cli.sources import images_at
+    from cliploc_ros.cli.sources import recorded
     from cliploc_ros.offline.datasets.folders import find_layout
-    from cliploc_ros.offline.datasets.images import images_of_recording, views_of_folder
+    from cliploc_ros.offline.datasets.images import views_of_folder
     from cliploc_ros.offline.datasets.map_recording import load_recording
-    from cliploc_ros.offline.datasets.observations import load_observations
     from cliploc_ros.offline.studio.document import Document
     from cliploc_ros.offline.studio.recording import Recording
     from cliploc_ros.offline.studio.room import read_walls
     from cliploc_ros.offline.studio.studio import Studio
 
-    images = detections = None
     is_folder = options.images is not None and find_layout(options.images) is not None
     built_from = None if options.map is None else load_recording(options.map)
     if is_folder and built_from is not None and built_from.source is not None and not (
             built_from.source.samefile(options.images)):
         built_from = None  # the folder has different poses
-    if options.observations is not None:
-        detections = load_observations(options.observations)
-    elif built_from is not None:
-        detections = built_from.load()
-    if options.images is not None:
-        images = images_at(options, options.images, _cameras(options, detections))
-    elif built_from is not None and detections is not None:
-        images = images_of_recording(built_from, _cameras(options, detections))
+    detections, images = recorded(options, built_from)
     if detections is None and options.images is not None:
         detections = views_of_folder(options.images)
     recording = None if detections is None else Recording(
@@ -133,17 +122,6 @@ def open_studio(options: argparse.Namespace) -> 'Studio':
     layer = read_layer([document.path], document.to_map(), None)
     walls = None if options.occupancy_grid is None else read_walls(options.occupancy_grid)
     return Studio(document, recording, layer, walls)
-
-
-def _cameras(options: argparse.Namespace, detections: 'PosedDetections | None') -> list[str]:
-    """Return the cameras whose images are shown: by default those of the observations."""
-    known = [''] if detections is None else list(detections.camera_names)
-    if options.cameras == ['']:
-        return known
-    if unknown := [name for name in options.cameras if name not in known]:
-        raise OptionsError(f"--cameras: the observations have no camera '{unknown[0]}'; they have "
-                           f'{", ".join(filter(None, known)) or "one without a name"}')
-    return list(dict.fromkeys(options.cameras))
 
 
 if __name__ == '__main__':

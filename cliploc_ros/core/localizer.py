@@ -25,7 +25,7 @@ from cliploc_ros.core.acceptance.camera_check import CameraCheck
 from cliploc_ros.core.acceptance.depth_check import DepthScale
 from cliploc_ros.core.acceptance.looks import NO_LOOKS, Look, Looks
 from cliploc_ros.core.acceptance.verdict import RefusalKind
-from cliploc_ros.core.fit.succession import FilterState, succeed
+from cliploc_ros.core.fit.succession import Answered, Track, follow
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import SAME_VIEW, pose_error
 from cliploc_ros.core.keyframes.localization import (
@@ -159,8 +159,7 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
     search_ms, left = 0.0, np.empty(0, dtype=np.int64)
     if crops is not None:
         compared = crops.known
-        observation = replace(observation, similarities=crops.compare(compared),
-                              compared=compared)
+        observation = replace(observation, similarities=crops.compare(compared), compared=compared)
         left = informative_first(relocalizer.landmark_map, observation)
         left = left[~np.isin(left, compared)]
     while True:
@@ -173,8 +172,7 @@ def localize_on_demand(relocalizer: Relocalizer, earlier: Sequence[SearchedFrame
             return frame, relocalizer.look_again(found, [*earlier, frame], looks, recognizer,
                                                  cameras)
         compared, left = np.append(compared, left[:count]), left[count:]
-        observation = replace(observation, similarities=crops.compare(compared),
-                              compared=compared)
+        observation = replace(observation, similarities=crops.compare(compared), compared=compared)
 
 
 class KeptInstant(NamedTuple):
@@ -206,7 +204,9 @@ class Localizer:
         self._relocalizer, self._keyframes = relocalizer, keyframes
         self._instants: list[KeptInstant] = []
         self._looks = Looks()
-        self._filter: FilterState | None = None
+        self._accepted: Track | None = None  # by the accepted answers alone, see follow
+        #: The pose by all answers of the current run of odometry
+        self.track: Track | None = None
         self._run: int | None = -1
         self._stamp_ns = 0
         #: The newest query with everything that its answer depended on, so that it can be repeated
@@ -296,8 +296,7 @@ class Localizer:
             return None
         features = ImageFeatures(lambda: query.images[-1], query.newest.camera,
                                  self._keyframes.layer.kind)
-        return ImageRecognizer(self._keyframes, features, deadline, begin_stage,
-                               query.is_thorough)
+        return ImageRecognizer(self._keyframes, features, deadline, begin_stage, query.is_thorough)
 
     def with_free_crops(self, query: Query, row: int, source: CropSource | None,
                         begin_stage: Callable[[str], None] = lambda stage: None) -> Observation:
@@ -391,11 +390,11 @@ class Localizer:
         earlier, looks = list[KeptInstant](), NO_LOOKS
         if not is_alone:
             if query.run != self._run or newest.stamp_ns < self._stamp_ns:
-                self._instants, self._looks, self._filter = [], Looks(), None
+                self._instants, self._looks = [], Looks()
+                self.track = self._accepted = None
             self._run, self._stamp_ns = query.run, newest.stamp_ns
             looks = self._looks
-            earlier, anchor = instants_to_fuse(self._instants, newest, query.limit,
-                                               query.length_s)
+            earlier, anchor = instants_to_fuse(self._instants, newest, query.limit, query.length_s)
             while earlier and sum(len(instant.searched) for instant in earlier) + len(beside) \
                     >= MAX_FRAMES:
                 del earlier[0]
@@ -428,7 +427,7 @@ class Localizer:
         while earlier and sum(len(instant.searched) for instant in earlier) + len(beside) \
                 >= found.frames:
             del earlier[0]  # odometry does not link it
-            self._filter = None
+            self.track = self._accepted = None
         self._instants = [*earlier, KeptInstant((*beside, searched), anchor)]
         if found.map_from_camera is not None and found.evidence is not None:
             self._looks = self._looks.with_look(Look(
@@ -437,20 +436,34 @@ class Localizer:
                 found.evidence.confidence), found.accepted)
         return found
 
-    def covariance_for_filter(self, found: Relocalization) -> NDArray[np.float64] | None:
-        """Return the covariance (6, 6) of the newest result for a filter that fuses all results.
+    def follow(self, found: Relocalization, is_new: bool = False) -> NDArray[np.float64] | None:
+        """Update the track with the newest result, and return its covariance for filters (6, 6).
 
-        Call this once for each accepted result that is passed to the filter. Without odometry, the
-        covariance of the result is returned unchanged.
+        Call this once for each result that is published. With this covariance, a filter may fuse
+        all accepted results as independent measurements. Without odometry, there is no track, and
+        the covariance of the result is returned unchanged.
+
+        Parameters
+        ----------
+        is_new : bool
+            Whether an accepted result begins a new track: the robot may have been carried.
         """
         assert self.query is not None
         odom_from_camera = self.query.newest.odom_from_camera
-        if (self.query.run is None or odom_from_camera is None or found.covariance is None
-                or found.map_from_camera is None):
+        if self.query.run is None or odom_from_camera is None:
+            self.track = None
             return found.covariance
-        given, self._filter = succeed(self._filter, odom_from_camera, found.map_from_camera,
-                                     found.covariance)
-        return given
+        if found.map_from_camera is None or found.covariance is None or found.evidence is None:
+            return None
+        answer = Answered(odom_from_camera, found.map_from_camera, found.covariance,
+                          found.evidence.confidence, found.accepted)
+        self.track = follow(None if is_new and found.accepted else self.track, answer)
+        if not found.accepted:
+            return found.covariance
+        # a filter does not get refused results, so it knows less than the track
+        self._accepted = follow(self._accepted, answer)
+        assert self._accepted is not None
+        return self._accepted.for_filter
 
 
 def repeat(case: Case, localizer: Localizer, crops: CropSource | None = None) -> Relocalization:

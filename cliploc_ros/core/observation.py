@@ -62,8 +62,7 @@ class Detections:
             sound &= (right - left < 3 * width) & (bottom - top < 3 * height)
             sound &= (right - left >= 1.0) & (bottom - top >= 1.0)
         rows = np.nonzero(sound)[0]
-        best = rows[np.argsort(-self.scores[rows], kind='stable')[:limit]]
-        return self.select(np.sort(best))
+        return self.select(np.sort(rows[np.argsort(-self.scores[rows], kind='stable')[:limit]]))
 
 
 @dataclass(frozen=True)

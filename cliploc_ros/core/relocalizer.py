@@ -188,8 +188,7 @@ class TimeBudget:
 
     def _time_s(self, share: float, earlier_s: float) -> float:
         scale = min(1.0, self.total_s / _SHORT_BUDGET_S)
-        frames = min(self.frames, _MOST_FRAMES)
-        return share * self.total_s - scale * earlier_s * frames
+        return share * self.total_s - scale * earlier_s * min(self.frames, _MOST_FRAMES)
 
 
 class Relocalizer:

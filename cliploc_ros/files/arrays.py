@@ -4,15 +4,15 @@
 
 A reader is defined by a table of fields. Files are untrusted: an invalid file causes an error that
 names the file, the array and the row. Pickles are refused, checksums are verified, and no array
-takes more memory than the file declares. Large arrays may be mapped: such a file must be replaced,
-never overwritten.
+takes more memory than the file declares. Large arrays may stay in the file.
 """
 
 import math
-import mmap
 import os
+import weakref
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,8 +29,8 @@ Arrays = Mapping[str, NDArray[Any]]
 # Groups of NumPy types by their kind codes. A field may also name a single NumPy type.
 _KINDS = {'text': 'U', 'numbers': 'fiu', 'floats': 'f', 'integers': 'iu', 'booleans': 'b'}
 _ROWS_AT_ONCE = 10_000
-# A larger array may be mapped; its checksum is verified in blocks of this size.
-_MAPPED_BYTES, _BLOCK_BYTES = 16 * 2**20, 2**20
+# A larger array may stay in the file; its checksum is verified in blocks of this size.
+_STORED_BYTES, _BLOCK_BYTES = 16 * 2**20, 2**20
 # Maximum memory of the arrays: this number of bytes, or this multiple of the file's size on disk.
 # A small or sparse file may declare arrays of any size.
 _MOST_BYTES, _MOST_GROWTH = 512 * 2**20, 8
@@ -76,8 +76,9 @@ class Offsets:
 def _is_not_finite(values: NDArray[Any]) -> NDArray[np.bool_]:
     """Check blocks of rows: their copies as floats take up to eight times the memory."""
     within_row = tuple(range(1, values.ndim))
-    return np.concatenate([~(np.abs(rows.astype(float)) <= _MOST).all(axis=within_row)
-                           for rows in np.array_split(values, len(values) // _ROWS_AT_ONCE + 1)])
+    return np.concatenate([
+        ~(np.abs(values[first:first + _ROWS_AT_ONCE].astype(float)) <= _MOST).all(axis=within_row)
+        for first in range(0, len(values) or 1, _ROWS_AT_ONCE)])
 
 
 FINITE = Check(f'is beyond {_MOST:g} or not finite', _is_not_finite)
@@ -86,6 +87,49 @@ UNIQUE = Check('repeats an id', lambda ids: np.isin(
 BOX = Check('is not in the order left, top, right, bottom',
             lambda boxes: (boxes[:, :2] >= boxes[:, 2:]).any(axis=1))
 SHARE = Check('is outside 0 to 1', lambda shares: (shares < 0) | (shares > 1))
+
+
+class StoredArray:
+    """An array in a file: its rows are read when they are used.
+
+    They are not mapped: a mapped file that is overwritten ends the process.
+    """
+
+    def __init__(self, file: BinaryIO, overwritten: CliplocError, start: int,
+                 shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        self._file, self._overwritten, self._start = os.dup(file.fileno()), overwritten, start
+        self.shape, self.dtype, self.ndim = shape, dtype, len(shape)
+        self._state = self._written()
+        weakref.finalize(self, os.close, self._file)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self.shape[0]
+
+    def __getitem__(self, rows: Any) -> NDArray[Any]:
+        """Read rows, given as a slice or as numbers; error of the schema: it was overwritten."""
+        if not isinstance(rows, slice):
+            first = int(np.min(rows, initial=len(self)))
+            return self[first:int(np.max(rows, initial=first)) + 1][rows - first]
+        first, last, step = rows.indices(len(self))
+        size = self.dtype.itemsize * math.prod(self.shape[1:])
+        with suppress(OSError):  # of a network file system
+            content = os.pread(self._file, size * max(0, last - first), self._start + size * first)
+            if self._written() == self._state:
+                return np.frombuffer(content, self.dtype).reshape(-1, *self.shape[1:])[::step]
+        raise self._overwritten.with_traceback(None)
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> NDArray[Any]:
+        """Read all rows."""
+        return np.asarray(self[:], dtype)
+
+    def __reduce__(self) -> Any:
+        """Copy all rows, for another process."""
+        return np.asarray, (self[:],)
+
+    def _written(self) -> tuple[int, int]:
+        status = os.fstat(self._file)
+        return status.st_size, status.st_mtime_ns
 
 
 @dataclass(frozen=True)
@@ -100,8 +144,7 @@ class Field:
     #: Checks that take the name and all arrays, and raise ArrayError
     checks: tuple[Callable[[str, Arrays], None], ...] = ()
     is_optional: bool = False
-    #: Whether a large array is mapped: its rows are loaded when they are used
-    is_mapped: bool = False
+    is_stored: bool = False  #: Whether a large array stays in the file, see StoredArray
 
 
 @dataclass(frozen=True)
@@ -185,7 +228,9 @@ class Schema:
             with open_file(path) as file, zipfile.ZipFile(file) as archive:
                 for member in archive.infolist():
                     archive.open(member).close()  # a damaged name would hide an array
-                return self._arrays_of(file, archive)
+                return self._arrays_of(file, archive, self.error(
+                    f'{path}: overwritten while it is used: replace it with mv, and load the map '
+                    'again'))
         except ArrayError:
             raise
         except OSError as error:
@@ -193,7 +238,8 @@ class Schema:
         except Exception as error:  # zipfile may raise any exception for a damaged file
             raise ArrayError(f'is not a complete npz file ({error})') from error
 
-    def _arrays_of(self, file: BinaryIO, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
+    def _arrays_of(self, file: BinaryIO, archive: zipfile.ZipFile, overwritten: CliplocError
+                   ) -> dict[str, NDArray[Any]]:
         members = {member.filename.removesuffix('.npy'): member for member in archive.infolist()
                    if member.filename.endswith('.npy')}
         for name, entry in self.fields.items():
@@ -212,16 +258,17 @@ class Schema:
         for name, member in wanted.items():
             try:
                 arrays[name] = _array(
-                    archive, member, file.fileno() if self.fields[name].is_mapped else None)
+                    archive, member, (file, overwritten) if self.fields[name].is_stored else None)
             except Exception as error:  # NumPy and zipfile may raise any exception, see above
                 raise ArrayError(f'array {name} cannot be read: {error}') from error
         return arrays
 
 
-def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, mapped: int | None) -> Any:
+def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo,
+           stored: tuple[BinaryIO, CliplocError] | None) -> Any:
     """Read an array of a file; it takes no more memory than the archive declares.
 
-    A large array is mapped if the file's descriptor is given.
+    A large array stays in the file if the file and its error are given, see StoredArray.
     """
     with archive.open(member) as stream:
         version = np.lib.format.read_magic(stream)
@@ -233,15 +280,15 @@ def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, mapped: int | None
             raise ValueError('it contains Python objects')
         if size != expected:
             raise ValueError(f'it has {size} bytes, expected {expected}')
-        if mapped is not None and size > _MAPPED_BYTES and not (
+        if stored is not None and size > _STORED_BYTES and not (
                 is_by_columns or member.compress_type):
             # the values follow the local header (30 bytes and two texts) and that of NumPy
-            lengths = np.frombuffer(os.pread(mapped, 4, member.header_offset + 26), '<u2')
+            lengths = np.frombuffer(os.pread(
+                stored[0].fileno(), 4, member.header_offset + 26), '<u2')
             start = member.header_offset + 30 + int(lengths.sum()) + stream.tell()
             while stream.read(_BLOCK_BYTES):
                 pass  # the last block verifies the checksum
-            content = memoryview(mmap.mmap(mapped, 0, access=mmap.ACCESS_READ))
-            return np.frombuffer(content, dtype, math.prod(shape), start).reshape(shape)
+            return StoredArray(*stored, start, shape, dtype)
         stream.seek(0)
         array = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
     return np.char.decode(array, 'utf-8') if array.dtype.kind == 'S' else array

@@ -149,10 +149,10 @@ class Doctor(RelocalizerNode):
                              f'{len(keyframes.localizer.layer if keyframes else ())} of {file}')
         has_frame = self._check_inputs(parameters, patience_s, report)
         if parameters.require_localizer:
-            report.judge('localizer', self._handoff.missing() if parameters.base_frame else
-                         'base_frame is empty: initialpose would carry the pose of the camera: '
-                         "set it to AMCL's base_frame_id", 'it subscribes to initialpose, and '
-                         f'publishes {parameters.localizer_pose or "nothing that is checked"}')
+            report.judge('localizer', 'base_frame is empty: initialpose would carry the pose of '
+                         "the camera: set it to AMCL's base_frame_id" if not parameters.base_frame
+                         else self._handoff.localizer.missing(), 'it subscribes to initialpose, '
+                         f'and publishes {self._handoff.localizer.pose_topic or "no pose, or tf"}')
         if localizer is None or not has_frame:
             return report.add('pose', State.NOT_CHECKED, 'it needs a map and a frame')
         answer = self._requests.answer()

@@ -30,7 +30,8 @@ from cliploc_ros.errors import CliplocError, MapError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer
-from cliploc_ros.ros.handoff import HandOff, MapToOdom
+from cliploc_ros.ros.handoff import HandOff
+from cliploc_ros.ros.inputs.coordinate_frames import MapToOdom
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
@@ -38,7 +39,7 @@ from cliploc_ros.ros.inputs.stamps import TimeJumps
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode, run_node
 from cliploc_ros.ros.node.threads import MAX_REQUESTS, BoundedCallbackGroup, LatestOnly
-from cliploc_ros.ros.parameters import DetectorParameters, RelocalizerParameters, path_of
+from cliploc_ros.ros.parameters import AUTO, DetectorParameters, RelocalizerParameters, path_of
 from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.ros.watch import Watcher
 
@@ -74,9 +75,9 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
             self.facts['topics'] = ' '.join(
                 f'{name}:={qos.resolved(self, name)}' for name in (
                     *(topic for source in sources for topic in source.topics.values()),
-                    *_OTHER_TOPICS, parameters.localizer_pose) if name)
+                    *_OTHER_TOPICS, parameters.localizer_pose) if name not in ('', AUTO))
         self._handoff = HandOff(self, self._robot.odometry, self._robot.transforms)
-        self._handoff.on_shown(self._robot.prior.follow)
+        self._handoff.localizer.listeners.append(self._robot.prior.follow)
         self._cases = CaseRecorder(bool(parameters.record_folder))
         self._requests = Requests(self, self._frames, self._robot, self._jumps, self._pipeline,
                                   self._cases, self._handoff if delivers else None)
@@ -118,7 +119,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
     def open(self) -> None:
         """Accept requests; in continuous mode subscribe to frames."""
         parameters = self.settings.values
-        self._handoff.open(parameters.localizer_pose)
+        self._handoff.open(parameters)
         self._robot.open()
         if parameters.publish_tf:
             self._map_to_odom.open()
@@ -148,7 +149,7 @@ class RelocalizerNode(ManagedNode[RelocalizerParameters]):
         """Report the inputs and the last verdict."""
         parameters = self.settings.values
         missing = [line for source in self._frames.sources.values() for line in source.missing()]
-        if parameters.require_localizer and (no_localizer := self._handoff.missing()):
+        if (no_localizer := self._handoff.localizer.missing()) and parameters.require_localizer:
             missing.append(no_localizer)
         self._frames.examine(health, parameters.stale_after_s)
         self._robot.examine(health)

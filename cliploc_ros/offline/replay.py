@@ -22,14 +22,8 @@ from rosgraph_msgs.msg import Clock
 
 from cliploc_ros.command import Interruption
 from cliploc_ros.errors import DatasetError
+from cliploc_ros.offline.datasets import bags
 from cliploc_ros.offline.datasets.bag_messages import COMPRESSED_IMAGE, IMAGE, ODOMETRY, stamp_ns
-from cliploc_ros.offline.datasets.bags import (
-    BagMessage,
-    BagReader,
-    BagTopic,
-    deserialize,
-    typestore,
-)
 from cliploc_ros.units import NS_PER_S
 
 CLOCK_TOPIC = '/clock'
@@ -78,7 +72,7 @@ class Player:
     has another definition.
     """
 
-    def __init__(self, node: Node, reader: BagReader, options: PlayOptions,
+    def __init__(self, node: Node, reader: bags.BagReader, options: PlayOptions,
                  stop: Interruption) -> None:
         self._reader, self._options, self._stop = reader, options, stop
         self.topics, self.without_type = _select_topics(reader, options)
@@ -113,7 +107,7 @@ class Player:
                 return
         self._stop.wait(_DISCOVERY_S)
 
-    def play(self, on_message: Callable[[BagMessage], None] = lambda message: None
+    def play(self, on_message: Callable[[bags.BagMessage], None] = lambda message: None
              ) -> Counter[str]:
         """Publish the messages, each at its time; return their number by recorded topic.
 
@@ -186,8 +180,8 @@ class Player:
         return counts
 
 
-def with_stands(messages: Iterable[BagMessage], topics: Mapping[str, BagTopic],
-                stand_s: float) -> Iterator[BagMessage]:
+def with_stands(messages: Iterable[bags.BagMessage], topics: Mapping[str, bags.BagTopic],
+                stand_s: float) -> Iterator[bags.BagMessage]:
     """Let the robot of a recording stand for a time, at an image after every DRIVE_NS.
 
     A robot that drives is not relocalized. While it stands, the newest message of each topic with
@@ -197,16 +191,17 @@ def with_stands(messages: Iterable[BagMessage], topics: Mapping[str, BagTopic],
     DatasetError: a message does not fit its type.
     """
     newest: dict[tuple[str, str], Any] = {}
-    late_ns, stop_ns, store = 0, 0, typestore()
+    late_ns, stop_ns, store = 0, 0, bags.typestore()
     for message in messages:
         kind = topics[message.topic].msgtype
         stop_ns = stop_ns or message.stamp_ns + DRIVE_NS
-        content = deserialize(message.data, kind, message.topic) if kind in store.types else None
+        content = None if kind not in store.types else bags.deserialize(message.data, kind,
+                                                                        message.topic)
         stamped = getattr(content, 'transforms', [content] if hasattr(content, 'header') else [])
         for part in stamped:
             _set_stamp(part, stamp_ns(part) + late_ns)
             newest[message.topic, getattr(part, 'child_frame_id', '')] = part
-        yield BagMessage(message.topic, message.stamp_ns + late_ns,
+        yield bags.BagMessage(message.topic, message.stamp_ns + late_ns,
                          bytes(store.serialize_cdr(content, kind)) if stamped else message.data)
         if message.stamp_ns < stop_ns or kind not in (IMAGE, COMPRESSED_IMAGE):
             continue
@@ -220,7 +215,7 @@ def with_stands(messages: Iterable[BagMessage], topics: Mapping[str, BagTopic],
                     for speed in (part.twist.twist.linear, part.twist.twist.angular):
                         speed.x = speed.y = speed.z = 0.0
                 whole = store.types[kind](transforms=[part]) if is_transform else part
-                yield BagMessage(topic, message.stamp_ns + late_ns,
+                yield bags.BagMessage(topic, message.stamp_ns + late_ns,
                                  bytes(store.serialize_cdr(whole, kind)))
         # messages of the time of the image may still follow
         late_ns, stop_ns = late_ns + _STAND_NS, message.stamp_ns + DRIVE_NS
@@ -230,8 +225,8 @@ def _set_stamp(message: Any, stamp_ns: int) -> None:
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NS_PER_S)
 
 
-def _select_topics(reader: BagReader, options: PlayOptions
-                   ) -> tuple[list[BagTopic], list[BagTopic]]:
+def _select_topics(reader: bags.BagReader, options: PlayOptions
+                   ) -> tuple[list[bags.BagTopic], list[bags.BagTopic]]:
     """Return the topics to play, and those whose types are not installed.
 
     DatasetError: a named topic is not recorded, its type is missing, or there is nothing to play.
@@ -259,7 +254,7 @@ def _select_topics(reader: BagReader, options: PlayOptions
     return playable, lacking
 
 
-def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
+def create_publisher(node: Node, topic: bags.BagTopic, name: str) -> Publisher:
     """Make a publisher with the recorded QoS; ROS may still remap its name.
 
     DatasetError: the type is not installed, or differs from the recorded one.
@@ -276,7 +271,7 @@ def create_publisher(node: Node, topic: BagTopic, name: str) -> Publisher:
     return publisher
 
 
-def message_class(topic: BagTopic) -> Any:
+def message_class(topic: bags.BagTopic) -> Any:
     """Return the installed class of a topic's messages.
 
     DatasetError: the type is not installed; the message names the package.

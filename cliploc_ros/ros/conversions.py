@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, Transform
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 from vision_msgs import msg as vision
@@ -54,6 +54,12 @@ def pose_from_msg(msg: Pose) -> NDArray[np.float64] | None:
             np.linalg.norm(quat_xyzw) - 1.0) < _UNIT_TOLERANCE:
         return None
     return transform_from_pose(position, quat_xyzw)
+
+
+def matrix_from_msg(msg: Transform) -> NDArray[np.float64]:
+    """Return a transform of tf2 as (4, 4)."""
+    t, q = msg.translation, msg.rotation
+    return transform_from_pose(np.array([t.x, t.y, t.z]), np.array([q.x, q.y, q.z, q.w]))
 
 
 def pose_to_msg(parent_from_child: NDArray[np.float64]) -> Pose:

@@ -26,7 +26,7 @@ from cliploc_ros.core.kernels.compiled import KernelCache
 from cliploc_ros.core.keyframes.layer import layer_hash, layer_path, load_layers
 from cliploc_ros.core.keyframes.localization import KeyframeLocalizer
 from cliploc_ros.core.localizer import Localizer, by_classes, can_do_without_crops
-from cliploc_ros.core.map.joined_map import join_maps, parts_of
+from cliploc_ros.core.map.joined_map import join_maps, parts_of, place_of
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.observation import Observation
 from cliploc_ros.core.options import RelocalizerOptions
@@ -72,9 +72,11 @@ class Localized(NamedTuple):
     landmark_map: LandmarkMap
     #: The image, the compared crops and their similarities to this map.
     seen: SeenImage
-    #: Covariance (6, 6) for a filter that fuses all accepted poses. In continuous mode it covers
-    #: only the new information, see cliploc_ros.core.localizer.
+    #: Covariance (6, 6) for a filter that fuses all accepted poses, see Localizer.follow.
     for_filter: NDArray[np.float64] | None
+    #: (4, 4): the camera by all answers and odometry, see Localizer.track; without odometry, by
+    #: this accepted answer. None if it is unknown, in doubt or in another map.
+    carried: NDArray[np.float64] | None
     #: Names of cameras without a frame, or with a frame of another run of odometry.
     left_out: tuple[str, ...]
     query: Query  #: Reproduces the answer
@@ -102,6 +104,7 @@ class FrameLocalizer:
         #: The map, or all maps joined, and the coordinate frames of the maps
         self.landmark_map = landmark_map
         self.frame_ids = [part.landmark_map.frame_id for part in parts_of(landmark_map)]
+        self.grids: dict[str, str] = {}  #: File of Nav2's grid of each of these frames
         self.observer = observer
         self.instants = Instants(landmark_map, options.matching != 'clip')
         self._options, self.watch = options, Watch(relocalizer)
@@ -135,18 +138,24 @@ class FrameLocalizer:
         found = self.answer(query, parameters.options(), times, deadline)
         assert self.localizer.query is not None
         query, seen = self.localizer.query, self.localizer.query.newest
-        # the result of a request that is late is not published, and must not advance the filter
-        for_filter = self.localizer.covariance_for_filter(found) if (
-            found.accepted and parameters.mode == 'continuous'
-            and time.monotonic() < deadline) else found.covariance
+        for_filter = found.covariance
+        # the result of a request that is late is not published, and must not advance the track
+        if time.monotonic() < deadline:
+            added = self.localizer.follow(found, not math.isinf(deadline))
+            for_filter = added if parameters.mode == 'continuous' else for_filter
         found, own = in_its_map(self.instants.explained(found), self.landmark_map)
+        track, carried = self.localizer.track, found.map_from_camera if found.accepted else None
+        if track is not None:
+            place = place_of(self.landmark_map, track.map_from_camera)
+            carried = place.map_from_camera if track.contradicting is None \
+                and place.part.landmark_map is own.landmark_map else None
         if seen.similarities is not None and len(self.frame_ids) > 1:
             seen = replace(seen, similarities=np.asarray(seen.similarities)[
                 :, own.first:own.first + len(own.landmark_map)])
         names = [camera_frame.camera_name for camera_frame in query.frames]
         layer = None if self.keyframes is None else self.keyframes.localizer.layer
         return Localized(
-            found, own.landmark_map, SeenImage(query.images[-1], seen, layer), for_filter,
+            found, own.landmark_map, SeenImage(query.images[-1], seen, layer), for_filter, carried,
             (*frame.left_out, *(beside.camera for beside, _ in known.beside
                                             if beside.camera not in names)), query)
 
@@ -354,7 +363,11 @@ def load_localizer(node: Node, parameters: RelocalizerParameters,
         else:
             observer = Observer(*load_encoder_for_map(*asked))
             observer.measure()
-    return FrameLocalizer(landmark_map, observer, relocalizer, options, map_hash, keyframes)
+    localizer = FrameLocalizer(landmark_map, observer, relocalizer, options, map_hash, keyframes)
+    localizer.grids = {part.frame_id: str(Path(file).absolute().parent / part.nav2_map)
+                       for (part, *_), file in zip(parts_of(landmark_map), files, strict=False)
+                       if part.nav2_map}
+    return localizer
 
 
 def layer_paths(parameters: RelocalizerParameters) -> list[Path]:

@@ -19,6 +19,8 @@ from cliploc_ros.models.protocols import PROFILE_NAMES
 from cliploc_ros.ros.conversions import DETECTION_TYPES, TAG_TYPES
 from cliploc_ros.ros.node.parameters import Parameters, parameter
 
+#: Value of localizer_pose that looks for the localizer
+AUTO = 'auto'
 _FILE, _PACKAGE = 'file://', 'package://'
 # Share of timeout_s that algorithms other than auto may search.
 _SEARCH_SHARE = 0.5
@@ -220,12 +222,12 @@ class RelocalizerParameters(CommonParameters):
     require_localizer: bool = parameter(True,
         'A request succeeds only if a localizer such as AMCL takes its pose; false: no localizer '
         'is needed.')
-    localizer_pose: str = parameter('amcl_pose',
-        "Topic of the localizer's pose, which must agree with initialpose; empty: any subscriber "
-        'of initialpose suffices.', read_only=True)
+    localizer_pose: str = parameter(AUTO,
+        "Topic of the localizer's pose, which must agree with initialpose; 'auto': found, or in "
+        'tf; empty: any subscriber of initialpose suffices.', read_only=True)
     publish_tf: bool = parameter(False,
-        'Broadcast map -> odom_frame (REP 105) after an accepted pose. It pauses while another '
-        'node broadcasts it.', read_only=True)
+        'Broadcast map -> odom_frame (REP 105) by all poses and odometry. It pauses while another '
+        'node broadcasts it, and while poses contradict each other.', read_only=True)
     odom_frame: str = parameter('odom', 'Coordinate frame of odometry, for publish_tf.')
     watch: str = parameter('none',
         "Check the localizer's pose continuously: map -> base_frame in tf2, or the topic "

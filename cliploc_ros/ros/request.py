@@ -18,13 +18,13 @@ from std_msgs.msg import Header
 
 from cliploc_ros.core.acceptance.verdict import RefusalKind
 from cliploc_ros.core.geometry.transforms import move_covariance
-from cliploc_ros.errors import CliplocError, TimeUpError
+from cliploc_ros.errors import CliplocError, HandOffError, NoLocalizerError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict, answer_to
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
-from cliploc_ros.ros.handoff import HandOff, HandOffError, MapToOdom, NoLocalizerError
-from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
+from cliploc_ros.ros.handoff import HandOff
+from cliploc_ros.ros.inputs.coordinate_frames import MapToOdom, NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
@@ -142,16 +142,20 @@ class Pipeline:
         self._node.check_active()
         self._jumps.check(image.stamp, answer.received_at)
         assert header is not None
+        parameters, carried = self._node.settings.snapshot(), localized.carried
+        try:
+            if carried is not None:
+                self._map_to_odom.update(
+                    header, carried @ state.camera_from_base, replace(
+                        parameters, tf_timeout_s=min(parameters.tf_timeout_s, max(
+                            0.0, deadline - time.monotonic()))), answer.received_at)
+            elif pose is not None:
+                self._map_to_odom.pause()
+        except NoTransformError as error:
+            answer = answer.withheld(f'publish_tf: {error}') if pose is not None else answer
         if pose is not None:
             assert found.map_from_camera is not None and localized.for_filter is not None
-            parameters = self._node.settings.snapshot()
-            parameters = replace(parameters, tf_timeout_s=min(
-                parameters.tf_timeout_s, max(0.0, deadline - time.monotonic())))
             map_from_base = found.map_from_camera @ state.camera_from_base
-            try:
-                self._map_to_odom.update(header, map_from_base, parameters, answer.received_at)
-            except NoTransformError as error:
-                answer = answer.withheld(f'publish_tf: {error}')
             self._pose.publish(pose_with_covariance_msg(header, map_from_base, move_covariance(
                 localized.for_filter, map_from_base[:3, 3] - found.map_from_camera[:3, 3])))
             self._robot.prior.keep(pose, parameters, answer.map_hash)
@@ -269,7 +273,8 @@ class Requests:
             return answer, True
         try:
             self._handoff.hand_over(answer.pose, self._node.settings.snapshot(), deadline,
-                                    answer.received_at, self._jumps)
+                                    answer.received_at, self._jumps,
+                                    getattr(self._pipeline.localizer, 'grids', {}))
         except HandOffError as error:
             return answer.withheld(str(error)), not isinstance(error, NoLocalizerError)
         return answer, False

@@ -25,13 +25,12 @@ from std_msgs.msg import Bool, Header, String
 
 from cliploc_ros.core.fit.verification import MAX_FRAMES
 from cliploc_ros.core.geometry.transforms import SAME_SPOT, invert_transform, is_rigid
-from cliploc_ros.core.map.joined_map import parts_of
 from cliploc_ros.core.watch.watch import WatchReport, WatchState
-from cliploc_ros.errors import CliplocError, StoppedError, TimeUpError
+from cliploc_ros.errors import CliplocError, HandOffError, StoppedError, TimeUpError
 from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer
 from cliploc_ros.ros.conversions import pose_from_msg, stamp_ns
-from cliploc_ros.ros.handoff import HandOff, HandOffError, not_one_publisher, silence_of_localizer
+from cliploc_ros.ros.handoff import HandOff
 from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
@@ -40,6 +39,7 @@ from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps, stamp_proble
 from cliploc_ros.ros.node.diagnostics import Health, join_names
 from cliploc_ros.ros.node.lifecycle import ManagedNode
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.receivers import RunningLocalizer
 from cliploc_ros.ros.request import Pipeline, Requests
 from cliploc_ros.units import NS_PER_S
 
@@ -94,7 +94,7 @@ class Watcher:
         self._pipeline, self._requests, self._handoff = pipeline, requests, handoff
         self._relocalize = relocalize
         self.is_on = node.settings.values.watch != 'none'
-        self._pose = LocalizerPose(node, robot)
+        self._pose = LocalizerPose(node, robot, handoff.localizer)
         self._lock = threading.Lock()
         self._known = _Known()
         self._stopped = threading.Event()
@@ -111,7 +111,7 @@ class Watcher:
         self._image_stamp, self._had_pose = Time(), False
         self._pause_s, self._next_request_at = _FIRST_PAUSE_S, 0.0
         if self.is_on:
-            handoff.on_shown(self._pose.hear)
+            handoff.localizer.listeners.append(self._pose.hear)
             pipeline.on_map = lambda: self._drop('a map was loaded')
             robot.odometry.on_restart(lambda _: self._drop('odom restarted'))
             self._localized = node.create_publisher(Bool, '~/localized', qos.LATCHED)
@@ -184,7 +184,7 @@ class Watcher:
                     self._miss(stopped, str(error))
                     # the localizer has no pose, but had one before: it was restarted
                     if self._node.settings.values.on_lost != 'report' and self._had_pose \
-                            and not self._handoff.missing():
+                            and not self._handoff.localizer.missing():
                         self._relocalize_at_rest(stopped, self._image_stamp,
                                                  'the localizer has no pose')
                 else:  # relocalize a lost robot at rest if on_lost asks for it
@@ -231,8 +231,8 @@ class Watcher:
                              fuse_frames=MAX_FRAMES)
         state = self._robot.at(image, parameters, depth_frame=frame.depth_frame,
                                info=frame.camera_info)
-        pose = self._pose.at(image, state, parameters, [
-            part.landmark_map.frame_id for part in parts_of(localizer.landmark_map)])
+        floors = self._handoff.floors.loaded
+        where, pose = self._pose.at(image, state, parameters, [*floors, *localizer.frame_ids])
         self._had_pose = True
 
         def score() -> WatchReport | None:
@@ -242,7 +242,7 @@ class Watcher:
                 return None
             begun_s = time.thread_time()
             try:
-                return localizer.look(frame, parameters, state, *pose)
+                return localizer.look(frame, parameters, state, floors.get(where, where), pose)
             finally:
                 self._cost_s = time.thread_time() - begun_s
         report = self._node.worker.run(score, begun_at + _STALE_S)
@@ -368,10 +368,8 @@ class LocalizerPose:
     All methods except `hear` and `forget` run in one thread.
     """
 
-    def __init__(self, node: Node, robot: RobotStateSource) -> None:
-        self._node = node
-        self._robot = robot
-        self._topic = ''
+    def __init__(self, node: Node, robot: RobotStateSource, localizer: RunningLocalizer) -> None:
+        self._node, self._robot, self._localizer = node, robot, localizer
         self.forget()
 
     def forget(self) -> None:
@@ -382,7 +380,8 @@ class LocalizerPose:
 
     def hear(self, shown: PoseWithCovarianceStamped) -> None:
         """Store a pose that the localizer published."""
-        publishers = self._node.get_publishers_info_by_topic(self._topic) if self._topic else []
+        topic = self._localizer.pose_topic
+        publishers = self._node.get_publishers_info_by_topic(topic) if topic else []
         self._shown_by = bytes(publishers[0].endpoint_gid) if len(publishers) == 1 else None
         self._shown = shown
 
@@ -420,10 +419,12 @@ class LocalizerPose:
 
     def _by_topic(self, image: Header, state: RobotState, parameters: RelocalizerParameters
                   ) -> tuple[str, NDArray[np.float64]]:
-        topic = self._topic = self._node.resolve_topic_name(parameters.localizer_pose)
-        publishers = self._node.get_publishers_info_by_topic(topic)
-        if problem := not_one_publisher(topic, publishers):
+        if problem := self._localizer.find():
             raise NoLocalizerPoseError(problem)
+        topic = self._localizer.pose_topic
+        publishers = self._node.get_publishers_info_by_topic(topic) if topic else []
+        if not publishers:
+            raise NoLocalizerPoseError('the localizer publishes no pose: set watch: tf')
         publisher = bytes(publishers[0].endpoint_gid)
         self._shown_by = self._shown_by or publisher
         if self._shown_by != publisher:
@@ -461,5 +462,5 @@ class LocalizerPose:
         if place.way_m - anchor.way_m > _SILENT_WAY_M:
             raise NoLocalizerPoseError(
                 f'no message on {topic} for {place.way_m - anchor.way_m:.1f} m of driving: '
-                f'{silence_of_localizer(self._node)}')
+                f'{self._localizer.silence()}')
         return frame_id, anchor.map_from_odom @ place.odom_from_frame

@@ -87,6 +87,8 @@ def run(arguments: list[str]) -> int:
     parser.add_argument('--out', type=Path, default=Path('demo_compare'), metavar='DIR')
     parser.add_argument('--trials', type=int, default=5, help='number of seeds (%(default)s)')
     parser.add_argument('--iterations', type=int, default=500, help="the paper's %(default)s")
+    parser.add_argument('--every', type=int, default=1, metavar='N',
+                        help='ask for the pose of each N-th image (%(default)s)')
     parser.add_argument('--budget', type=float, default=2.0, metavar='S',
                         help='time limit of a search [s] (%(default)s), which some exhaustive '
                         'searches reach')
@@ -102,7 +104,7 @@ def run(arguments: list[str]) -> int:
     print(f'detector: mAP50 {score_detector(ASSETS / "sequence"):.3f}; CLIP: top-1 {first:.3f}, '
           f'top-3 {third:.3f} of {count} detected objects, {len(landmark_map)} labels\n')
     paper = RelocalizerOptions(iterations=options.iterations, time_budget_s=options.budget)
-    compare_methods(landmark_map, make_queries(queries, landmark_map),
+    compare_methods(landmark_map, make_queries(queries, landmark_map)[::options.every],
                     parse_methods(['all', 'auto'], paper, len(landmark_map)), options.out,
                     trials=options.trials, workers=options.workers)
     return 0

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from cliploc_ros.command import interrupt_on_sigterm, positive_int, run_command
+from cliploc_ros.command import interrupt_on_sigterm, not_negative, positive_int, run_command
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.files.parallel import run_tasks
 from studies.keyframes import verdicts
@@ -37,7 +37,8 @@ def _collect(options: argparse.Namespace) -> int:
         raise OptionsError('--sites: give two or more; each needs images of another site')
     chosen = [place for place in places if any(text in place.name for text in options.places)]
     names = [name for name in cases() if name.partition(':')[0] in options.families]
-    work = partial(make_collect, options.out, places, options.queries)
+    work = partial(make_collect, options.out, places, options.queries,
+                   options.stale)
     for tasks in (product(chosen, ['']),  # built once, before several workers need it
                   ((place, name) for name, place in product(names, chosen))):
         for _ in tqdm(run_tasks(work, tasks, workers=options.workers), unit='case', disable=None):
@@ -108,6 +109,9 @@ def main() -> int:
     collects.add_argument('--model', required=True, help='weights of YOLO for real images')
     collects.add_argument('--queries', type=positive_int, default=24, metavar='N',
                           help='most queries of a case, except the plain case (%(default)s)')
+    collects.add_argument('--stale', type=not_negative, default=0.0, metavar='M',
+                          help='in all cases, everything on one side of an upright plane is this '
+                               'far from its place in map and layer [m] (%(default)g)')
     fits = commands.add_parser('fit', parents=[common], help='fit and print the coefficients')
     fits.set_defaults(command=_fit)
     judges = commands.add_parser('judge', parents=[common], help='judge records, and print tables')

@@ -47,6 +47,7 @@ from studies.keyframes.cases import (
     World,
     cases,
     make_query,
+    moved_half,
 )
 from studies.rooms.rooms import Looker, frames_of_raws, keep, open_folder, posed
 
@@ -117,11 +118,12 @@ def localize(landmark_map: LandmarkMap, options: RelocalizerOptions,
     return found
 
 
-def make_collect(out: Path, places: Sequence[Place], queries: int
+def make_collect(out: Path, places: Sequence[Place], queries: int, stale_m: float
                  ) -> Callable[[tuple[Place, str]], None]:
     """Return a function that collects the records of a case at a place; '' only builds the place.
 
-    The plain case uses all images, other cases at most ``queries``.
+    The plain case uses all images, other cases at most ``queries``. Before the change of the case,
+    half of the place moves by ``stale_m``, see moved_half.
     """
     import torch
 
@@ -136,6 +138,10 @@ def make_collect(out: Path, places: Sequence[Place], queries: int
         if not name:
             return
         case, key = cases()[name], zlib.crc32(f'{place.name} {name}'.encode())
+        if stale_m:
+            world = moved_half(stale_m, world, np.random.default_rng(
+                zlib.crc32(place.name.encode())))
+            case = replace(case, truths=case.truths if case.world else (0, 1))
         if case.world is not None:
             world = case.world(world, np.random.default_rng(key))
         path = out / 'cases' / place.name.replace('/', '.') / f'{name}.pickle'
@@ -145,7 +151,7 @@ def make_collect(out: Path, places: Sequence[Place], queries: int
         localizer = KeyframeLocalizer(world.layer)
         # a run with more queries includes those of a run with fewer
         order = np.random.default_rng(0).permutation(len(place.asked)).tolist()
-        for number in order if case == Case() else order[:queries]:
+        for number in order if cases()[name] == Case() else order[:queries]:
             rng = np.random.default_rng([key, number])
             query = None if number in records else make_query(
                 case, place, [*others.values()], place.asked[number], world.shift_m, rng)

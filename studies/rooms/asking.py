@@ -126,8 +126,8 @@ def make_ask(folders: Sequence[str], reading: RoomOptions, options: AskOptions
             if other.name != room.name:
                 some = rng.permutation(len(other))[:options.elsewhere]
                 # all of these should be refused
-                found += [_outcome(task, other, other.queries[row], way, known, landmark_map,
-                                   keyframes)
+                found += [outcome_of(task, other, other.queries[row], way, known, landmark_map,
+                                     keyframes)
                           for row in some for way, known in product(WAYS[:3], options.known)
                           if known == NOTHING or (known == VERTICAL and other.has_poses)]
         return [Answers(task, len(landmark_map), len(layer or ()), tuple(found))]
@@ -141,7 +141,7 @@ def _ask_here(task: Task, names: Sequence[str], room: Room, landmark_map: Landma
     for way, known in product((OBJECTS, BOTH, KEYFRAMES), names):
         if known not in (NOTHING, VERTICAL) and (way == KEYFRAMES or not room.has_depth):
             continue
-        yield _outcome(task, room, query, way, known, landmark_map, keyframes)
+        yield outcome_of(task, room, query, way, known, landmark_map, keyframes)
     if baseline is not None:
         image_rgb, camera = room.raws[query.number].color()
         pose = baseline.locate(image_rgb, camera)
@@ -152,8 +152,8 @@ def _ask_here(task: Task, names: Sequence[str], room: Room, landmark_map: Landma
                       confidence=0.0, source=BASELINE, reason='', boxes=0, inliers=0, **errors)
 
 
-def _outcome(task: Task, asked: Room, query: PosedQuery, way: str, known: str,
-             landmark_map: LandmarkMap, keyframes: KeyframeLocalizer | None) -> Outcome:
+def outcome_of(task: Task, asked: Room, query: PosedQuery, way: str, known: str,
+               landmark_map: LandmarkMap, keyframes: KeyframeLocalizer | None) -> Outcome:
     """Ask an independent question: without evidence of earlier images about the camera.
 
     The relocalizer is asked, not a localizer, because the features of the images are stored.

@@ -143,11 +143,16 @@ class Room:
     @cached_property
     def by_robot(self) -> 'Room':
         """Return the room as seen by another camera: a part of each image at less resolution."""
-        raws = tuple(replace(raw, color=partial(_robot_view, raw.color), depth=None)
-                     for raw in self.raws)
+        return self.changed(_robot_view, 'robot')
+
+    def changed(self, change: Callable[[Image, Camera], tuple[Image, Camera]], name: str,
+                keeps_depth: bool = False) -> 'Room':
+        """Return the room with changed images; the name is that of the change."""
+        raws = tuple(replace(raw, color=partial(_changed, change, raw.color),
+                             depth=raw.depth if keeps_depth else None) for raw in self.raws)
         frames = frames_of_raws(self.frames.source, raws)
         return replace(self, frames=frames, raws=raws, **_seen(
-            frames, raws, self.options, f'{self.name}.robot'))
+            frames, raws, self.options, f'{self.name}.{name}'))
 
     @cached_property
     def queries(self) -> tuple[PosedQuery, ...]:
@@ -239,10 +244,13 @@ def _seen(frames: Frames, raws: tuple[RawFrame, ...], options: RoomOptions, name
             'features': tuple(KeptFeatures(looker, raw) for raw in raws)}
 
 
-def _robot_view(color: Callable[[], tuple[Image, Camera]]
-                ) -> tuple[Image, Camera]:
+def _changed(change: Callable[[Image, Camera], tuple[Image, Camera]],
+             color: Callable[[], tuple[Image, Camera]]) -> tuple[Image, Camera]:
+    return change(*color())
+
+
+def _robot_view(image_rgb: Image, camera: Camera) -> tuple[Image, Camera]:
     """Return a part of an image, and its camera."""
-    image_rgb, camera = color()
     columns, rows = round(_ROBOT_SHARE * camera.width), round(_ROBOT_SHARE * camera.height)
     left, top = round(0.7 * (camera.width - columns)), round(0.4 * (camera.height - rows))
     scale = _ROBOT_PX / columns

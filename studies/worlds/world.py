@@ -155,8 +155,11 @@ class Drive:
     wrong: NDArray[np.bool_]
 
 
-def make_drive(kind: str, seed: int, images: int, changed: float = 0.0) -> Drive:
+def make_drive(kind: str, seed: int, images: int, changed: float = 0.0, stands: bool = False
+               ) -> Drive:
     """Return a world and a drive through it, after a share of its objects changed.
+
+    A robot that stands takes all images at the first pose of the drive.
 
     Half of these objects are removed, the others are elsewhere in the place.
 
@@ -170,7 +173,8 @@ def make_drive(kind: str, seed: int, images: int, changed: float = 0.0) -> Drive
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     place, scene = _make_scene(kind, rng)
     camera, (of_changes, of_looks) = make_camera(rng), rng.spawn(2)
-    poses = drive_about(place, scene.objects, images, rng)
+    poses = drive_about(place, scene.objects, 1 if stands else images, rng)
+    poses = np.repeat(poses, images // len(poses), axis=0)
     count = len(scene.objects.class_ids)
     rows = of_changes.permutation(count)[:round(changed * count)]
     centers = scene.objects.centers.copy()

@@ -34,7 +34,7 @@ PAGES = [PROJECT / page for page in ('doc/first_relocalization.md', 'README.md',
 # Commands for another robot or recording, or for a network that has to be downloaded.
 OTHER = {'--cameras', '--update', '--observations', '--colmap', '--queries', '--keyframe-features'}
 MOUNT = mount_from_numbers([0.1, 0.0, 0.4, -0.5, 0.5, -0.5, 0.5])
-FEW = ('--positions', '4', '--headings', '2', '--frames', '10')
+FEW = ('--positions', '2', '--headings', '2', '--frames', '4')
 WHOLE = [pytest.param(name, marks=FULL) for name in ('rendered', 'real')]
 BOTH = pytest.mark.parametrize('drive', WHOLE, indirect=True)
 
@@ -68,7 +68,7 @@ def drive(request, tmp_path_factory):
         write_drive(folder / 'drive', ASSETS / 'mapping', 3)
         found, more = {'model': ASSETS / 'yolo.onnx'}, ['--no-clip', '--no-check']
     elif request.param == 'rendered':
-        write_drive(folder / 'drive', ASSETS / 'mapping', 1)
+        write_drive(folder / 'drive', ASSETS / 'mapping', 2)
         found, more = {'model': ASSETS / 'yolo.onnx', 'clip_pretrained': ASSETS / 'clip'}, []
     else:
         shared = request.getfixturevalue('shared_data')

@@ -13,7 +13,7 @@ from cliploc_ros.offline.evaluation import trials
 from cliploc_ros.offline.evaluation.methods import Method
 from cliploc_ros.offline.evaluation.summary import summarize
 
-pytestmark = pytest.mark.full
+pytestmark = [pytest.mark.full, pytest.mark.once]
 
 LIMITS_M = (0.25, 0.5, 1.0)
 OPTIONS = RelocalizerOptions(crops='all')

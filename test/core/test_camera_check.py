@@ -33,7 +33,7 @@ from studies import wrong_sensors
 ROOM = make_room()
 RELOCALIZER = Relocalizer(ROOM, RelocalizerOptions(matching='class', tilt_deviation_deg=0.0))
 SIZE = np.array([CAMERA.width, CAMERA.height])
-LOOKS = 24
+LOOKS = 16
 
 
 def place(rng):

@@ -73,6 +73,7 @@ def replace_in(file, old, new):
     file.write_text(text.replace(old, new))
 
 
+@pytest.mark.once
 def test_a_change_of_a_module_compiles_its_kernels_and_their_callers(kernels, package):
     count = len(list(kernels.iterdir()))
     replace_in(package / 'cliploc_ros/core/geometry/minimal_solvers.py', '_ROUNDING = 4e-16',
@@ -94,6 +95,7 @@ def test_damaged_kernels_are_compiled_again(kernels):
     assert run_in(kernels)[0] == 0
 
 
+@pytest.mark.once
 @pytest.mark.parametrize('part', ['no file', 'core.geometry.ellipse.unit_circle_overlap-*.nbc'])
 def test_kernels_that_others_can_write_to_are_not_used(kernels, part):
     next(kernels.glob(part), kernels).chmod(0o777)
@@ -101,6 +103,7 @@ def test_kernels_that_others_can_write_to_are_not_used(kernels, part):
     assert missing == KERNELS and 'can write to it' in log
 
 
+@pytest.mark.once
 def test_a_full_disk_costs_only_the_cache(tmp_path):
     limit = 'import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n'
     missing, result, log = run_in(tmp_path, program=limit + PROGRAM)
@@ -110,6 +113,7 @@ def test_a_full_disk_costs_only_the_cache(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.once
 def test_a_new_folder_begins_with_the_kernels_of_the_installation(kernels, package, tmp_path):
     """This completes a folder that is to be carried to another machine.
 

@@ -58,6 +58,7 @@ def test_the_chord_is_that_of_the_ray_through_the_centre():
         assert half_chord(center, shape, ROTATION, TRANSLATION) == pytest.approx(expected)
 
 
+@pytest.mark.once
 def test_right_depth_makes_poses_better_and_surer():
     rng, errors, deviations = np.random.default_rng(0), [], []
     for _ in range(40):

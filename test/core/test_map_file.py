@@ -42,9 +42,11 @@ def read(fields):
 def test_a_written_map_is_read_back(tmp_path):
     odd = ('yes: "quoted" \\ #1: [\U0001f600]', 'tab\tand\nline', '\x7f', '\\ud83d', 'a\u2028"\\')
     room = replace(ROOM, labels=(*odd, *ROOM.labels[len(odd):]),
-                   details=(FULL,) + (LandmarkDetails(support=3),) * (len(ROOM) - 1))
+                   details=(FULL,) + (LandmarkDetails(support=3),) * (len(ROOM) - 1),
+                   nav2_map='grid.yaml')
     write_map(tmp_path / 'map.yaml', room, ['two\nlines become one'])
     loaded = LandmarkMap.from_file(tmp_path / 'map.yaml')
+    assert loaded.select([0]).with_more(loaded).nav2_map == 'grid.yaml', 'updates keep it'
     assert (loaded.frame_id, loaded.landmark_ids, loaded.labels, loaded.class_ids,
             loaded.details) == (room.frame_id, room.landmark_ids, room.labels, room.class_ids,
                                 room.details)

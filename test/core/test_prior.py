@@ -124,6 +124,7 @@ def with_vertical(room, up=UP_IN_CAMERA, rows=None):
     return observe(room, rows=rows, up_in_camera=up)
 
 
+@pytest.mark.once
 @pytest.mark.parametrize('tilt_deg', [90.0, 180.0])
 def test_a_vertical_that_is_wrong_misleads_nobody(tilt_deg, office_map, queries, observed):
     """As with a wrong mount: the pose from boxes without the vertical is among the rivals."""

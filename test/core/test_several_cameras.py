@@ -48,6 +48,7 @@ def test_cameras_of_one_instant_have_no_odometry_between_them(rng, verified_came
     assert np.trace(rigid.covariance) < 0.9 * np.trace(moving.covariance)
 
 
+@pytest.mark.once
 def test_the_covariance_holds_the_errors_of_mounts(rng):
     deviation = (0.03, 1.5)
     stated, ignored = (Relocalizer(MAP, replace(OPTIONS, mount_deviation=given))

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Query files, observation files and records of a map's origin: read, refused and written."""
 
+import pickle
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -10,9 +11,14 @@ from scene import CAMERA
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.errors import DatasetError
+from cliploc_ros.errors import DatasetError, MapError
+from cliploc_ros.files.arrays import FINITE, Field, Schema, StoredArray
 from cliploc_ros.offline.datasets import map_recording, observations
+from cliploc_ros.offline.datasets.folders import read_folder
+from cliploc_ros.offline.datasets.images import images_of_recording
 from cliploc_ros.offline.mapping.posed_detections import PosedDetections
+from cliploc_ros.units import NS_PER_S
+from demo import ASSETS
 
 
 def frame_arrays() -> dict[str, np.ndarray]:
@@ -172,6 +178,41 @@ def test_a_moved_folder_keeps_its_recording(built, tmp_path):
     assert found.source.samefile(tmp_path / 'there/drive')
     assert (found.image, found.camera_info, found.intrinsics) == ('/image', '/info', None)
     np.testing.assert_allclose(found.load().map_from_camera[:, 1, 3], -2.0 * poses[:, 2, 3])
+
+
+def test_a_large_array_stays_in_its_file_which_may_be_replaced_but_not_overwritten(tmp_path):
+    """A mapped file would end the process with SIGBUS."""
+    values, path = np.random.default_rng(0).random((2_000_000, 3), np.float32), tmp_path / 'a.npz'
+    schema = Schema('file', {'a': Field('floats', ('n', 3), (FINITE,), is_stored=True)}, MapError)
+    schema.write(path, {'a': values})
+    first = schema.read(path)['a']
+    assert isinstance(first, StoredArray) and len(first) == len(values)
+    schema.write(path, {'a': values[::-1]})  # in another file, which takes its place
+    second, rows = schema.read(path)['a'], np.array([7, 3, 1_999_999])
+    for found, truth in ((first, values), (second, values[::-1])):
+        np.testing.assert_array_equal(found[5:9], truth[5:9])
+        np.testing.assert_array_equal(found[rows], truth[rows])
+        np.testing.assert_array_equal(np.asarray(found, np.float64), truth)
+    assert first[rows[:0]].shape == (0, 3)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(first)), values)
+    path.write_bytes(b'cut')
+    with pytest.raises(MapError, match='overwritten while it is used'):
+        second[1:3]
+    np.testing.assert_array_equal(first[5:9], values[5:9])
+
+
+def test_the_images_of_all_recordings_of_a_map_are_found(built, tmp_path):
+    """The second one has another camera; stamps of recordings that overlap are moved."""
+    path, _ = built
+    first, second = (map_recording.MapRecording(
+        path.with_name('drive.npz'), ASSETS / name, cameras=('',)) for name in (
+            'mapping', 'sequence'))
+    map_recording.save_recording(path, replace(first, others=(replace(second, later_s=3600.0),)))
+    images = images_of_recording(map_recording.load_recording(path), ['', '#1'])
+    for name, camera, later_s in (('mapping', '', 0.0), ('sequence', '#1', 3600.0)):
+        seen = next(read_folder(ASSETS / name).read())
+        found = images.near(seen.stamp_ns / NS_PER_S + later_s, camera)
+        np.testing.assert_array_equal(found, seen.image_rgb)
 
 
 def test_what_is_gone_is_none_and_what_is_damaged_is_named(built):

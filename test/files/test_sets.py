@@ -36,7 +36,8 @@ def read(path):
     return number, {number % 8 == int(np.argmax(embeddings.means[0])),
                     *(number == load_layer_of_map(layer_path(place), landmark_map).points[0, 0]
                       for place in (path, removed_path(path))),
-                    number == load_recording(path).scale - 1.0}
+                    number == load_recording(path).scale - 1.0,
+                    number == load_recording(path).load().stamps_s[0]}
 
 
 def hidden(path):
@@ -113,7 +114,7 @@ def test_the_studio_finishes_what_a_killed_writer_left(path):
 
 def test_an_update_writes_a_new_set_unless_another_update_was_faster(path):
     recording, before = MapRecording(path.with_name('seen.npz')), LandmarkMap.from_file(path)
-    first, second = (replace(made_map(number), embeddings=None, updated=before.map_set)
+    first, second = (replace(made_map(number), embeddings=None, updated=path.read_text())
                      for number in (1, 2))
     write_made_map(path, first, [], recording, path)
     after = LandmarkMap.from_file(path)

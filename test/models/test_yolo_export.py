@@ -17,6 +17,7 @@ import pytest
 from scene import make_room
 from without_pytorch import Lazy, hide_pytorch
 
+from cliploc_ros.cli import evaluate
 from cliploc_ros.errors import ModelError, OptionsError
 from cliploc_ros.models import protocols
 from cliploc_ros.models.files import is_hub_name
@@ -293,41 +294,44 @@ ONNX = (ASSETS / 'yolo.onnx', '', ASSETS / 'clip')
 WEIGHTS = (ASSETS / 'yolo.pt', ASSETS / 'clip.json', ASSETS / 'clip.safetensors')
 
 
-def localize(networks, cache, out, environment):
-    """Run evaluate on some images of the demo."""
+def localizing(networks, out):
+    """Return the arguments of evaluate for some images of the demo."""
     model, clip_model, pretrained = networks
     named = ['--clip-model', clip_model] if clip_model else []
-    return subprocess.run(
-        [sys.executable, '-m', 'cliploc_ros.cli.evaluate', '--tum', ASSETS / 'sequence', '--map',
-         ASSETS / 'map.yaml', '--every', '10', '--methods', 'auto', '--trials', '1', '--sweep',
-         '--no-figures', '--workers', '1', '--model', model, *named, '--clip-pretrained',
-         pretrained, '--out', out], env=environment | {'XDG_CACHE_HOME': str(cache)},
-        capture_output=True, text=True, timeout=300, check=False)
+    return ['--tum', ASSETS / 'sequence', '--map', ASSETS / 'map.yaml', '--every', '10',
+            '--methods', 'auto', '--trials', '1', '--sweep', '--no-figures', '--workers', '1',
+            '--model', model, *named, '--clip-pretrained', pretrained, '--out', out]
 
 
 @pytest.fixture
-def hidden(tmp_path):
-    (tmp_path / 'hidden').mkdir()
-    return hide_pytorch(tmp_path / 'hidden')
+def localize_hidden(tmp_path):
+    """Run evaluate in a process without PyTorch, and without the outputs of earlier runs."""
+    return lambda *given: subprocess.run(
+        [sys.executable, '-m', 'cliploc_ros.cli.evaluate', *localizing(*given)],
+        env=hide_pytorch(tmp_path) | {'XDG_CACHE_HOME': str(tmp_path / 'cache'),
+                                      'CLIPLOC_RECORDINGS': str(tmp_path)},
+        capture_output=True, text=True, timeout=300, check=False)
 
 
 @pytest.mark.parametrize(('networks', 'named'), [
     (WEIGHTS, '--no-clip'), ((WEIGHTS[0], *ONNX[1:]), 'yolo.pt')])
-def test_without_pytorch_weights_are_refused_with_what_to_do(networks, named, hidden, tmp_path):
-    done = localize(networks, tmp_path / 'empty', tmp_path / 'out', hidden)
+def test_without_pytorch_weights_are_refused_with_what_to_do(networks, named, localize_hidden,
+                                                             tmp_path):
+    done = localize_hidden(networks, tmp_path / 'out')
     assert done.returncode == 1 and 'Traceback' not in done.stderr
     assert 'is not installed' in done.stderr and 'export_network' in done.stderr
     assert 'script/setup models' in done.stderr and named in done.stderr
 
 
-def test_weights_are_exported_once_and_then_need_no_pytorch(hidden, tmp_path):
-    found = []
-    for networks, environment in ((ONNX, hidden), (WEIGHTS, dict(os.environ)), (WEIGHTS, hidden)):
-        out = tmp_path / str(len(found))
-        done = localize(networks, tmp_path / 'cache', out, environment)
+def test_weights_are_exported_once_and_then_need_no_pytorch(localize_hidden, tmp_path, run_here,
+                                                            monkeypatch):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    found, here = [], lambda *given: run_here(evaluate.main, *localizing(*given))
+    for networks, run in ((ONNX, here), (WEIGHTS, here), (WEIGHTS, localize_hidden)):
+        done = run(networks, tmp_path / 'out')
         assert done.returncode == 0, done.stderr
         found.append([(row['accepted'], row['error_m'])
-                      for row in json.loads((out / 'results.json').read_text())])
+                      for row in json.loads((tmp_path / 'out/results.json').read_text())])
     onnx, exported, again = found
     assert exported == again
     assert [accepted for accepted, _ in onnx] == [accepted for accepted, _ in exported]

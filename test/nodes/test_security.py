@@ -11,8 +11,11 @@ from tester import make_frame
 pytestmark = pytest.mark.full
 
 POLICY = PROJECT / 'config/security_policy.xml'
-# Topics and services of tf2_ros and nav2_msgs, which are not installed on all test machines.
-FOREIGN = {'/tf', '/tf_static', '/relocalizer/load_map'}
+# Topics and services of tf2_ros and nav2_msgs, which are not installed on all test machines; those
+# of floors are used where maps have nav2_map.
+FOREIGN = {'/tf', '/tf_static', '/relocalizer/load_map', '/map', '/map_server/load_map',
+           '/global_costmap/clear_entirely_global_costmap',
+           '/local_costmap/clear_entirely_local_costmap'}
 GRAPH = {('topics', 'publish'): 'get_publisher_names_and_types_by_node',
          ('topics', 'subscribe'): 'get_subscriber_names_and_types_by_node',
          ('services', 'reply'): 'get_service_names_and_types_by_node',

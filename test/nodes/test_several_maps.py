@@ -5,10 +5,12 @@
 import importlib
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scene import make_layer, make_room, see_room, write_map
+from stand_ins import Nav2
 from tester import make_frame
 
 from cliploc_ros.core.keyframes.layer import layer_path, save_layer
@@ -76,6 +78,22 @@ def test_keyframes_of_all_floors_are_used_or_none(relocalizer, tester, floors, r
         assert ' m in floor_0, ' in answer.message
     for name, value in (('map_files', ['']), ('map_file', str(room_map))):
         assert tester.set_parameter(name, value).successful
+
+
+@pytest.mark.needs('nav2_msgs')
+def test_nav2_follows_to_the_floor_and_not_during_a_ride(own_relocalizer, tester, floors):
+    for number, (room, file) in enumerate(zip((ROOM, other_room()), floors, strict=True)):
+        write_map(replace(room, frame_id=f'floor_{number}', nav2_map=f'grids/{number}.yaml'),
+                  Path(file))
+    own_relocalizer(map_file="''", map_files=f'[{", ".join(floors)}]', timeout_s=5.0)
+    nav2, cabin, expected = Nav2(tester), see_room(ROOM).select(np.array([0, 1])), []
+    for number in (0, 1, 0):
+        assert not tester.relocalize(make_frame(cabin)).success
+        assert nav2.order == expected
+        answer = tester.relocalize(make_frame(see_room((ROOM, other_room())[number])))
+        assert answer.success and f' m in floor_{number}, ' in answer.message, answer.message
+        expected += [str(number), 'global', 'local', 'pose in map']
+    assert nav2.order == expected
 
 
 @pytest.fixture

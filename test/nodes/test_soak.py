@@ -36,7 +36,6 @@ def move_camera(number):
     return moved
 
 
-@pytest.mark.clock
 def test_soak(tester, own_relocalizer):
     """A loop of frames; one in four shows too few objects for a pose."""
     process, measured, verdicts = own_relocalizer(fresh=True, image_transport='compressed'), [], []

@@ -30,7 +30,7 @@ RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class TakingLocalizer:
-    """Publishes each initial pose at once as its estimate, while it is switched on."""
+    """Publishes each initial pose at once as its estimate, a millimetre off, while it is on."""
 
     def __init__(self, node):
         self.is_on, self._node = True, node
@@ -50,6 +50,7 @@ class TakingLocalizer:
 
     def _show(self, pose):
         if self.is_on:
+            pose.pose.pose.position.x += 1e-3
             self._publisher.publish(pose)
 
 

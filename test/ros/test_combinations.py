@@ -4,7 +4,7 @@
 
 import math
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -148,9 +148,28 @@ def test_continuous_answers_tell_a_filter_only_what_is_new(cameras, known, tmp_p
         queries.append(found.query)
         shares.append(np.trace(found.found.covariance[:3, :3])
                       / np.trace(found.for_filter[:3, :3]))
+        assert np.linalg.norm((found.carried - found.found.map_from_camera)[:3, 3]) < 0.05
     assert shares[0] == pytest.approx(1.0)
     assert max(shares[1:]) < 0.9
     equal(drive.repeated(Case(tuple(queries), {}), drive.parameters.options()), found.found)
+
+
+def test_a_carried_robot_has_no_pose_until_two_answers_agree(tmp_path):
+    """Odometry does not see the carry. A request begins a new track."""
+    drive = Drive(1, 'nothing', tmp_path, 'continuous')
+    poses = [drive.localize(number)[0].carried for number in range(3)]
+    assert all(pose is not None for pose in poses)
+    track = drive.localizer.localizer.track
+    elsewhere = track.map_from_camera.copy()
+    elsewhere[0, 3] += 3.0
+    drive.localizer.localizer.track = replace(track, map_from_camera=elsewhere)
+    found = [drive.localize(number)[0] for number in (3, 4)]
+    assert all(each.found.accepted for each in found)
+    assert found[0].carried is None
+    np.testing.assert_array_equal(found[1].carried, found[1].found.map_from_camera)
+    drive.localizer.localizer.track = replace(track, map_from_camera=elsewhere)
+    found, _ = drive.localize(5, deadline=time.monotonic() + 60.0)
+    np.testing.assert_array_equal(found.carried, found.found.map_from_camera)
 
 
 def test_mounts_of_cameras_are_no_odometry(tmp_path):

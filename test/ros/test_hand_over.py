@@ -3,6 +3,7 @@
 """Handing a pose over: real subscribers, odometry, and services that answer or never do."""
 
 import math
+import random
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -13,21 +14,21 @@ import pytest
 from builtin_interfaces.msg import Time as Stamp
 from frames import stamp
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry
-from rclpy.callback_groups import ReentrantCallbackGroup
+from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.time import Time
-from std_srvs.srv import Empty
+from stand_ins import KINDS, Localizer, Nav2
 
 from cliploc_ros.ros import handoff
 from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
 from cliploc_ros.ros.parameters import RelocalizerParameters
+from cliploc_ros.ros.receivers import difference
 
-PARAMETERS = RelocalizerParameters(base_frame='base_link')
+PARAMETERS = RelocalizerParameters(base_frame='base_link', localizer_pose='')
 
 # Times of odometry since the image [s].
 ONE_HZ, TEN_HZ = (0.0, 1.0, 2.0), tuple(tick / 10 for tick in range(10))
@@ -39,44 +40,33 @@ def make_pose():
     return pose
 
 
-class Localizer:
-    """Replaces AMCL: receives initial poses, and answers update requests while it may."""
-
-    def __init__(self, node):
-        self.node = node
-        self.poses, self.updates = [], []
-        self.may_answer = threading.Event()
-        self.may_answer.set()
-        self._group = ReentrantCallbackGroup()
-
-    def subscribe(self):
-        self.node.create_subscription(PoseWithCovarianceStamped, 'initialpose',
-                                      self.poses.append, 10)
-
-    def serve(self):
-        def update(_, response):
-            self.updates.append(time.monotonic())
-            self.may_answer.wait()
-            return response
-        self.node.create_service(Empty, 'request_nomotion_update', update,
-                                 callback_group=self._group)
-
-
 class Robot:
     """A relocalizer's hand-over and a localizer, whose callbacks are all executed."""
 
     def __init__(self, make_node, wait):
-        self.node, self.wait = make_node('relocalizer'), wait
-        self.localizer = Localizer(make_node('amcl'))
+        self.node, self.wait, self._make_node = make_node('relocalizer'), wait, make_node
         self.odometry = OdometrySource(self.node)
         self.handoff = handoff.HandOff(self.node, self.odometry, CoordinateFrames(self.node))
         self.jumps = TimeJumps(self.node, self.odometry.forget)
+        self.parameters = PARAMETERS
 
-    def hand_over(self, timeout_s=10.0, **changes):
+    def start(self, name, **others):
+        """Start a localizer, the first of which is the robot's."""
+        localizer = Localizer(self._make_node, name, **others)
+        self.localizer = getattr(self, 'localizer', localizer)
+        self.executor.add_node(localizer.node)
+        return localizer
+
+    def open(self, localizer_pose):
+        self.parameters = replace(PARAMETERS, localizer_pose=localizer_pose)
+        self.handoff.open(self.parameters)
+
+    def hand_over(self, timeout_s=10.0, floor='map', grids=(), age_s=0.0, **changes):
         """Hand a pose over; return the elapsed time [s]."""
-        start = time.monotonic()
-        self.handoff.hand_over(make_pose(), replace(PARAMETERS, **changes), start + timeout_s,
-                               start, self.jumps)
+        start, pose = time.monotonic(), make_pose()
+        pose.header.frame_id = floor
+        self.handoff.hand_over(pose, replace(self.parameters, **changes), start + timeout_s,
+                               start - age_s, self.jumps, grids)
         return time.monotonic() - start
 
     def jump(self):
@@ -86,7 +76,7 @@ class Robot:
 
     def meet(self):
         """Wait until the relocalizer has discovered the localizer."""
-        self.wait(lambda: self.handoff._publisher.get_subscription_count(), 'the subscriber')
+        self.wait(self.handoff.localizer._publisher.get_subscription_count, 'the subscriber')
 
 
 def tell(robot, wheels, moments_s, speed_m_s=0.0, twist_m_s=0.0):
@@ -110,9 +100,8 @@ def stand(robot, wheels, places, twist_m_s=0.0, rad_per_m=0.0, body=''):
 @pytest.fixture
 def robot(context, make_node, wait):
     robot = Robot(make_node, wait)
-    executor = MultiThreadedExecutor(4, context=context)
-    for node in (robot.node, robot.localizer.node):
-        executor.add_node(node)
+    executor = robot.executor = MultiThreadedExecutor(4, context=context)
+    executor.add_node(robot.node)
 
     def spin():
         with suppress(InvalidHandle):  # the shutdown below may happen while it waits
@@ -120,7 +109,8 @@ def robot(context, make_node, wait):
     spinning = threading.Thread(target=spin)
     spinning.start()
     yield robot
-    robot.localizer.may_answer.set()
+    if hasattr(robot, 'localizer'):
+        robot.localizer.may_answer.set()
     executor.shutdown()
     spinning.join()
 
@@ -138,18 +128,18 @@ def wheels(robot, make_node):
 
 def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
     """Who hears the pose but shows none, such as ros2 topic echo, is no localizer."""
-    robot.handoff.open('amcl_pose')
+    robot.open('amcl_pose')
     with pytest.raises(handoff.NoLocalizerError, match=r'/initialpose.*retry'):
         robot.hand_over(1.5)
-    robot.localizer.subscribe()
+    robot.start('ros2 topic echo')
     robot.meet()
     start = time.monotonic()
-    with pytest.raises(handoff.NoLocalizerError, match='/amcl_pose'):
+    with pytest.raises(handoff.NoLocalizerError, match='localizer_pose: amcl_pose'):
         robot.hand_over(1.5)
     assert 0.5 < time.monotonic() - start < 3.0
     assert not robot.localizer.poses
     robot.handoff.close()
-    robot.handoff.open('')
+    robot.open('')
     robot.hand_over()
     robot.wait(lambda: robot.localizer.poses, 'the pose')
     assert len(robot.localizer.poses) == 1, 'the withheld pose is not delivered late'
@@ -158,8 +148,7 @@ def test_without_a_localizer_the_pose_is_withheld_once_time_is_up(robot):
 @pytest.fixture
 def served(robot):
     """Return a robot whose localizer receives poses and serves updates."""
-    robot.localizer.subscribe()
-    robot.localizer.serve()
+    robot.start('amcl')
     robot.meet()
     robot.wait(robot.handoff._updater.service_is_ready, 'the service')
     return robot
@@ -179,7 +168,7 @@ def test_updates_come_no_faster_than_scans_and_without_an_answer_cost_little(ser
 
 def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
     """The hand-over waits for odometry when time jumps."""
-    robot.localizer.subscribe()
+    robot.start('ros2 topic echo')
     robot.meet()
     with ThreadPoolExecutor(1) as pool:
         handing_over = pool.submit(robot.hand_over)
@@ -193,25 +182,10 @@ def test_a_jump_during_the_hand_over_withholds_the_pose(robot, wheels):
 
 @pytest.fixture
 def showing(served):
-    """A localizer that publishes the poses it is given, with an error; NaN: it publishes none."""
-    localizer, node = served.localizer, served.localizer.node
-    shows = node.create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
-    localizer.off_m = 0.0
-
-    def show(pose):
-        pose.pose.pose.orientation.w = 1.0
-        pose.pose.pose.position.x += localizer.off_m
-        if math.isfinite(localizer.off_m):
-            shows.publish(pose)
-    node.create_subscription(PoseWithCovarianceStamped, 'initialpose', show, 10)
-    served.handoff.open('amcl_pose')
-    served.wait(lambda: not served.handoff.missing() and shows.get_subscription_count(), 'both')
-
-    def show_at(x_m, seconds):
-        pose = make_pose()
-        pose.pose.pose.position.x, pose.header.stamp = x_m, stamp(100.0 + seconds)
-        show(pose)
-    localizer.show = show_at
+    """A localizer that shows the poses it is given."""
+    served.open('amcl_pose')
+    served.wait(lambda: not served.handoff.localizer.missing()
+                and served.localizer._pose.get_subscription_count(), 'both')
     yield served
     served.handoff.close()
 
@@ -225,14 +199,6 @@ def test_a_localizer_has_taken_the_pose_once_it_shows_it(showing, off_m, timeout
     with pytest.raises(handoff.NoLocalizerError, match=named) if named else nullcontext():
         showing.hand_over(timeout_s)
     assert len(showing.localizer.poses) == times
-
-
-def test_two_localizers_are_named(showing, make_node):
-    make_node('slam').create_publisher(PoseWithCovarianceStamped, 'amcl_pose', 10)
-    showing.wait(showing.handoff.missing, 'the second localizer')
-    with pytest.raises(handoff.NoLocalizerError, match='2 nodes publish /amcl_pose: /amcl, /slam'):
-        showing.hand_over(1.0)
-    assert not showing.localizer.poses
 
 
 def test_a_localizer_that_dies_while_it_settles_has_not_taken_the_pose(showing):
@@ -276,7 +242,7 @@ def test_where_the_localizer_is_once_it_has_settled_decides(showing, wheels, x_m
         showing.wait(lambda: showing.localizer.updates, 'an update')
         stand(showing, wheels, {0.4 + 0.1 * tick: driven_m * tick / 20 for tick in range(1, 21)},
               twist_m_s=5.0 * driven_m / 10, body=body)
-        showing.localizer.show(x_m, 2.4)
+        showing.localizer.show(x_m, stamp(102.4))
         with pytest.raises(handoff.NoLocalizerError, match=named) if named else nullcontext():
             handing_over.result()
     showing.localizer.may_answer.set()
@@ -310,9 +276,9 @@ def test_how_near_the_localizer_has_to_be(x_m, yaw_deg, frame, is_taken_over):
     shown.header.frame_id, shown.pose.pose.position.x = frame, x_m
     shown.pose.pose.orientation.z = math.sin(math.radians(yaw_deg) / 2)
     shown.pose.pose.orientation.w = math.cos(math.radians(yaw_deg) / 2)
-    assert (not handoff.difference(given, shown)) == is_taken_over
+    assert (not difference(given, shown)) == is_taken_over
     shown.pose.pose.orientation.y = 1e200
-    assert handoff.difference(given, shown)
+    assert difference(given, shown)
 
 
 @pytest.mark.parametrize(('now_s', 'published_s'), [(200, 100), (50, 50), (0, 100)])
@@ -331,7 +297,7 @@ def test_the_stamp_is_the_images_but_not_later_than_now(now_s, published_s):
 @pytest.fixture
 def listening(robot, wheels):
     """Return a robot whose localizer receives poses."""
-    robot.localizer.subscribe()
+    robot.start('ros2 topic echo')
     robot.meet()
     return robot
 
@@ -399,3 +365,110 @@ def test_odometry_that_does_not_tell_of_rest_withholds_the_pose(listening, wheel
     for _ in range(3 if len(places) == 1 else 1):
         stand(listening, wheels, places)
     assert named in is_withheld(listening, 2.5)
+
+
+# ---- any localizer ------------------------------------------------------------------------------
+
+def withheld(robot, named, timeout_s=1.7):
+    with pytest.raises(handoff.NoLocalizerError, match=named) if named else nullcontext():
+        robot.hand_over(timeout_s)
+
+
+@pytest.mark.parametrize('name', [*KINDS][:-1])
+def test_any_localizer_confirms_the_pose_that_it_takes(robot, name):
+    """Success, another place, silence, two at once, death; ros2 topic echo does not count."""
+    transforms, topic = robot.handoff._transforms, KINDS[name][3]
+    localizer = robot.start(name, tell=lambda *placed: [
+        listener(*placed) for listener in transforms.listeners])
+    transforms._buffer = localizer
+    robot.open('auto')
+    robot.wait(lambda: not robot.handoff.localizer.missing(), 'the localizer')
+    assert robot.handoff.localizer.pose_topic == (f'/{topic}' if topic else '')
+    robot.start('ros2 topic echo')
+    withheld(robot, '', 5.0)
+    localizer.off_m = 2.0
+    withheld(robot, r'differs from it by 2\.00 m')
+    localizer.off_m = math.nan
+    withheld(robot, f'no message on {f"/{topic}" if topic else "tf from the map"} since')
+    count, others = len(localizer.poses), [
+        other for other in KINDS if KINDS[other][0] != KINDS[name][0]
+        and bool(KINDS[other][3]) is bool(topic) and KINDS[other][6]]
+    other = robot.start(others[0])
+    robot.wait(robot.handoff.localizer.missing, 'the second localizer')
+    withheld(robot, f'several localizers.*/{KINDS[others[0]][0]} on .*stop all but one', 0.7)
+    assert len(localizer.poses) == count and not other.poses
+    robot.executor.shutdown()  # rclpy fails where a node ends while it is executed
+    for node in (localizer.node, other.node):
+        node.destroy_node()
+    robot.wait(lambda: 'nobody' in robot.handoff.localizer.missing(), 'their end')
+    withheld(robot, "nobody publishes the localizer's pose", 0.7)
+
+
+# ---- Nav2's grid follows the robot from floor to floor ------------------------------------------
+
+GRIDS = {f'floor_{number}': f'/maps/{number}.yaml' for number in range(3)}
+POSE = 'pose in map'
+
+
+@pytest.fixture
+def nav2(showing, make_node):
+    """Start map_server and costmaps."""
+    nav2 = Nav2(make_node('nav2'))
+    showing.executor.add_node(nav2._node)
+    showing.enter = lambda floor, timeout_s=5.0, **how: showing.hand_over(
+        timeout_s, f'floor_{floor}', GRIDS, nomotion_updates=0, **how)
+    yield nav2
+    nav2.ended.set()
+
+
+@pytest.mark.needs('nav2_msgs')
+def test_fifty_changes_between_three_floors(showing, nav2):
+    """The grid is loaded, then the costmaps are cleared, then the pose is given, once."""
+    floor, expected = 0, []
+    for step in range(51):
+        showing.enter(floor)
+        expected += [str(floor), 'global', 'local', POSE]
+        showing.wait(lambda: nav2.order == expected, f'step {step}')  # noqa: B023
+        floor = (floor + random.Random(step).randint(1, 2)) % 3
+    showing.enter(nav2.order[-4])
+    showing.wait(lambda: nav2.order == [*expected, POSE], 'a pose on the loaded floor')
+    nav2.grids.publish(OccupancyGrid())
+    showing.wait(lambda: not showing.handoff.floors.loaded, 'the grid of another program')
+    showing.enter(nav2.order[-5])
+    showing.wait(lambda: nav2.order == [*expected, POSE, *expected[-4:]], 'the grid again')
+
+
+@pytest.mark.needs('nav2_msgs')
+@pytest.mark.parametrize(('broken', 'named', 'got'), [
+    ('result', 'load_map: result 1', '1'), ('1', 'load_map does not answer', '1'),
+    ('grid', 'result 0, and no such grid on map', '1'),
+    ('global', 'clear_entirely_global_costmap does not answer', '1 global'),
+    ('local', 'clear_entirely_local_costmap does not answer', '1 global local'),
+    ('amcl', r'differs from it by 3\.00 m', f'1 global local {POSE}')])
+def test_what_fails_withholds_the_pose_and_restores_the_grid(showing, nav2, broken, named, got):
+    showing.enter(0)
+    showing.wait(lambda: len(nav2.order) == 4, 'the first floor')
+    nav2.order.clear()
+    nav2.broken, showing.localizer.off_m = broken, 3.0 * (broken == 'amcl')
+    with pytest.raises(handoff.NoLocalizerError, match=f"{named}.*'floor_0' is requested again"):
+        showing.enter(1, 1.5)
+    nav2.broken, showing.localizer.off_m = '', 0.0
+    nav2.ended.set()
+    showing.wait(lambda: ' '.join(nav2.order) == f'{got} 0' and (
+        showing.handoff.floors.loaded == {'map': 'floor_0'} or broken == 'grid'), 'the grid')
+    showing.enter(1)
+    showing.wait(lambda: nav2.order[-4:] == ['1', 'global', 'local', POSE], 'the next request')
+
+
+@pytest.mark.needs('nav2_msgs')
+def test_nothing_changes_after_a_ride_without_a_grid_or_map_server(showing, nav2):
+    """A lift brings the robot to another floor while odometry shows rest."""
+    with pytest.raises(handoff.HandOffError, match=r'image is 6\.0 s old, as by a lift'):
+        showing.enter(1, age_s=6.0)
+    with pytest.raises(handoff.NoLocalizerError, match="'floor_7' has no nav2_map"):
+        showing.enter(7)
+    showing.executor.shutdown()
+    nav2._node.destroy_service(nav2.load_map)
+    with pytest.raises(handoff.NoLocalizerError, match=r'nobody serves .*load_map'):
+        showing.enter(2, 1.5)
+    assert not nav2.order and not showing.localizer.poses

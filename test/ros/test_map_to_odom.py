@@ -13,8 +13,12 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
-from cliploc_ros.ros.handoff import MapToOdom, transform_msg
-from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
+from cliploc_ros.ros.inputs.coordinate_frames import (
+    CoordinateFrames,
+    MapToOdom,
+    NoTransformError,
+    transform_msg,
+)
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError
 from cliploc_ros.ros.parameters import RelocalizerParameters
@@ -129,12 +133,19 @@ def test_map_to_odom_pauses_while_another_node_broadcasts_it(make_node):
     map_to_odom._broadcaster = SimpleNamespace(sendTransform=lambda t: sent.append(deepcopy(t)))
     map_to_odom._transform, map_to_odom._timer = moving(100.0, 0.0, 'map', 'odom'), 'open'
     map_to_odom._broadcast()
-    frames.on_transform(sent[0], False)
-    frames.on_transform(moving(100.0, 0.0), False)
+    frames.listeners[-1](sent[0], False)
+    frames.listeners[-1](moving(100.0, 0.0), False)
     assert map_to_odom.rival('odom') == '', 'its own transform, and that of odometry'
-    frames.on_transform(moving(100.0, 0.0, 'map', '/odom'), False)
+    frames.listeners[-1](moving(100.0, 0.0, 'map', '/odom'), False)
     map_to_odom._broadcast()
     assert len(sent) == 1
+    map_to_odom._others.clear()
+    with pytest.raises(NoTransformError, match='contradicts the earlier poses'):
+        map_to_odom.pause()
+    map_to_odom._broadcast()
+    assert len(sent) == 1, 'poses contradict each other'
+    frames_of_others = moving(100.0, 0.0, 'map', '/odom')
+    map_to_odom.hear(frames_of_others, False)
     with pytest.raises(NoTransformError, match=r"'map' -> 'odom'.*publish_tf"):
         map_to_odom.update(Header(frame_id='map'), np.eye(4), PARAMETERS, 0.0)
 

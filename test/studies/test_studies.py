@@ -119,7 +119,7 @@ def test_the_table_counts_each_request_once(capsys):
 def outcomes(tmp_path_factory):
     """Run the study on the demo's room and images without poses; return the outcomes."""
     folder = tmp_path_factory.mktemp('rooms')
-    shutil.copytree(ASSETS / 'sequence', folder / 'demo')
+    shutil.copytree(ASSETS / 'mapping', folder / 'demo')
     (folder / 'elsewhere' / 'images').mkdir(parents=True)
     rng = np.random.default_rng(0)
     for number in range(3):

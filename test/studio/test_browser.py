@@ -12,9 +12,7 @@ from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.offline.studio.document import Document
 from cliploc_ros.offline.studio.studio import Studio
 
-# Software rendering needs an idle machine.
-pytestmark = [pytest.mark.full, pytest.mark.clock,
-              pytest.mark.needs('viser', 'playwright', 'chromium')]
+pytestmark = [pytest.mark.full, pytest.mark.needs('viser', 'playwright', 'chromium')]
 
 
 def test_select_type_relabel_undo_save_reload(person, studio, path):
@@ -103,6 +101,7 @@ def test_a_hostile_map_is_shown_as_text(chromium, path):
         assert person.page.locator('img[src=x]').count() == 0
 
 
+@pytest.mark.clock  # software rendering of the scene needs an idle machine
 def test_without_views_the_scene_has_the_page_and_ids_tell_equal_labels_apart(chromium, path):
     """The labels of the two rooms' chairs are equal."""
     write_two_rooms(path)

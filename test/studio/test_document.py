@@ -151,21 +151,23 @@ def test_merging_halves_gives_back_the_whole(document):
 
 def test_a_file_that_changed_on_disk_is_not_overwritten(document, path):
     document.edit(edits.set_fields, ['cup_1'], label='mine')
-    theirs = TEXT.replace('a red cup', 'theirs')
+    theirs = f'# set {"1" * 12} {"2" * 12}\n' + TEXT.replace('a red cup', 'theirs')  # an update
     path.write_text(theirs)
     with pytest.raises(MapError, match='another program'):
         document.save()
     assert path.read_text() == theirs
     assert document.has_conflict
     assert 'office.yaml' in document.overwrite() and not document.has_conflict
-    assert LandmarkMap.from_file(path).labels[0] == 'mine'
+    found = LandmarkMap.from_file(path)
+    assert found.labels[0] == 'mine' and found.map_set.digest == '2' * 12
 
 
 def test_reloading_is_an_edit(document, path):
     document.edit(edits.set_fields, ['cup_1'], label='mine')
     document.edit(edits.delete, ['book_1'])
-    path.write_text(TEXT.replace('a red cup', 'theirs'))
+    path.write_text(f'# set {"1" * 12} {"2" * 12}\n' + TEXT.replace('a red cup', 'theirs'))
     document.reload()
+    assert 'views and keyframes are those from before' in document.notes[-1]
     assert document.is_saved and document.landmarks['cup_1'].label == 'theirs'
     assert set(document.landmarks) == {'cup_1', 'book_1', 'plant_1'}
     document.undo()

@@ -301,8 +301,7 @@ def none_right(setting: Setting, calibration: Calibration = CALIBRATION) -> floa
 
 def counted_points(place: RecognizedPlace) -> float:
     """Return how many of the features that agree with a place count as evidence, at least 1."""
-    share = CALIBRATION.keyframes.thorough if place.is_thorough else 1.0
-    return max(1.0, share * place.inliers)
+    return max(1.0, (CALIBRATION.keyframes.thorough if place.is_thorough else 1.0) * place.inliers)
 
 
 def points_utility(place: RecognizedPlace) -> float:

@@ -31,14 +31,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gammainc
 
 from cliploc_ros.core.calibration import CALIBRATION
+from cliploc_ros.core.fit import refinement
 from cliploc_ros.core.fit.camera_fit import ERRORS, camera_jacobian
-from cliploc_ros.core.fit.refinement import (
-    LEAST_DEVIATION,
-    RELATIVE_DEVIATION,
-    Inliers,
-    one_to_one,
-    residuals_of,
-)
 from cliploc_ros.core.fit.verification import Rig, verify_rig
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_difference
 
@@ -179,8 +173,8 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
         Standard deviations of the errors of each camera, see cliploc_ros.core.fit.camera_fit.
     """
     found = verify_rig(rig, rotation, translation)
-    fit = _linearize(one_to_one(rig, found, rotation, translation), rig.sigmas, rotation,
-                     translation)
+    fit = _linearize(refinement.one_to_one(rig, found, rotation, translation), rig.sigmas,
+                     rotation, translation)
     of_matches, prior = fit.information, np.diag(1.0 / PRIOR_VARIANCES)
     of_objects = _sums(of_matches, fit.objects, len(fit.sigmas))
     verticals = fit.verticals.sum(axis=0)
@@ -219,7 +213,7 @@ def refined_covariance(rig: Rig, rotation: NDArray[np.float64], translation: NDA
     return np.asarray(matched + _sandwich(information, common) + wrong_share * wrong)
 
 
-def moves_with_cameras(rig: Rig, inliers: Inliers, rotation: NDArray[np.float64],
+def moves_with_cameras(rig: Rig, inliers: refinement.Inliers, rotation: NDArray[np.float64],
                        translation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the Jacobian (F, 6, 7) of a refined pose for the camera errors of each frame.
 
@@ -254,8 +248,8 @@ def _sandwich(information: NDArray[np.float64], noise: NDArray[np.float64]) -> N
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[np.float64],
-               translation: NDArray[np.float64]) -> _Fit:
+def _linearize(inliers: refinement.Inliers, sigmas: NDArray[np.float64],
+               rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> _Fit:
     count, frames = len(inliers.pairs), len(inliers.cameras)
     jacobian, residuals = np.empty((count, 5, 6)), np.empty((count, 5))
     verticals, cameras = np.zeros((frames, 6, 6)), np.tile(np.eye(4), (frames, 1, 1))
@@ -269,7 +263,7 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
         cameras[frame, :3, 3] = -own_rotation.T @ own_translation
         pairs = inliers.pairs[first:last]
         own, rows = np.empty(5 * len(pairs) + 3), 5 * len(pairs)
-        residuals_of(pairs, vertical, own_rotation, own_translation, own)
+        refinement.residuals_of(pairs, vertical, own_rotation, own_translation, own)
         steps = camera_jacobian(pairs, vertical, np.zeros(ERRORS), own_rotation, own_translation,
                                 own)
         # a rotation of the reference about its own centre moves this camera
@@ -281,7 +275,8 @@ def _linearize(inliers: Inliers, sigmas: NDArray[np.float64], rotation: NDArray[
                                                        own[:rows].reshape(-1, 5))
     numbers, objects = np.unique(inliers.landmarks, return_inverse=True)
     pairs = inliers.pairs
-    edges = (RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3]) + LEAST_DEVIATION) / pairs[:, 13]
+    edges = (refinement.RELATIVE_DEVIATION * (pairs[:, 2] + pairs[:, 3])
+             + refinement.LEAST_DEVIATION) / pairs[:, 13]
     depths = np.sqrt(1.0 - (sigmas[inliers.landmarks] / np.maximum(pairs[:, 15], 1e-9)) ** 2,
                      out=np.zeros(count), where=pairs[:, 15] > 0.0)
     kinds = 5 if depths.any() else 4

@@ -132,7 +132,6 @@ SIFT = FeatureKind('rootsift-128-uint8', DIMENSIONS, extract)
 ONLY_SIFT: FeatureKinds = {SIFT.name: lambda: SIFT}
 
 
-def compact(units: NDArray[np.float32], zero: int = 0, scale: float = _SCALE
-            ) -> NDArray[np.uint8]:
+def compact(units: NDArray[np.float32], zero: int = 0, scale: float = _SCALE) -> NDArray[np.uint8]:
     """Convert unit vectors (n, d) to descriptors (n, d), see FeatureKind."""
     return np.clip(np.round(scale * units) + zero, 0, 255).astype(np.uint8)

@@ -9,7 +9,7 @@ words of a large layer have two levels (Nister and Stewenius, "Scalable recognit
 vocabulary tree", 2006), and its descriptors are compressed: to the word and a product-quantized
 residual (Jegou et al., "Product quantization for nearest neighbor search", 2011).
 
-The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Large arrays of points are mapped.
+The file is ``NAME.keyframes.npz`` next to ``NAME.yaml``. Large arrays of points stay in it.
 """
 
 import hashlib
@@ -138,9 +138,9 @@ class KeyframeLayer:
         """Return the layer without compression and no view, to join or to change it."""
         if self.ends is not None:
             return self.select(np.ones(len(self), dtype=np.bool_)).plain()
-        return replace(
-            self, points=self.points.astype(np.float32), codebook=None, descriptors=np.concatenate(
-                [self.descriptors_of(self.rows(keyframe)) for keyframe in range(len(self))]))
+        descriptors = [self.descriptors_of(self.rows(keyframe)) for keyframe in range(len(self))]
+        return replace(self, points=np.asarray(self.points, np.float32), codebook=None,
+                       descriptors=np.concatenate(descriptors))
 
     def prepare(self) -> None:
         """Compute the indices in advance, so that the first request does not wait for them."""
@@ -270,9 +270,9 @@ _SCHEMA = Schema('file of keyframes', {
     'map_from_camera': Field('float64', ('K', 4, 4), (
         FINITE, Check('is not a rigid transform', lambda poses: ~are_rigid(poses)))),
     'offsets': Field('int64', ('K+1',), (Offsets('descriptors', 'points'),)),
-    'pixels': Field('uint16', ('n', 2), is_mapped=True),
-    'points': Field('floats', ('n', 3), (FINITE,), is_mapped=True),
-    'descriptors': Field('uint8', ('n', 'c'), is_mapped=True),
+    'pixels': Field('uint16', ('n', 2), is_stored=True),
+    'points': Field('floats', ('n', 3), (FINITE,), is_stored=True),
+    'descriptors': Field('uint8', ('n', 'c'), is_stored=True),
     'words': Field('uint16', ('n',), (_check_words,)),
     'vocabulary': Field('uint8', ('W', 'd')),
     'codebook': Field('int16', ('c', 256, 's'), is_optional=True),  # if they are compressed
@@ -280,7 +280,7 @@ _SCHEMA = Schema('file of keyframes', {
     'deviation_per_metre': Field('float64', ('K',), is_optional=True),
     'source_rows': Field('int64', ('K',), is_optional=True),  # missing if there is one source
     # both missing unless images were requested
-    'images': Field('uint8', ('b',), is_optional=True, is_mapped=True),
+    'images': Field('uint8', ('b',), is_optional=True, is_stored=True),
     'image_offsets': Field('int64', ('K+1',), (Offsets('images', 'bytes'),), is_optional=True),
     # missing if there is a single camera; the header contains the cameras
     'camera_rows': Field('int64', ('K',), is_optional=True),

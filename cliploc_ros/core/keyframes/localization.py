@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, TAKEN, invert_transform
+from cliploc_ros.core.geometry.transforms import SAME_ANSWER, SAME_SIGHT, invert_transform
 from cliploc_ros.core.keyframes.features import SIFT, FeatureKind, Features
 from cliploc_ros.core.keyframes.layer import KeyframeLayer
 from cliploc_ros.core.keyframes.places import Recognition, RecognizedPlace
@@ -58,6 +58,11 @@ _MOST_RANKED = 500
 NEAR_M, NEAR_DEG = SAME_SIGHT
 # Number of three-point samples: for the first place, and for each rival.
 _ITERATIONS, _RIVAL_ITERATIONS = 3000, 1000
+# A part of a place was elsewhere if a pose within this tolerance of its own, which other features
+# agree with, moves the median of their points by this [m]; errors of maps move it by up to .2 m.
+# Features within this angle of agreeing ones (20 px at f = 525 px) do not count: a texture of the
+# bonsai's room repeats every .3 m. Measured on four rooms, see studies/README.md.
+_MOVED, _LEAST_MOVE_M, _BESIDE = SAME_SIGHT._replace(distance_m=4.0), 0.3, 20.0 / 525.0
 # Before the search for a rival, all points within this multiple of the tolerance are removed.
 _RIVAL_TOLERANCE = 3.0
 #: No constraint on the camera.
@@ -155,8 +160,8 @@ class _Place(NamedTuple):
     inliers: _Matched
     agreed: int
     cells: NDArray[np.int64]
-    #: Number of other features that agree on a pose nearby, see RecognizedPlace.parted
-    parted: int = 0
+    #: Features that agree on another pose, from which their points have moved
+    parted: NDArray[np.int64] = np.empty(0, dtype=np.int64)
 
 
 class KeyframeLocalizer:
@@ -219,13 +224,11 @@ class KeyframeLocalizer:
             return Recognition(is_thorough=is_thorough)
         descriptors = kind.units(features.descriptors)
         look = _Look(features, bearings[known], camera, constraint, kind.least_inliers)
-        if fast is None:
-            places, outside_m = _places(
-                *self._search_fast(descriptors, look, guesses, deadline), look)
-        else:
-            places, outside_m = _places(*self._search_thoroughly(
-                descriptors, look, guesses, [place.map_from_camera for place in fast.places],
-                deadline), look)
+        searched = self._search_fast(descriptors, look, guesses, deadline) if fast is None else (
+            self._search_thoroughly(descriptors, look, guesses, [
+                place.map_from_camera for place in fast.places], deadline))
+        places, outside_m = _places(*searched, look)
+        if is_thorough:
             places[:1] = [self._guided(place, look, descriptors) for place in places[:1]]
         if time.monotonic() > deadline:
             return Recognition(is_complete=False, is_thorough=is_thorough)
@@ -279,8 +282,7 @@ class KeyframeLocalizer:
         chosen = ranks[np.argsort(-np.array(votes), kind='stable')][:_VOTED].tolist()
         for guess in (*guesses, *found):
             chosen += keyframes_near(self.layer.map_from_camera, guess)[:PROPOSED].tolist()
-        chosen = [*dict.fromkeys(chosen)]
-        matched = self._match(descriptors, chosen, deadline)
+        matched = self._match(descriptors, [*dict.fromkeys(chosen)], deadline)
         first = _place(matched, look, found=found)
         if first is not None:
             near = keyframes_near(self.layer.map_from_camera, first.map_from_camera)
@@ -298,8 +300,7 @@ class KeyframeLocalizer:
         camera_from_map = invert_transform(place.map_from_camera)
         near = keyframes_near(self.layer.map_from_camera, place.map_from_camera)
         seen = dict.fromkeys([*self._used(place)[0].tolist(), *near.tolist()])
-        tree = cKDTree(look.bearings)
-        matched = place.inliers
+        tree, matched = cKDTree(look.bearings), place.inliers
         for keyframe in [*seen][:_GUIDED_KEYFRAMES]:
             theirs = self.layer.points_in_map(keyframe)
             inside = theirs @ camera_from_map[:3, :3].T + camera_from_map[:3, 3]
@@ -356,10 +357,11 @@ class KeyframeLocalizer:
         confirmed = np.count_nonzero(place.cells[comparable]) / max(1, int(comparable.sum()))
         among = place.among.select(np.nonzero(np.isin(place.among.keyframes, used))[0])
         free = free_focal(among.points, look.bearings[among.features], invert_transform(pose))
-        ratio, aspect, deviation, of_aspect = 1.0, 1.0, np.inf, np.inf
-        if free is not None:
-            ratio, aspect = np.exp(free[0])
-            deviation, of_aspect = np.hypot(_MUCH_ALIKE * free[1], _STRETCHED)
+        (ratio, aspect), (deviation, of_aspect) = ((1.0, 1.0), (np.inf, np.inf)) if free is None \
+            else (np.exp(free[0]), np.hypot(_MUCH_ALIKE * free[1], _STRETCHED))
+        # features beside agreeing ones show a texture that repeats, not a part that has moved
+        parted = np.count_nonzero(cKDTree(look.bearings[place.inliers.features]).query(
+            look.bearings[np.unique(place.parted)])[0] > _BESIDE)
         shared = self._shared(pose, counts)
         covariance = _MUCH_ALIKE**2 * place.covariance + shared
         return RecognizedPlace(
@@ -369,7 +371,7 @@ class KeyframeLocalizer:
             look.features.pixels[place.inliers.features], place.inliers.rows,
             place.inliers.points, is_thorough,
             float(_distances(self.layer.map_from_camera[used], pose).min()),
-            place.parted / (place.agreed + place.parted),
+            parted / (place.agreed + parted),
             self.layer.recorded(int(used[0])))
 
     def _match(self, descriptors: NDArray[np.float32], chosen: Sequence[int], deadline: float
@@ -402,9 +404,8 @@ class KeyframeLocalizer:
             poses[:, :3, 3] - pose[:3, 3], axis=1))
         turns = Rotation.from_matrix(poses[:, :3, :3].transpose(0, 2, 1) @ pose[:3, :3])
         angle = shares @ turns.magnitude()
-        position = _KEYFRAME_M**2 + grown_m ** 2
-        rotation = _KEYFRAME_RAD**2 + (PER_RADIAN * angle) ** 2
-        return np.diag(np.repeat([position, rotation], 3))
+        return np.diag(np.repeat([_KEYFRAME_M**2 + grown_m**2,
+                                  _KEYFRAME_RAD**2 + (PER_RADIAN * angle)**2], 3))
 
 
 def _places(first: _Place | None, matched: _Matched, look: _Look
@@ -414,27 +415,34 @@ def _places(first: _Place | None, matched: _Matched, look: _Look
     The place whose points lie in the most cells of the image comes first: a poster has many
     points, but shows only a part of its place.
     """
-    place, found, places, outside_m = first, 0, list[_Place](), None
+    place, found, places, outside_m = first, list[_Place](), list[_Place](), None
     while place is not None and (not places or place.agreed >= LEAST_INLIERS):
         if look.constraint.allows(place.map_from_camera):
-            found += 1
-            pose = place.map_from_camera
-            places = [other._replace(parted=max(place.agreed, other.parted))
-                      if SAME_SIGHT.agree(pose, other.map_from_camera)
-                      and not TAKEN.agree(pose, other.map_from_camera) else other
-                      for other in places]
-            if not any(SAME_ANSWER.agree(pose, other.map_from_camera) for other in places):
+            found.append(place)
+            if not any(SAME_ANSWER.agree(place.map_from_camera, other.map_from_camera)
+                       for other in places):
                 places.append(place)
         elif outside_m is None and place.agreed >= LEAST_INLIERS:
             outside_m = look.constraint.outside_m(place.map_from_camera)
-        if found == MOST_PLACES:
+        if len(found) == MOST_PLACES:
             break
         taken = agreeing(matched.points, look.bearings[matched.features],
                          invert_transform(place.map_from_camera), _RIVAL_TOLERANCE)
         matched = matched.select(np.setdiff1d(np.arange(len(matched.features)), taken))
         place = _place(matched, look, _RIVAL_ITERATIONS)
+    places = [place._replace(parted=max((
+        other.inliers.features for other in found if _was_elsewhere(other, place)), key=len,
+        default=place.parted)) for place in places]
     return (sorted(places, key=lambda place: -np.count_nonzero(place.cells)),
             None if places else outside_m)
+
+
+def _was_elsewhere(part: _Place, place: _Place) -> bool:
+    """Check whether the points of another pose have moved, if a place is right."""
+    move = place.map_from_camera @ invert_transform(part.map_from_camera) - np.eye(4)
+    moves_m = np.linalg.norm(part.inliers.points @ move[:3, :3].T + move[:3, 3], axis=1)
+    return bool(_MOVED.agree(part.map_from_camera, place.map_from_camera)
+                and np.median(moves_m) > _LEAST_MOVE_M)
 
 
 def _place(matched: _Matched, look: _Look, iterations: int = _ITERATIONS,

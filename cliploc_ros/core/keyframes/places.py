@@ -45,8 +45,8 @@ class RecognizedPlace(NamedTuple):
     #: How far the view of the nearest keyframe with agreeing points is from the pose: the sum of
     #: distance / 2 m and angle / 40 degrees
     apart: float = 0.5
-    #: Share, 0 to 1, of the agreeing features that agree on another pose nearby: a part of the
-    #: place was elsewhere when it was mapped
+    #: Share, 0 to 1, of the agreeing features that agree on another pose, as points do that have
+    #: moved: a part of the place was elsewhere when it was mapped
     parted: float = 0.0
     recorded: str = ''  #: Recording of the keyframe with most points, see KeyframeLayer.recorded
 

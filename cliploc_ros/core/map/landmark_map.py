@@ -156,6 +156,7 @@ class LandmarkMap:
     #: Optional fields of each landmark; empty if the map has none
     details: tuple[LandmarkDetails, ...] = ()
     map_set: MapSet = NO_SET  #: Identity that the files next to the map must share
+    nav2_map: str = ''  #: File of Nav2's grid of this place, from the folder of the map
     tags: tuple[Tag, ...] = ()  #: Fiducials, which name themselves
 
     def __len__(self) -> int:
@@ -170,7 +171,7 @@ class LandmarkMap:
         return LandmarkMap(
             self.frame_id, pick(self.landmark_ids), pick(self.labels), pick(self.class_ids),
             self.centers[rows], self.semi_axes[rows], self.quats_xyzw[rows],
-            pick(self.details) if self.details else ())
+            pick(self.details) if self.details else (), nav2_map=self.nav2_map)
 
     def with_more(self, other: 'LandmarkMap') -> 'LandmarkMap':
         """Return the map with the landmarks of another map appended."""
@@ -180,7 +181,7 @@ class LandmarkMap:
             np.concatenate([self.semi_axes, other.semi_axes]),
             np.concatenate([self.quats_xyzw, other.quats_xyzw]),
             self.every_detail + other.every_detail if self.details or other.details else (),
-            self.map_set, self.tags + other.tags)
+            self.map_set, self.nav2_map, self.tags + other.tags)
 
     def joined(self, into: NDArray[np.int64]) -> 'LandmarkMap':
         """Return the map with the labels and classes of parts added to their whole landmarks.
@@ -324,7 +325,10 @@ class LandmarkMap:
         finish_set(Path(path), map_set.digest)
         tree = parse_parameters(text, path)
         found = tree[find_map_node(tree, path)]['ros__parameters']['map']
-        return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set)
+        nav2_map = checked_text(found['nav2_map'], f'{path}: map: nav2_map') \
+            if 'nav2_map' in found else ''
+        return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set,
+                       nav2_map=nav2_map)
 
     @staticmethod
     def empty(frame_id: str) -> 'LandmarkMap':
@@ -342,7 +346,7 @@ class LandmarkMap:
             The tree is invalid; the message names the source, the landmark and the field to
             correct.
         """
-        check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map', ('tags',))
+        check_keys(tree, ('frame_id', 'landmarks'), f'{source}: map', ('nav2_map', 'tags'))
         frame_id = checked_text(tree['frame_id'], f'{source}: map: frame_id')
         landmarks, tags = tree['landmarks'], read_tags(tree.get('tags') or {}, source)
         if not isinstance(landmarks, Mapping):

@@ -97,6 +97,7 @@ def _lines(landmark_map: LandmarkMap) -> Iterator[str]:
     yield '  ros__parameters:'
     yield '    map:'
     yield f'      frame_id: {quoted(landmark_map.frame_id)}'
+    yield from [f'      nav2_map: {quoted(landmark_map.nav2_map)}'] * bool(landmark_map.nav2_map)
     yield f'      landmarks:{"" if len(landmark_map) else " {}"}'
     for row, landmark_id in enumerate(landmark_map.landmark_ids):
         yield f'        {quoted(landmark_id)}:'

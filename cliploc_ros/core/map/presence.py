@@ -93,8 +93,7 @@ class _Record(NamedTuple):
         missed = _OF_SHARE * (1.0 - share) + self.missed
         misses = min(self.misses, max(0.0, found / _BY_CHANCE - found - missed))
         there = log_evidence(found, missed, 0.0, misses)
-        away = misses * log(1.0 - _BY_CHANCE)
-        return float(expit(log(_GONE / (1.0 - _GONE)) + away - there))
+        return float(expit(log(_GONE / (1.0 - _GONE)) + misses * log(1.0 - _BY_CHANCE) - there))
 
 
 class Missing:

@@ -13,13 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cliploc_ros.core.geometry import ellipsoid
 from cliploc_ros.core.geometry.camera import Camera
-from cliploc_ros.core.geometry.ellipsoid import (
-    ellipse_bboxes,
-    ellipses_in_pixels,
-    project_ellipsoids,
-    shared_areas,
-)
 from cliploc_ros.core.geometry.transforms import invert_transform
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 
@@ -71,8 +66,8 @@ def boxes_in_image(camera: Camera, camera_from_map: NDArray[np.float64],
                    centers: NDArray[np.float64], shapes: NDArray[np.float64], least_share: float,
                    least_side_px: float) -> InImage:
     """Project ellipsoids (n, 3), (n, 6) to boxes in an image."""
-    boxes = ellipse_bboxes(ellipses_in_pixels(
-        project_ellipsoids(camera_from_map, centers, shapes), camera))
+    boxes = ellipsoid.ellipse_bboxes(ellipsoid.ellipses_in_pixels(
+        ellipsoid.project_ellipsoids(camera_from_map, centers, shapes), camera))
     bounds = np.array([0.0, 0.0, camera.width, camera.height])
     shown = np.clip(boxes, 0.0, np.tile(bounds[2:], 2))
     return InImage(boxes, shown, is_in_image(boxes.T, bounds, least_share) & (
@@ -86,7 +81,7 @@ def is_hidden(boxes: NDArray[np.float64], is_nearer: NDArray[np.bool_], most: fl
     Row i of is_nearer (n, n) marks the boxes that are nearer than box i.
     """
     areas = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
-    covers = shared_areas(boxes, boxes) > most * areas[:, None]
+    covers = ellipsoid.shared_areas(boxes, boxes) > most * areas[:, None]
     return np.asarray((is_nearer & covers).any(axis=1))
 
 

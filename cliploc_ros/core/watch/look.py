@@ -29,12 +29,7 @@ from cliploc_ros.core.acceptance.contenders import Contender, JoinedFrames, join
 from cliploc_ros.core.calibration import CALIBRATION, Calibration
 from cliploc_ros.core.fit.tag_pose import find_tag_places
 from cliploc_ros.core.fit.verification import scores_of
-from cliploc_ros.core.geometry.transforms import (
-    SAME_ANSWER,
-    SAME_NEIGHBOURHOOD,
-    Tolerance,
-    pose_error,
-)
+from cliploc_ros.core.geometry import transforms
 from cliploc_ros.core.keyframes.localization import ImageRecognizer
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.visibility import Expected, expect
@@ -56,7 +51,7 @@ _GRID = np.tile(np.eye(4), (len(_STEPS), 1, 1))
 _GRID[:, :3, :3] = Rotation.from_rotvec(_STEPS[:, :3], degrees=True).as_matrix()
 _GRID[:, [0, 2], 3] = _STEPS[:, 3:]
 # Minimum distance between poses that are refined.
-_APART = Tolerance(_TERMS.apart_m, _TERMS.apart_deg)
+_APART = transforms.Tolerance(_TERMS.apart_m, _TERMS.apart_deg)
 
 
 class Alignment(NamedTuple):
@@ -88,8 +83,10 @@ class Alignment(NamedTuple):
 def _here_and_elsewhere(places: Sequence[tuple[NDArray[np.float64], float]],
                         given: NDArray[np.float64]) -> tuple[float, float]:
     """Return the greatest log odds, at least 0, of the poses at a given pose, and elsewhere."""
-    return (max([0.0, *(odds for pose, odds in places if SAME_ANSWER.agree(pose, given))]),
-            max([0.0, *(odds for pose, odds in places if not SAME_ANSWER.agree(pose, given))]))
+    here, elsewhere = (max([0.0, *(odds for pose, odds in places
+                                   if transforms.SAME_ANSWER.agree(pose, given) == near)])
+                       for near in (True, False))
+    return here, elsewhere
 
 
 def look_at(landmark_map: LandmarkMap, observation: Observation, options: RelocalizerOptions
@@ -121,10 +118,10 @@ def align(joined: JoinedFrames, map_from_camera: NDArray[np.float64]) -> Alignme
     if len(finalists) > 1:
         finalists += [joined.refined(finalist) for finalist in finalists]
     found = joined.contenders(finalists, [True] * len(finalists))
-    errors = [pose_error(contender.pose, map_from_camera) for contender in found]
+    errors = [transforms.pose_error(contender.pose, map_from_camera) for contender in found]
     near = [row for row, error in enumerate(errors)
-            if error[0] < SAME_NEIGHBOURHOOD.distance_m
-            and error[1] < SAME_NEIGHBOURHOOD.angle_deg]
+            if error[0] < transforms.SAME_NEIGHBOURHOOD.distance_m
+            and error[1] < transforms.SAME_NEIGHBOURHOOD.angle_deg]
     odds = [contender.odds
             - 0.5 * ((away_m / _TERMS.pull_m) ** 2 + (away_deg / _TERMS.pull_deg) ** 2)
             for contender, (away_m, away_deg) in zip(found, errors, strict=True)]

@@ -4,6 +4,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -30,7 +31,7 @@ class Images:
     """The images of a folder or a recording, found by stamp, and by camera in a recording."""
 
     def __init__(self, frames: Sequence[RawFrame], of_folder: bool = False):
-        self._frames, self.of_folder = frames, of_folder
+        self.frames, self.of_folder = frames, of_folder
         self._stamps_ns = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
         self._cameras = np.array([frame.camera for frame in frames], dtype=np.str_)
         self._lock = threading.Lock()  # readers of recordings are not thread-safe
@@ -58,13 +59,13 @@ class Images:
         """Return a camera's distorted image at a time [s], its camera and its depth image."""
         place = self._place(stamp_s, camera)
         with self._lock:
-            read_depth = None if place is None else self._frames[place].depth
+            read_depth = None if place is None else self.frames[place].depth
             return None if place is None or read_depth is None else (
-                *self._frames[place].color(), read_depth())
+                *self.frames[place].color(), read_depth())
 
     def _place(self, stamp_s: float, camera: str) -> int | None:
-        # the stamps of a folder are unique, whatever its cameras
-        places = np.nonzero((self._cameras == camera) | (self._cameras == ''))[0]
+        # the stamps of a folder are unique, whatever its cameras; NAME#1: see join_detections
+        places = np.nonzero(np.isin(self._cameras, (camera, camera.partition('#')[0], '')))[0]
         if not len(places):
             return None
         offsets = np.abs(self._stamps_ns[places] - round(stamp_s * NS_PER_S))
@@ -73,13 +74,14 @@ class Images:
 
 
 def images_of_recording(recording: MapRecording, cameras: Sequence[str]) -> Images | None:
-    """Open the images that a map was built from; None if they are missing."""
-    if recording.source is None:
-        return None
-    return open_images(recording.source, BagTopics(
-        recording.image, recording.camera_info, recording.rectified,
-        intrinsics=recording.intrinsics), cameras, FolderOptions(
-        recording.intrinsics, images=recording.images, layout=recording.layout))
+    """Open the images of all recordings of a map; None if they are missing."""
+    parts = [(open_images(part.source, BagTopics(
+        part.image, part.camera_info, part.rectified, intrinsics=part.intrinsics),
+        part.cameras or cameras, FolderOptions(
+            part.intrinsics, images=part.images, layout=part.layout)),
+        round(part.later_s * NS_PER_S)) for part in (recording, *recording.others) if part.source]
+    return Images([replace(frame, stamp_ns=frame.stamp_ns + later_ns) for part, later_ns in parts
+                   for frame in part.frames], parts[0][0].of_folder) if parts else None
 
 
 def open_images(path: Path, topics: BagTopics, cameras: Sequence[str] = ('',),

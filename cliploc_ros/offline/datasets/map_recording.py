@@ -46,6 +46,12 @@ class MapRecording:
     #: rotation (3, 3)
     scale: float = 1.0
     rotation: list[list[float]] = field(default_factory=lambda: np.eye(3).tolist())
+    #: Of several recordings with joined observations: names of the cameras of this one, what was
+    #: added to its stamps [s], and the further recordings
+    cameras: tuple[str, ...] = ()
+    later_s: float = 0.0
+    others: tuple['MapRecording', ...] = ()
+    is_update: bool = False  #: Whether the map was updated with it, and has older landmarks, too
 
     @property
     def is_moved(self) -> bool:
@@ -76,10 +82,10 @@ def save_recording(map_file: Path, recording: MapRecording, place: Path | None =
     """
     folder = map_file.resolve().parent
     values: dict[str, Any] = asdict(recording) | ({'set': set_digest} if set_digest else {})
-    for name in _PATHS:
-        if values[name] is not None:
-            path = values[name].resolve()
-            values[name] = str(path) if path.is_relative_to(recordings_folder()) else (
+    for part in (values, *values['others']):
+        for name in (name for name in _PATHS if part[name] is not None):
+            path = part[name].resolve()
+            part[name] = str(path) if path.is_relative_to(recordings_folder()) else (
                 os.path.relpath(path, folder))
     storage.write_text(place or recording_path(map_file), json.dumps(values, indent=1))
 
@@ -89,19 +95,22 @@ def load_recording(map_file: Path) -> MapRecording | None:
 
     Missing images are None. DatasetError: the file is damaged.
     """
-    path = recording_path(map_file)
-    if not path.is_file():
-        return None
+    path, of_map = recording_path(map_file), ''
     try:
-        values = storage.parse_json(storage.read_file(path))
-        digest = str(values.pop('set', ''))
-        if digest and map_file.exists():
+        if map_file.exists():
             with storage.open_file(map_file) as file:
-                check_set(digest, set_of(file.read(_HEAD).decode(errors='replace')).digest)
-        paths = {name: map_file.resolve().parent / values[name] for name in _PATHS
-                 if values.get(name) is not None}
-        found = MapRecording(**(values | {
-            name: path if path.exists() else None for name, path in paths.items()}))
+                of_map = set_of(file.read(_HEAD).decode(errors='replace')).digest
+            storage.finish_set(map_file, of_map)
+        if not path.is_file():
+            return None
+        values = storage.parse_json(storage.read_file(path))
+        check_set(str(values.pop('set', '')), of_map)
+        for part in (*values.get('others', ()), values):
+            for name in (name for name in _PATHS if part.get(name) is not None):
+                place = map_file.resolve().parent / part[name]
+                part[name] = place if place.exists() else None
+        found = MapRecording(**values | {'others': tuple(
+            MapRecording(**part) for part in values.get('others', ()))})
         turn = np.array(found.rotation, dtype=float)
         is_valid = turn.shape == (3, 3) and 0.0 < found.scale < np.inf and is_rigid(
             make_transform(turn, np.zeros(3)))

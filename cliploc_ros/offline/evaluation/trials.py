@@ -374,5 +374,4 @@ def turned(direction: NDArray[np.float64], angle: float, rng: np.random.Generato
             ) -> NDArray[np.float64]:
     """Return a direction (3,) rotated by an angle [rad] about a random perpendicular axis."""
     axis = np.cross(direction, rng.normal(size=3))
-    turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
-    return np.asarray(turn.apply(direction))
+    return np.asarray(Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).apply(direction))

@@ -21,7 +21,7 @@ from cliploc_ros.core.keyframes.layer import (
 from cliploc_ros.core.map.landmark_embeddings import LandmarkEmbeddings, load_embeddings_of_map
 from cliploc_ros.core.map.landmark_map import LandmarkMap
 from cliploc_ros.core.map.map_file import load_removed, removed_path, write_landmarks, write_map
-from cliploc_ros.core.map.parameter_file import MapSet
+from cliploc_ros.core.map.parameter_file import read_text
 from cliploc_ros.core.observation import Detections, Observation
 from cliploc_ros.core.tag_detection import detect_tags
 from cliploc_ros.errors import MapError, MappingError, ModelError, counted
@@ -31,6 +31,7 @@ from cliploc_ros.models.protocols import ClipOptions
 from cliploc_ros.models.xfeat import feature_kinds
 from cliploc_ros.offline.datasets.frames import Frames
 from cliploc_ros.offline.datasets.map_recording import MapRecording, recording_path, save_recording
+from cliploc_ros.offline.datasets.observations import save_observations
 from cliploc_ros.offline.mapping.building import MappingReport, Progress, build_map
 from cliploc_ros.offline.mapping.labelling import embed_landmarks, embed_phrases, label_landmarks
 from cliploc_ros.offline.mapping.landmarks import Landmarks, classes_of
@@ -62,7 +63,7 @@ class MadeMap:
     note: str = ''  #: The reason why the requested layer is missing
     removed: LandmarkMap | None = None  #: Landmarks that updates removed from the map
     keyframes: UpdatedLayer | None = None  #: What an update made of the keyframes
-    updated: MapSet | None = None  #: The map that was updated
+    updated: str = ''  #: Text of the map that was updated: the studio may change it meanwhile
 
 
 @dataclass(frozen=True)
@@ -265,6 +266,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
         The map is invalid, the recording does not belong to it, or the text tower cannot be
         loaded.
     """
+    text = read_text(path)  # before the map
     old, place, kinds = LandmarkMap.from_file(path), layer_path(path), feature_kinds()
     old_layer = load_layer_of_map(place, old, kinds) if place.exists() else None
     if layer is not None and old_layer is not None:
@@ -279,8 +281,7 @@ def update_map(path: Path, detections: PosedDetections, labeller: Labeller,
                 new, map_from_camera=found.map_from_given @ new.map_from_camera))
     else:
         made, gone = make_map(detections, labeller, options, frames, layer), Landmarks.none()
-    made = replace(made, updated=old.map_set, landmark_map=replace(
-        made.landmark_map, tags=old.tags))
+    made = replace(made, updated=text, landmark_map=replace(made.landmark_map, tags=old.tags))
     if old_layer is None:
         return made
     keyframes = update_layer(old_layer, made.layer, gone)
@@ -309,18 +310,26 @@ def _label_new(updated: UpdatedMap, detections: PosedDetections, labeller: Label
 
 
 def write_made_map(path: Path, made: MadeMap, comments: Iterable[str], recording: MapRecording,
-                   updated: Path | None = None) -> list[str]:
+                   updated: Path | None = None, together: PosedDetections | None = None
+                   ) -> list[str]:
     """Write a map and the files next to it as one set; return lines about its keyframes.
 
-    The keyframes of a map that is replaced are removed if the new one has none.
+    The keyframes of a map that is replaced are removed if the new one has none. The detections of
+    several recordings `together`, with poses in the map, get a file next to it.
 
     CliplocError: a file cannot be written, or another program changed the map while it was
     updated; nothing was changed.
     """
     is_in_place = updated is not None and path.resolve() == updated.resolve()
-    if is_in_place and LandmarkMap.from_file(path).map_set != made.updated:
+    if is_in_place and read_text(path) != made.updated:
         raise MapError(f'{path}: another program changed it during this update; update again')
-    besides: dict[Path, WriteOfSet | None] = {
+    besides: dict[Path, WriteOfSet | None] = {}
+    if together is not None:
+        recording = replace(recording, observations=path.with_suffix('.recordings.npz'))
+        # with the poses of the first recording
+        found = together.moved(1.0 / recording.scale, np.array(recording.rotation).T)
+        besides[recording.observations] = lambda place, _: save_observations(place, found)
+    besides |= {
         recording_path(path): partial(save_recording, path, recording),
         removed_path(path): partial(
             write_landmarks, landmark_map=made.removed) if made.removed else None}

@@ -230,8 +230,7 @@ def _solve(views: Views, derivatives: NDArray[np.float64], linear: Linear,
     gradients = np.zeros((viewpoints.max() + 1, len(step)))
     np.add.at(gradients, viewpoints, np.einsum(
         'meg,me->mg', free, linear.weights * (residuals + free @ step)))
-    covariance = (inverse @ gradients.T @ gradients @ inverse
-                  + inverse @ np.diag(prior) @ inverse)
+    covariance = (inverse @ gradients.T @ gradients @ inverse + inverse @ np.diag(prior) @ inverse)
     return step, np.sqrt(np.maximum(np.diag(covariance), 1e-24))
 
 

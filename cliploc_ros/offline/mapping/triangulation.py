@@ -102,8 +102,7 @@ def depth_hypotheses(views: Views, rows: NDArray[np.int64]
     in_camera = _middles(views, rows) * depths[:, None]
     centers = np.einsum('fji,fj->fi', views.rotations[frames],
                         in_camera - views.translations[frames])
-    radii = np.maximum(box_radii(views, rows), 1e-3) * depths
-    return centers, radii[:, None, None] * np.eye(3)
+    return centers, (np.maximum(box_radii(views, rows), 1e-3) * depths)[:, None, None] * np.eye(3)
 
 
 def scaled_depths(views: Views, detections: PosedDetections, landmarks: Landmarks,

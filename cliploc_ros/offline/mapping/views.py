@@ -162,8 +162,7 @@ def _levers(detections: PosedDetections) -> NDArray[np.float64]:
 def _inverses(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotations (F, 3, 3) and translations (F, 3) of the inverses of poses (F, 4, 4)."""
     rotations = np.ascontiguousarray(poses[:, :3, :3].transpose(0, 2, 1))
-    translations = -np.einsum('fij,fj->fi', rotations, poses[:, :3, 3])
-    return rotations, np.ascontiguousarray(translations)
+    return rotations, np.ascontiguousarray(-np.einsum('fij,fj->fi', rotations, poses[:, :3, 3]))
 
 
 def thin_out(views: Views, most: int) -> NDArray[np.bool_]:

@@ -229,8 +229,7 @@ def _again(seen: SeenFrame, raw: RawFrame) -> SeenFrame:
         _, camera = raw.color()
         depths, spreads = depths_of_boxes(raw.depth(), camera, seen.bboxes_in_image)
     assert raw.map_from_camera is not None
-    return replace(seen, map_from_camera=raw.map_from_camera, depths=depths,
-                   depth_spreads=spreads)
+    return replace(seen, map_from_camera=raw.map_from_camera, depths=depths, depth_spreads=spreads)
 
 
 def _record(frames: Frames, options: RecordingOptions, described: str, outputs: Log,

@@ -7,6 +7,7 @@ atomic hold it, too.
 """
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, RLock
@@ -210,7 +211,11 @@ class Document:
             if not self.landmarks:
                 raise edits.EditError(f'{self.path}: a map without landmarks is not saved; create '
                                       'one, or delete the file')
-            file = self.file.with_landmarks(self.landmarks)
+            base = self.file
+            if self.has_conflict:
+                with suppress(CliplocError):  # the set of the other program stays
+                    base = read_map_file(self.path)
+            file = base.with_landmarks(self.landmarks)
             self._journal.append({'writing': file.digest})
             file.write(self.file)
             self._take_file(file, self.landmarks)
@@ -229,8 +234,10 @@ class Document:
             found = {key: replace(before.get(key, one), fields=one.fields, look=one.look)
                      for key, one in file.landmarks.items()}
             self._take('edit', edits.Change('reload the file', {**dict.fromkeys(before), **found}))
+            self.notes += (*file.notes, *[
+                'views and keyframes are those from before: start the studio again'
+            ] * (file.map_set != self.file.map_set))
             self._take_file(file, found)
-            self.notes += file.notes
             return f'reloaded {self.path.name}; undo reverts this'
 
     def _take_file(self, file: MapFile, landmarks: edits.Landmarks) -> None:

@@ -212,8 +212,7 @@ def _unrelated(landmark_map: LandmarkMap, detections: PosedDetections) -> str:
 def give_advice(report: CheckReport, of_folder: bool = False) -> list[Advice]:
     """Return pieces of advice, each of one or two sentences; of_folder: see CheckOptions."""
     recorded = report.recording.trials if report.recording else ()
-    misled = [trial for trial in (*recorded, *report.grid.trials)
-              if trial.verdict == 'misled']
+    misled = [trial for trial in (*recorded, *report.grid.trials) if trial.verdict == 'misled']
     advice = [Advice('this map has no keyframes: build it again from all images')] * (
         report.recording is not None and not (report.keyframes or report.passed))
     advice += [Advice(report.tilt)] * bool(report.tilt)
