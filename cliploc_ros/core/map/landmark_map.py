@@ -323,10 +323,9 @@ class LandmarkMap:
         finish_set(Path(path), map_set.digest)
         tree = parse_parameters(text, path)
         found = tree[find_map_node(tree, path)]['ros__parameters']['map']
-        nav2_map = checked_text(found['nav2_map'], f'{path}: map: nav2_map') \
-            if 'nav2_map' in found else ''
-        return replace(LandmarkMap.from_mapping(found, str(path)), map_set=map_set,
-                       nav2_map=nav2_map)
+        landmark_map = LandmarkMap.from_mapping(found, str(path))  # it checks the tree
+        return replace(landmark_map, map_set=map_set, nav2_map=checked_text(
+            found['nav2_map'], f'{path}: map: nav2_map') if 'nav2_map' in found else '')
 
     @staticmethod
     def empty(frame_id: str) -> 'LandmarkMap':
