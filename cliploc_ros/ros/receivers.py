@@ -147,7 +147,8 @@ class RunningLocalizer:
         node, given_on = self._node, self._publisher.topic_name
         takers = self._nodes('subscriptions', given_on) if self._name == AUTO else set()
         topics = {str(node.resolve_topic_name(name)) for name in {self._name} - {'', AUTO}}
-        for space, _, name in (taker.rpartition('/') for taker in takers):
+        # a node that is not discovered yet has a namespace without '/'
+        for space, _, name in (taker.rpartition('/') for taker in takers if taker[0] == '/'):
             with suppress(NodeNameNonExistentError):  # it has ended, or is not fully discovered
                 topics |= {topic for topic, types in node.get_publisher_names_and_types_by_node(
                     name, space or '/') if 'geometry_msgs/msg/PoseWithCovarianceStamped' in types}
