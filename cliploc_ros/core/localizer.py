@@ -441,6 +441,7 @@ class Localizer:
             self.track = None
             return found.covariance
         if found.map_from_camera is None or found.covariance is None or found.evidence is None:
+            self.track = self.track and self.track.carried(odom_from_camera)
             return None
         answer = Answered(odom_from_camera, found.map_from_camera, found.covariance,
                           found.evidence.confidence, found.accepted)

@@ -159,16 +159,21 @@ def test_a_carried_robot_has_no_pose_until_two_answers_agree(tmp_path):
     drive = Drive(1, 'nothing', tmp_path, 'continuous')
     poses = [drive.localize(number)[0].carried for number in range(3)]
     assert all(pose is not None for pose in poses)
+    drive.objects = 0
+    blind, _ = drive.localize(12)
+    truth = drive.see(12)[1]
+    assert blind.found.map_from_camera is None and pose_error(blind.carried, truth)[0] < 0.05
+    drive.objects = 8
     track = drive.localizer.localizer.track
     elsewhere = track.map_from_camera.copy()
     elsewhere[0, 3] += 3.0
     drive.localizer.localizer.track = replace(track, map_from_camera=elsewhere)
-    found = [drive.localize(number)[0] for number in (3, 4)]
+    found = [drive.localize(number)[0] for number in (13, 14)]
     assert all(each.found.accepted for each in found)
     assert found[0].carried is None
     np.testing.assert_array_equal(found[1].carried, found[1].found.map_from_camera)
     drive.localizer.localizer.track = replace(track, map_from_camera=elsewhere)
-    found, _ = drive.localize(5, deadline=time.monotonic() + 60.0)
+    found, _ = drive.localize(15, deadline=time.monotonic() + 60.0)
     np.testing.assert_array_equal(found.carried, found.found.map_from_camera)
 
 
