@@ -276,18 +276,19 @@ def test_a_robot_at_rest_becomes_as_certain_as_the_shared_errors_and_no_more():
 
 
 def test_tracks_are_consistent_with_white_shared_and_odometry_errors():
-    rng, root = np.random.default_rng(1), np.sqrt(OWN)
+    rng, root, squares = np.random.default_rng(1), np.sqrt(OWN), []
     motion = scenes.rigid((0.2, 0.1, 0.0), degrees=6.0)
-    kept = math.exp(-math.hypot(0.2, 0.1) / 2.0 - math.radians(6.0) / 0.8)
-    squares = []
     for _ in range(60):
         track, truth, odom, shared = None, at(), at(), rng.normal(size=6)
-        for _ in range(20):
+        for number in range(20):
             odom = odom @ motion
             truth = moved_pose(truth @ motion, odometry_deviations(motion) * rng.normal(size=6))
-            shared = kept * shared + math.sqrt(1.0 - kept ** 2) * rng.normal(size=6)
             error = root @ (math.sqrt(0.6) * rng.normal(size=6) + math.sqrt(0.4) * shared)
             track = follow(track, answered(truth, error, odom))
+            # a rough answer changes nothing, whatever the precise ones share with it
+            rough = follow(track, Answered(odom, moved_pose(truth, 5.0 * root @ shared),
+                                           25.0 * OWN))
+            assert number < 3 or np.allclose(rough.covariance, track.covariance)
         squares.append(normalized_square(track.map_from_camera, track.covariance, truth))
     assert 4.5 < np.mean(squares) < 7.5
 

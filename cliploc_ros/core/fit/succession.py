@@ -3,34 +3,36 @@
 """A track: the pose by all answers of one run of odometry, and what a new answer adds to it.
 
 Answers of a place share images, landmarks and their errors, so ten answers are not ten independent
-measurements. The error of an answer is therefore the sum of two parts: a white part, and a shared
-part that hardly changes until the camera sees something else. The shared part is estimated
-together with the pose, as the state of a first-order Gauss-Markov process (Bar-Shalom, Li and
-Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 8.3). The
-variance of a robot that stands still thus falls to that of the shared part, but not below it.
+measurements. The error of an answer is therefore the sum of a white part and of a part that all
+answers of the track may share. In each direction, an answer reduces the variance of the track at
+most to the shared part of its own, and a rough answer does not change a better track. The rest is
+a Kalman filter. Such split covariances are those of Julier and Uhlmann, "Using Covariance
+Intersection for SLAM", 2007; here, all shared parts count as one error.
 
 An answer that contradicts the track does not change it: one of the two is wrong, and the track is
 in doubt. The next answer decides. If it agrees with the track, the doubt is over; if it agrees
 with the contradicting answer, the robot was carried, and a new track begins.
 """
 
-import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from cliploc_ros.core.fit.covariance import moved_pose, odometry_deviations
-from cliploc_ros.core.geometry.transforms import SAME_ANSWER, invert_transform, pose_difference
+from cliploc_ros.core.geometry.transforms import (
+    SAME_ANSWER,
+    invert_transform,
+    move_covariance,
+    pose_difference,
+)
 
 # None of these numbers is in calibration.yaml, because a track affects no decision about a pose.
 # They were chosen on simulated drives and on recordings, python -m studies.tracks.
-# Share of the variance of an answer that is white, and the way [m] and the turn [rad] after which
-# the correlation of the shared errors has fallen to 1 / e.
-_WHITE, _SHARED_M, _SHARED_RAD = 0.6, 2.0, 0.8
+# Share of the variance of an answer that is white.
+_WHITE = 0.6
 # Squared distances from the track: an accepted answer further away contradicts it, and a refused
 # pose further away is not used.
 _CONTRADICTION, _AGREEMENT = float(chdtri(6, 0.001)), float(chdtri(6, 0.05))
@@ -58,10 +60,7 @@ class Track:
     #: (4, 4), (4, 4): the camera by odometry, and by the track
     odom_from_camera: NDArray[np.float64]
     map_from_camera: NDArray[np.float64]
-    #: (12, 12): covariance of the errors of the pose and of the shared errors
-    joint: NDArray[np.float64]
-    #: (6,): estimate of the shared errors, in their standard deviations
-    shared: NDArray[np.float64]
+    covariance: NDArray[np.float64]  #: (6, 6): covariance of the pose, see Relocalization
     #: (6, 6): covariance of the last accepted answer for a filter that takes answers as
     #: independent. With it, the filter becomes as certain as the track, if it fuses the same
     #: answers and odometry.
@@ -69,24 +68,13 @@ class Track:
     #: The last accepted answer if it contradicts the track
     contradicting: Answered | None = None
 
-    @property
-    def covariance(self) -> NDArray[np.float64]:
-        """Return the covariance (6, 6) of the pose, see Relocalization."""
-        return self.joint[:6, :6]
-
     def carried(self, odom_from_camera: NDArray[np.float64]) -> 'Track':
         """Return the track after a motion, given the pose (4, 4) by odometry after it."""
         motion = invert_transform(self.odom_from_camera) @ odom_from_camera
         pose = self.map_from_camera @ motion
-        x, y, z = pose[:3, 3] - self.map_from_camera[:3, 3]
-        kept = math.exp(-float(np.linalg.norm(motion[:3, 3])) / _SHARED_M - float(
-            Rotation.from_matrix(motion[:3, :3]).magnitude()) / _SHARED_RAD)
-        transition = np.diag(np.repeat([1.0, kept], 6))
-        transition[:3, 3:6] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
-        added = np.append(odometry_deviations(motion) ** 2, np.full(6, 1.0 - kept ** 2))
+        covariance = move_covariance(self.covariance, pose[:3, 3] - self.map_from_camera[:3, 3])
         return replace(self, odom_from_camera=odom_from_camera, map_from_camera=pose,
-                       joint=transition @ self.joint @ transition.T + np.diag(added),
-                       shared=kept * self.shared)
+                       covariance=covariance + np.diag(odometry_deviations(motion) ** 2))
 
 
 def follow(track: Track | None, answer: Answered) -> Track | None:
@@ -101,11 +89,8 @@ def follow(track: Track | None, answer: Answered) -> Track | None:
     if not answer.is_accepted and answer.confidence < _LEAST_CONFIDENCE:
         return track
     covariance = answer.covariance / (1.0 if answer.is_accepted else answer.confidence)
-    observed = np.hstack([np.eye(6), _shared_root(covariance)])
-    innovation = (pose_difference(track.map_from_camera, answer.map_from_camera)
-                  - observed[:, 6:] @ track.shared)
-    expected = observed @ track.joint @ observed.T + _WHITE * covariance
-    square = float(innovation @ np.linalg.solve(expected, innovation))
+    innovation = pose_difference(track.map_from_camera, answer.map_from_camera)
+    square = float(innovation @ np.linalg.solve(track.covariance + covariance, innovation))
     if square > (_CONTRADICTION if answer.is_accepted else _AGREEMENT):
         if not answer.is_accepted:
             return track
@@ -114,38 +99,26 @@ def follow(track: Track | None, answer: Answered) -> Track | None:
         # with this covariance, they would just agree
         return replace(track, contradicting=answer,
                        for_filter=square / _CONTRADICTION * covariance)
-    gain = np.linalg.solve(expected, observed @ track.joint).T
-    rest, step = np.eye(12) - gain @ observed, gain @ innovation
-    # Joseph's form: the covariance stays positive definite
-    joint = rest @ track.joint @ rest.T + gain @ (_WHITE * covariance) @ gain.T
-    pose, shared = moved_pose(track.map_from_camera, step[:6]), track.shared + step[6:]
+    # along axes on which both covariances are diagonal; the variances of the track are 1 there
+    root = np.linalg.cholesky(track.covariance)
+    whitened = np.linalg.solve(root, np.linalg.solve(root, covariance).T)
+    variances, axes = np.linalg.eigh((whitened + whitened.T) / 2)
+    own = np.maximum(0.0, 1.0 - (1.0 - _WHITE) * variances)  # not shared with the answer
+    gains, axes = own / (own + _WHITE * variances), root @ axes
+    left = 1.0 - gains * own
+    track = replace(
+        track, covariance=(axes * left) @ axes.T, map_from_camera=moved_pose(
+            track.map_from_camera, axes @ (gains * np.linalg.solve(axes, innovation))))
     if not answer.is_accepted:
-        return replace(track, map_from_camera=pose, joint=joint, shared=shared)
-    return Track(answer.odom_from_camera, pose, joint, shared,
-                 _added(track.covariance, joint[:6, :6]))
-
-
-def _added(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance (6, 6) of the measurement that reduces one covariance to another."""
-    root = np.linalg.cholesky(before)
-    whitened = np.linalg.solve(root, np.linalg.solve(root, after).T)
-    ratios, axes = np.linalg.eigh((whitened + whitened.T) / 2)
-    information = np.maximum(1.0 / ratios - 1.0, _LEAST_SHARE / ratios)
-    axes = root @ axes
-    return np.asarray((axes / information) @ axes.T)
+        return track
+    information = np.maximum(1.0 / left - 1.0, _LEAST_SHARE / variances)
+    return replace(track, contradicting=None, for_filter=(axes / information) @ axes.T)
 
 
 def _begin(answer: Answered) -> Track:
-    """Return the track of one answer, whose error has a shared part."""
-    root = _shared_root(answer.covariance)
-    return Track(answer.odom_from_camera, answer.map_from_camera, np.block(
-        [[answer.covariance, -root], [-root, np.eye(6)]]), np.zeros(6), answer.covariance)
-
-
-def _shared_root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the symmetric root (6, 6) of the shared part of a covariance."""
-    variances, axes = np.linalg.eigh((1.0 - _WHITE) * covariance)
-    return np.asarray((axes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T)
+    """Return the track of one answer."""
+    return Track(answer.odom_from_camera, answer.map_from_camera, answer.covariance,
+                 answer.covariance)
 
 
 def _agree(one: Answered | None, other: Answered) -> bool:
