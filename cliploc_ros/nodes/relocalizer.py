@@ -31,11 +31,11 @@ from cliploc_ros.ros import qos
 from cliploc_ros.ros.answer import Answer, CaseRecorder, RequestCounters, Verdict, answer_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer
 from cliploc_ros.ros.handoff import HandOff
-from cliploc_ros.ros.inputs.coordinate_frames import MapToOdom
 from cliploc_ros.ros.inputs.frame_source import Frame
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumps
+from cliploc_ros.ros.map_to_odom import MapToOdom
 from cliploc_ros.ros.node.diagnostics import Health
 from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode, run_node
 from cliploc_ros.ros.node.threads import MAX_REQUESTS, BoundedCallbackGroup, LatestOnly

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, Transform
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, Transform, TransformStamped
 from numpy.typing import NDArray
 from std_msgs.msg import Header
 from vision_msgs import msg as vision
@@ -69,6 +69,17 @@ def pose_to_msg(parent_from_child: NDArray[np.float64]) -> Pose:
     (pose.orientation.x, pose.orientation.y, pose.orientation.z,
      pose.orientation.w) = map(float, quaternion_from_transform(parent_from_child))
     return pose
+
+
+def transform_msg(header: Header, child_frame: str, parent_from_child: NDArray[np.float64]
+                  ) -> TransformStamped:
+    """Return a transform (4, 4), child to parent, as a message; the header names the parent."""
+    pose = pose_to_msg(parent_from_child)
+    msg = TransformStamped(header=Header(stamp=header.stamp, frame_id=header.frame_id),
+                           child_frame_id=child_frame)
+    p, t = pose.position, msg.transform.translation
+    t.x, t.y, t.z, msg.transform.rotation = p.x, p.y, p.z, pose.orientation
+    return msg
 
 
 def pose_with_covariance_msg(header: Header, parent_from_child: NDArray[np.float64],

@@ -24,11 +24,12 @@ from cliploc_ros.ros.answer import Answer, CaseRecorder, Verdict, answer_to
 from cliploc_ros.ros.conversions import pose_with_covariance_msg
 from cliploc_ros.ros.frame_localizer import FrameLocalizer, Localized, load_localizer
 from cliploc_ros.ros.handoff import HandOff
-from cliploc_ros.ros.inputs.coordinate_frames import MapToOdom, NoTransformError
+from cliploc_ros.ros.inputs.coordinate_frames import NoTransformError
 from cliploc_ros.ros.inputs.frame_source import Frame, NoFrameError
 from cliploc_ros.ros.inputs.rig import CameraRig
 from cliploc_ros.ros.inputs.robot_state import RobotState, RobotStateSource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError, TimeJumps
+from cliploc_ros.ros.map_to_odom import MapToOdom
 from cliploc_ros.ros.node.diagnostics import StageTimes
 from cliploc_ros.ros.node.lifecycle import LOG_PERIOD_S, ManagedNode, NotActiveError
 from cliploc_ros.ros.parameters import RelocalizerParameters

@@ -8,7 +8,7 @@ from scene import MAP_FROM_CAMERA
 from tester import make_frame, transform_of
 
 from cliploc_ros.core.geometry.transforms import invert_transform, pose_error, transform_from_pose
-from cliploc_ros.ros.inputs.coordinate_frames import transform_msg
+from cliploc_ros.ros.conversions import transform_msg
 
 pytestmark = pytest.mark.needs('tf2_ros')
 

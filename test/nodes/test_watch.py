@@ -15,7 +15,7 @@ from tester import class_matching, transform_of
 from watched import MOUNT, Robot
 
 from cliploc_ros.core.geometry.transforms import pose_error
-from cliploc_ros.ros.inputs.coordinate_frames import transform_msg
+from cliploc_ros.ros.conversions import transform_msg
 from cliploc_ros.ros.qos import LATCHED
 
 PERIOD_S = 1.0

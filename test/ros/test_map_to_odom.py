@@ -13,14 +13,11 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import Header
 
 from cliploc_ros.core.geometry.transforms import transform_from_pose
-from cliploc_ros.ros.inputs.coordinate_frames import (
-    CoordinateFrames,
-    MapToOdom,
-    NoTransformError,
-    transform_msg,
-)
+from cliploc_ros.ros.conversions import transform_msg
+from cliploc_ros.ros.inputs.coordinate_frames import CoordinateFrames, NoTransformError
 from cliploc_ros.ros.inputs.odometry import OdometrySource
 from cliploc_ros.ros.inputs.stamps import TimeJumpError
+from cliploc_ros.ros.map_to_odom import MapToOdom
 from cliploc_ros.ros.parameters import RelocalizerParameters
 
 PARAMETERS = RelocalizerParameters(base_frame='base_link', tf_timeout_s=5.0)
