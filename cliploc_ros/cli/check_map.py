@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
-from typing import TYPE_CHECKING, get_type_hints
+from typing import get_type_hints
 
 from cliploc_ros import command
 from cliploc_ros.cli.options import add_topic_options, add_use_option, read_layer
@@ -15,9 +15,6 @@ from cliploc_ros.command import option
 from cliploc_ros.core.options import RelocalizerOptions
 from cliploc_ros.errors import OptionsError
 from cliploc_ros.offline.mapping.options import CheckOptions, Thresholds
-
-if TYPE_CHECKING:
-    pass
 
 _ADVICE_SHOWN = 8
 EPILOG = """\
